@@ -1,0 +1,85 @@
+//! The error type of the crate: one line that names the file, the pass or the tensor, and the remedy.
+
+use std::{fmt, io, path::PathBuf};
+
+use crate::passes::Pass;
+
+/// Result with this crate's [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// What went wrong, where, and what to do about it.
+#[derive(Debug)]
+pub enum Error {
+    /// The operating system refused to read, write, create or rename `path`.
+    Io {
+        /// The file or directory.
+        path: PathBuf,
+        /// What was tried: "read", "write", "create", "rename".
+        action: &'static str,
+        /// What the operating system said.
+        source: io::Error,
+    },
+    /// `path` is readable but holds something unusable; `reason` ends with the remedy.
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it and what to do.
+        reason: String,
+    },
+    /// The view layer lacks a pass that the method needs.
+    MissingPass {
+        /// The EXR file.
+        path: PathBuf,
+        /// The view layer searched.
+        view_layer: String,
+        /// The pass that is missing; the message says how Blender turns it on.
+        pass: Pass,
+        /// The method that needs it.
+        needed_by: String,
+    },
+    /// The command line or a parameter is wrong.
+    Usage(String),
+    /// The user asked to stop (Ctrl-C).
+    Interrupted,
+}
+
+impl Error {
+    /// [`Error::Invalid`] from anything printable.
+    pub fn invalid(path: impl Into<PathBuf>, reason: impl fmt::Display) -> Self {
+        Self::Invalid { path: path.into(), reason: reason.to_string() }
+    }
+
+    /// For `map_err` on an I/O call: `.map_err(Error::io("write", path))`.
+    pub fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { path, action, source }
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Io { path, action, source } => {
+                write!(f, "{}: cannot {action}: {source}", path.display())
+            }
+            Self::Invalid { path, reason } => write!(f, "{}: {reason}", path.display()),
+            Self::MissingPass { path, view_layer, pass, needed_by } => write!(
+                f,
+                "{}: view layer '{view_layer}' has no {pass} pass, which {needed_by} needs; {}",
+                path.display(),
+                pass.blender_setting()
+            ),
+            Self::Usage(message) => f.write_str(message),
+            Self::Interrupted => f.write_str("interrupted"),
+        }
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Io { source, .. } => Some(source),
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! Every denoising method behind one trait. A new method is one file here and one line in the catalogue.
+
+use crate::{
+    Error, Result,
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// One way to remove noise from a frame.
+pub trait Denoiser: Send + Sync {
+    /// The name by which `--model` and the report know it.
+    fn name(&self) -> &str;
+
+    /// The passes it needs.
+    fn passes(&self) -> &[Pass];
+
+    /// Denoised radiance, (3, H, W), of finite passes (see [`PassSet::sanitize`]).
+    ///
+    /// # Errors
+    /// A pass is missing, or the method cannot run here; the message says why.
+    fn denoise(&self, passes: &PassSet) -> Result<Planes>;
+}
+
+/// The input itself: the row every report begins with.
+pub struct Noisy;
+
+impl Denoiser for Noisy {
+    fn name(&self) -> &str {
+        "noisy"
+    }
+
+    fn passes(&self) -> &[Pass] {
+        &[Pass::Combined]
+    }
+
+    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+        Ok(passes.require(Pass::Combined, self.name())?.clone())
+    }
+}
+
+/// A method by its built-in name, or from a weights file.
+///
+/// # Errors
+/// No built-in method or readable weights file goes by that name.
+pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
+    match name_or_file {
+        "noisy" => Ok(Box::new(Noisy)),
+        other => Err(Error::Usage(format!("no model '{other}': `demc models` lists the built-in ones"))),
+    }
+}
