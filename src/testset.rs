@@ -1,1 +1,400 @@
-//! (skeleton)
+//! Render pairs on disk: which noisy file belongs to which reference.
+//!
+//! In: a directory, a CSV manifest or a glob, as the user typed it. Out: [`Pair`]s in a fixed order,
+//! and the files that have no counterpart. Files are `<scene>_<NNNN>spp[.FRAME].exr` and
+//! `<scene>_ref[.FRAME].exr`; a manifest has the header `scene,noisy,reference,spp`, with paths
+//! relative to itself. Only names are looked at; no image is opened.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt,
+    path::{Path, PathBuf},
+};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Error, Result};
+
+/// A noisy render and the converged render of the same view.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Pair {
+    /// Scene name; frames of one sequence share it.
+    pub scene: String,
+    /// The noisy multilayer EXR.
+    pub noisy: PathBuf,
+    /// The reference EXR.
+    pub reference: PathBuf,
+    /// Samples per pixel of the noisy render.
+    pub spp: u32,
+    /// Frame number of a sequence, digits as in the file name.
+    pub frame: Option<String>,
+}
+
+impl Pair {
+    /// Scene and frame, as reports name the row: `bathroom`, `shot.0017`.
+    pub fn label(&self) -> String {
+        match &self.frame {
+            Some(frame) => format!("{}.{frame}", self.scene),
+            None => self.scene.clone(),
+        }
+    }
+
+    /// A name that is unique in its test set: `bathroom_0004spp`, `shot_0004spp.0017`.
+    pub fn id(&self) -> String {
+        let frame = self.frame.as_ref().map(|f| format!(".{f}")).unwrap_or_default();
+        format!("{}_{:04}spp{frame}", self.scene, self.spp)
+    }
+}
+
+/// A file of a test set that cannot be scored, and what it lacks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Unmatched {
+    /// A noisy render; the reference it lacks.
+    Noisy {
+        /// The noisy file.
+        path: PathBuf,
+        /// The reference looked for.
+        wanted: PathBuf,
+    },
+    /// A reference that no noisy render goes with.
+    Reference(PathBuf),
+}
+
+impl fmt::Display for Unmatched {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Noisy { path, wanted } => write!(
+                f,
+                "{}: no reference: {} is missing; render it, or take the noisy file out of the set",
+                path.display(),
+                wanted.display()
+            ),
+            Self::Reference(path) => write!(
+                f,
+                "{}: reference without a noisy render named <scene>_<spp>spp.exr beside it",
+                path.display()
+            ),
+        }
+    }
+}
+
+/// What a specification names: the pairs, by scene, frame and spp, and the files left over.
+#[derive(Clone, Debug, Default)]
+pub struct TestSet {
+    /// Complete pairs, sorted by scene, frame, spp and path.
+    pub pairs: Vec<Pair>,
+    /// Files without their counterpart, sorted by path.
+    pub unmatched: Vec<Unmatched>,
+}
+
+/// The pairs of `spec`; a file without its counterpart is named in a warning on stderr.
+///
+/// # Errors
+/// As [`read`].
+pub fn pairs(spec: &str) -> Result<Vec<Pair>> {
+    let set = read(spec)?;
+    for unmatched in &set.unmatched {
+        eprintln!("warning: {unmatched}");
+    }
+    Ok(set.pairs)
+}
+
+/// The test set that `spec` (directory, manifest or glob) names.
+///
+/// A glob picks noisy renders, references or both; a reference that it leaves out is looked for
+/// beside its noisy render.
+///
+/// # Errors
+/// Nothing is there, the manifest is malformed, or no pair is complete.
+pub fn read(spec: &str) -> Result<TestSet> {
+    let path = Path::new(spec);
+    let set = if path.is_dir() {
+        let entries = std::fs::read_dir(path).map_err(Error::io("read", path))?;
+        let files = entries
+            .map(|entry| entry.map(|e| e.path()))
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(Error::io("read", path))?;
+        match_files(files.into_iter().filter(|f| f.is_file()), true)
+    } else if path.is_file() {
+        manifest(path)?
+    } else if spec.contains(['*', '?', '[']) {
+        let found = glob::glob(spec)
+            .map_err(|e| Error::Usage(format!("'{spec}' is not a valid glob pattern: {e}")))?;
+        let mut files = Vec::new();
+        for file in found {
+            let file = file.map_err(|e| {
+                let path = e.path().to_path_buf();
+                Error::io("read", path)(e.into())
+            })?;
+            files.push(file);
+        }
+        if files.is_empty() {
+            return Err(Error::Usage(format!(
+                "no file matches '{spec}'; quote the pattern and check its path"
+            )));
+        }
+        match_files(files, false)
+    } else {
+        return Err(Error::Usage(format!(
+            "'{spec}' is no directory, CSV manifest or glob: nothing there by that name"
+        )));
+    };
+    if set.pairs.is_empty() {
+        let hint = match set.unmatched.first() {
+            Some(unmatched) => unmatched.to_string(),
+            None => "a pair is <scene>_<spp>spp.exr and <scene>_ref.exr".into(),
+        };
+        return Err(Error::Usage(format!("no render pair in '{spec}': {hint}")));
+    }
+    Ok(set)
+}
+
+/// What a file name says about a render.
+#[derive(Debug, PartialEq, Eq)]
+struct Name<'a> {
+    scene: &'a str,
+    /// `None` for a reference.
+    spp: Option<u32>,
+    frame: Option<&'a str>,
+}
+
+/// Reads `<scene>_<NNNN>spp[.FRAME].exr` or `<scene>_ref[.FRAME].exr`; `None` for any other name.
+fn parse_name(file_name: &str) -> Option<Name<'_>> {
+    let (stem, extension) = file_name.rsplit_once('.')?;
+    if !extension.eq_ignore_ascii_case("exr") {
+        return None;
+    }
+    let all_digits = |s: &str| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit());
+    // A negative frame is written `-0003` by Blender.
+    let (stem, frame) = match stem.rsplit_once('.') {
+        Some((rest, frame)) if all_digits(frame.strip_prefix('-').unwrap_or(frame)) => (rest, Some(frame)),
+        _ => (stem, None),
+    };
+    let (scene, kind) = stem.rsplit_once('_')?;
+    if scene.is_empty() {
+        return None;
+    }
+    if kind == "ref" {
+        return Some(Name { scene, spp: None, frame });
+    }
+    let digits = kind.strip_suffix("spp").filter(|d| all_digits(d))?;
+    Some(Name { scene, spp: Some(digits.parse().ok()?), frame })
+}
+
+/// Pairs files by name within their directory. `report_references`: name references that no noisy
+/// render goes with (a glob may well pick a subset of the noisy ones, a directory is complete).
+fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool) -> TestSet {
+    // Keyed by directory, scene and frame: one reference serves every spp of its view.
+    let mut references: BTreeMap<(PathBuf, String, Option<String>), PathBuf> = BTreeMap::new();
+    let mut noisy = Vec::new();
+    for file in files {
+        let Some(name) = file.file_name().and_then(|n| n.to_str()).and_then(parse_name) else { continue };
+        let directory = file.parent().unwrap_or(Path::new("")).to_path_buf();
+        let (scene, frame) = (name.scene.to_string(), name.frame.map(str::to_string));
+        match name.spp {
+            None => {
+                references.insert((directory, scene, frame), file.clone());
+            }
+            Some(spp) => noisy.push((directory, scene, frame, spp, file.clone())),
+        }
+    }
+    let mut set = TestSet::default();
+    let mut used = BTreeSet::new();
+    for (directory, scene, frame, spp, path) in noisy {
+        let suffix = frame.as_ref().map(|f| format!(".{f}")).unwrap_or_default();
+        let wanted = directory.join(format!("{scene}_ref{suffix}.exr"));
+        let key = (directory, scene.clone(), frame.clone());
+        let reference = references.get(&key).cloned().or_else(|| wanted.is_file().then(|| wanted.clone()));
+        match reference {
+            Some(reference) => {
+                used.insert(reference.clone());
+                set.pairs.push(Pair { scene, noisy: path, reference, spp, frame });
+            }
+            None => set.unmatched.push(Unmatched::Noisy { path, wanted }),
+        }
+    }
+    if report_references {
+        let unused = references.into_values().filter(|r| !used.contains(r));
+        set.unmatched.extend(unused.map(Unmatched::Reference));
+    }
+    set.sort();
+    set
+}
+
+impl TestSet {
+    fn sort(&mut self) {
+        // Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
+        self.pairs.sort_by_cached_key(|p| {
+            let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
+            (p.scene.clone(), number, p.spp, p.noisy.clone())
+        });
+        self.unmatched.sort_by_cached_key(|u| match u {
+            Unmatched::Noisy { path, .. } | Unmatched::Reference(path) => path.clone(),
+        });
+    }
+}
+
+/// A row of a manifest.
+#[derive(Deserialize)]
+struct Row {
+    scene: String,
+    noisy: PathBuf,
+    reference: PathBuf,
+    spp: u32,
+}
+
+/// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
+/// the reference; a noisy file that is missing is kept, so that the row fails where it is read.
+fn manifest(path: &Path) -> Result<TestSet> {
+    let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
+    let mut reader = csv::ReaderBuilder::new()
+        .trim(csv::Trim::All)
+        .comment(Some(b'#'))
+        .from_path(path)
+        .map_err(|e| Error::invalid(path, format!("cannot read the manifest: {e}; {remedy}")))?;
+    let directory = path.parent().unwrap_or(Path::new(""));
+    let mut set = TestSet::default();
+    for row in reader.deserialize::<Row>() {
+        let row = row.map_err(|e| Error::invalid(path, format!("{e}; {remedy}")))?;
+        let frame = row
+            .noisy
+            .file_name()
+            .and_then(|n| n.to_str())
+            .and_then(parse_name)
+            .and_then(|n| n.frame.map(str::to_string));
+        let (noisy, reference) = (directory.join(&row.noisy), directory.join(&row.reference));
+        if reference.is_file() {
+            set.pairs.push(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame });
+        } else {
+            set.unmatched.push(Unmatched::Noisy { path: noisy, wanted: reference });
+        }
+    }
+    set.sort();
+    Ok(set)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder(names: &[&str]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        for name in names {
+            std::fs::write(dir.path().join(name), b"").unwrap();
+        }
+        dir
+    }
+
+    fn ids(set: &TestSet) -> Vec<String> {
+        set.pairs.iter().map(Pair::id).collect()
+    }
+
+    #[test]
+    fn names_follow_the_contract() {
+        let name = |scene, spp, frame| Some(Name { scene, spp, frame });
+        for (file, expected) in [
+            ("bathroom_0004spp.exr", name("bathroom", Some(4), None)),
+            ("bathroom_4spp.EXR", name("bathroom", Some(4), None)),
+            ("bathroom_ref.exr", name("bathroom", None, None)),
+            ("shot_0016spp.0017.exr", name("shot", Some(16), Some("0017"))),
+            ("shot_ref.-0003.exr", name("shot", None, Some("-0003"))),
+            ("a_b.c_12_ref.exr", name("a_b.c_12", None, None)),
+            ("bathroom.exr", None),
+            ("_ref.exr", None),
+            ("bathroom_spp.exr", None),
+            ("bathroom_+4spp.exr", None),
+            ("bathroom_99999999999spp.exr", None),
+            ("bathroom_ref.png", None),
+        ] {
+            assert_eq!(parse_name(file), expected, "{file}");
+        }
+    }
+
+    #[test]
+    fn directory_gives_each_spp_and_frame_in_order() {
+        let dir = folder(&[
+            "b_0016spp.exr",
+            "b_0004spp.exr",
+            "b_ref.exr",
+            "a_0004spp.0100.exr",
+            "a_0004spp.0099.exr",
+            "a_ref.0099.exr",
+            "a_ref.0100.exr",
+            "notes.txt",
+        ]);
+        let set = read(dir.path().to_str().unwrap()).unwrap();
+        assert_eq!(ids(&set), ["a_0004spp.0099", "a_0004spp.0100", "b_0004spp", "b_0016spp"]);
+        assert_eq!(set.pairs[0].reference, dir.path().join("a_ref.0099.exr"));
+        assert_eq!(set.pairs[3].reference, dir.path().join("b_ref.exr"));
+        assert!(set.unmatched.is_empty());
+    }
+
+    #[test]
+    fn a_file_without_counterpart_is_named() {
+        let dir = folder(&[
+            "a_0004spp.exr",
+            "a_ref.exr",
+            "b_0004spp.exr",
+            "c_ref.exr",
+            "d_0004spp.0001.exr",
+            "d_ref.exr",
+        ]);
+        let set = read(dir.path().to_str().unwrap()).unwrap();
+        assert_eq!(ids(&set), ["a_0004spp"]);
+        let lines: Vec<_> = set.unmatched.iter().map(|u| u.to_string()).collect();
+        assert_eq!(lines.len(), 4);
+        assert!(lines[0].contains("b_0004spp.exr") && lines[0].contains("b_ref.exr"), "{}", lines[0]);
+        assert!(lines[1].contains("c_ref.exr"), "{}", lines[1]);
+        assert!(lines[2].contains("d_ref.0001.exr"), "a still reference is not a frame's: {}", lines[2]);
+        assert!(lines[3].contains("d_ref.exr"), "{}", lines[3]);
+    }
+
+    #[test]
+    fn glob_finds_references_beside_the_noisy_files_it_picks() {
+        let dir = folder(&[
+            "a_0004spp.exr",
+            "a_0016spp.exr",
+            "a_ref.exr",
+            "b_0004spp.exr",
+            "b_ref.exr",
+            "c_ref.exr",
+        ]);
+        let set = read(&format!("{}/*_0004spp.exr", dir.path().display())).unwrap();
+        assert_eq!(ids(&set), ["a_0004spp", "b_0004spp"]);
+        let set = read(&format!("{}/*.exr", dir.path().display())).unwrap();
+        assert_eq!(ids(&set), ["a_0004spp", "a_0016spp", "b_0004spp"]);
+        assert!(set.unmatched.is_empty());
+    }
+
+    #[test]
+    fn manifest_paths_are_relative_to_it() {
+        let dir = folder(&["x.exr", "y.exr", "s_0008spp.0002.exr"]);
+        let file = dir.path().join("set.csv");
+        let text = "scene,noisy,reference,spp\n# comment\nz,x.exr,y.exr,4\ns, s_0008spp.0002.exr ,y.exr,8\nq,x.exr,gone.exr,4\n";
+        std::fs::write(&file, text).unwrap();
+        let set = read(file.to_str().unwrap()).unwrap();
+        assert_eq!(ids(&set), ["s_0008spp.0002", "z_0004spp"]);
+        assert_eq!(set.pairs[1].noisy, dir.path().join("x.exr"));
+        assert!(set.unmatched[0].to_string().contains("gone.exr"));
+    }
+
+    #[test]
+    fn errors_name_the_file_and_the_remedy() {
+        let dir = folder(&["a_0004spp.exr"]);
+        let at = |name: &str| dir.path().join(name).to_str().unwrap().to_string();
+        std::fs::write(at("bad.csv"), "scene,noisy\na,b\n").unwrap();
+        std::fs::write(at("spp.csv"), "scene,noisy,reference,spp\na,b,c,many\n").unwrap();
+        for (spec, expected) in [
+            (at(""), "a_ref.exr is missing"),
+            (at("nothing"), "nothing there by that name"),
+            (at("*.tif"), "no file matches"),
+            (at("***"), "not a valid glob"),
+            (at("bad.csv"), "scene,noisy,reference,spp"),
+            (at("spp.csv"), "scene,noisy,reference,spp"),
+        ] {
+            let message = read(&spec).unwrap_err().to_string();
+            assert!(message.contains(expected), "{spec}: {message}");
+            assert!(!message.contains('\n'), "{message}");
+        }
+    }
+}
