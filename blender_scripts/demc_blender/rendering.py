@@ -1,0 +1,139 @@
+"""One Cycles render into one multilayer EXR: passes, sampling, region, output, all undoable."""
+
+import os
+import tempfile
+
+import bpy
+
+# The passes demc reads besides Combined and the position AOV; depth lets others reuse the files.
+DATA_PASSES = (
+    "use_pass_z",
+    "use_pass_position",
+    "use_pass_normal",
+    "use_pass_diffuse_color",
+    "use_pass_glossy_color",
+    "use_pass_transmission_color",
+)
+
+
+def prepare_scene(edits, scene):
+    """What holds for every render: Cycles, no denoising, no post-processing, nothing kept between
+    renders (persistent data gave materials wrong textures on the second render of a process)."""
+    if scene.render.engine != "CYCLES":
+        print(f"warning: {scene.name} is set to {scene.render.engine}; rendering it with Cycles")
+    render, cycles = scene.render, scene.cycles
+    edits.set(render, "engine", "CYCLES")
+    for name in ("use_persistent_data", "use_compositing", "use_sequencer", "use_multiview",
+                 "use_single_layer", "use_freestyle", "use_border", "use_crop_to_border",
+                 "use_file_extension", "use_stamp"):
+        edits.set(render, name, False)
+    edits.set(render, "use_overwrite", True)
+    for name in ("use_denoising", "use_animated_seed", "use_sample_subset"):
+        edits.set(cycles, name, False)
+    edits.set(cycles, "time_limit", 0.0)
+    edits.set(cycles, "sample_offset", 0)
+    edits.set(cycles, "use_layer_samples", "IGNORE")
+    for layer in scene.view_layers:
+        edits.set(layer.cycles, "use_denoising", False)
+
+
+def enable_passes(edits, layers, vector=False):
+    """Turns on what demc needs, and leaves on what the user has on."""
+    for layer in layers:
+        for name in ("use_pass_combined",) + DATA_PASSES + (("use_pass_vector",) if vector else ()):
+            edits.set(layer, name, True)
+        edits.set(layer.cycles, "denoising_store_passes", True)
+
+
+def combined_only(edits, layers):
+    """Turns every pass off but Combined (the user's own AOVs stay)."""
+    for layer in layers:
+        for owner in (layer, layer.cycles):
+            for prop in owner.bl_rna.properties:
+                if prop.identifier.startswith("use_pass_"):
+                    edits.set(owner, prop.identifier, prop.identifier == "use_pass_combined")
+        edits.set(layer.cycles, "denoising_store_passes", False)
+
+
+def set_output(edits, scene, full_float=False):
+    """Multilayer EXR, ZIP. Half keeps files small: Cycles' data passes stay 32-bit float in it."""
+    settings = scene.render.image_settings
+    # Registered first and so undone last: a depth is valid only for its own file format.
+    depth = settings.color_depth
+    edits.on_undo(lambda: setattr(settings, "color_depth", depth))
+    if hasattr(settings, "media_type"):  # Blender 5 wants it before the file format
+        edits.set(settings, "media_type", "MULTI_LAYER_IMAGE")
+    edits.set(settings, "file_format", "OPEN_EXR_MULTILAYER")
+    edits.set(settings, "color_depth", "32" if full_float else "16")
+    edits.set(settings, "exr_codec", "ZIP")
+    edits.set(settings, "use_preview", False)
+
+
+def set_resolution(edits, scene, resolution):
+    """Width and height in pixels."""
+    edits.set(scene.render, "resolution_x", resolution[0])
+    edits.set(scene.render, "resolution_y", resolution[1])
+    edits.set(scene.render, "resolution_percentage", 100)
+
+
+def frame_size(scene):
+    """Pixels of the whole frame, (width, height), as Blender rounds them."""
+    render = scene.render
+    return (render.resolution_x * render.resolution_percentage // 100,
+            render.resolution_y * render.resolution_percentage // 100)
+
+
+def set_region(edits, scene, region):
+    """Renders X,Y,W,H alone, in pixels from the top left; raises ValueError outside the frame."""
+    width, height = frame_size(scene)
+    x, y, w, h = region
+    if x + w > width or y + h > height:
+        raise ValueError(f"the region {x},{y},{w},{h} leaves the frame of {width}x{height}")
+    render = scene.render
+    bottom = height - y - h
+    # Blender truncates border times size; a quarter pixel keeps rounding on the right side.
+    for name, pixels, size in (("min_x", x, width), ("max_x", x + w, width),
+                               ("min_y", bottom, height), ("max_y", bottom + h, height)):
+        edits.set(render, f"border_{name}", min((pixels + 0.25) / size, 1.0))
+    edits.set(render, "use_border", True)
+    edits.set(render, "use_crop_to_border", True)
+
+
+def set_sampling(edits, scene, spp, seed, noise_threshold=0.0):
+    """Exactly `spp` samples a pixel, or adaptive up to `spp` where a noise threshold is given."""
+    cycles = scene.cycles
+    edits.set(cycles, "samples", spp)
+    edits.set(cycles, "seed", seed)
+    edits.set(cycles, "use_adaptive_sampling", noise_threshold > 0.0)
+    if noise_threshold > 0.0:
+        edits.set(cycles, "adaptive_threshold", noise_threshold)
+        edits.set(cycles, "adaptive_min_samples", 0)
+
+
+def render_to(scene, path, layer=None):
+    """Renders into `path`: to a temporary name first, so that a killed run leaves no half file.
+
+    Raises RuntimeError where Blender fails or writes nothing."""
+    folder = os.path.dirname(os.path.abspath(path))
+    handle, temporary = tempfile.mkstemp(suffix=".tmp", prefix="demc_", dir=folder)
+    os.close(handle)
+    os.remove(temporary)
+    old = scene.render.filepath
+    scene.render.filepath = temporary
+    try:
+        bpy.ops.render.render(write_still=True, scene=scene.name, **({"layer": layer} if layer else {}))
+        if not os.path.exists(temporary) or os.path.getsize(temporary) == 0:
+            raise RuntimeError("Blender wrote no image")
+        os.replace(temporary, path)
+    finally:
+        scene.render.filepath = old
+        if os.path.exists(temporary):
+            os.remove(temporary)
+
+
+def mixed_seed(*parts):
+    """A Cycles seed from any numbers or words, the same on every machine (FNV-1a, 31 bits)."""
+    value = 0xCBF29CE484222325
+    for byte in "/".join(str(part) for part in parts).encode():
+        value = ((value ^ byte) * 0x100000001B3) & 0xFFFFFFFFFFFFFFFF
+    return (value ^ (value >> 32)) & 0x7FFFFFFF
