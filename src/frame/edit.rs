@@ -1,0 +1,3 @@
+//! (edit)
+pub struct NewChannel;
+pub struct Recoded;

@@ -1,0 +1,90 @@
+//! From a file to a [`Frame`]: headers, then every chunk still compressed, each checked to be present
+//! exactly once, so that a truncated render is refused here and not half denoised.
+
+use std::{collections::HashMap, fs::File, io::BufReader, path::Path};
+
+use exr::block::{chunk::TileCoordinates, reader::ChunksReader};
+
+use super::{Frame, StoredChunk};
+use crate::{Error, Result};
+
+/// Leading bytes of every EXR file.
+const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
+/// Offset-table entry of one chunk.
+const OFFSET_BYTES: u64 = 8;
+
+impl Frame {
+    /// Reads a file: headers and compressed chunks; nothing is decoded yet.
+    ///
+    /// # Errors
+    /// The file cannot be read, is no EXR, is truncated or damaged, or holds deep data.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let file = File::open(path).map_err(Error::io("read", path))?;
+        let info = file.metadata().map_err(Error::io("read", path))?;
+        if info.is_dir() {
+            return Err(Error::invalid(path, "is a directory; name the EXR files in it"));
+        }
+        let mut buffered = BufReader::with_capacity(1 << 18, file);
+        check_magic(&mut buffered, path, info.len())?;
+
+        let reader = exr::block::read(buffered, false).map_err(|e| Self::error(path, e))?;
+        // A damaged header may promise billions of chunks: believe only what the file has room for.
+        let promised: u64 = reader.headers().iter().map(|h| h.chunk_count as u64).sum();
+        if promised.saturating_mul(OFFSET_BYTES) > info.len() {
+            return Err(truncated(path));
+        }
+
+        // Where each block of each part belongs, in increasing y.
+        let places: Vec<HashMap<TileCoordinates, usize>> = reader
+            .headers()
+            .iter()
+            .map(|h| h.blocks_increasing_y_order().enumerate().map(|(i, t)| (t.location, i)).collect())
+            .collect();
+        // Through the offset tables (sorted): files may hold gaps and any order of chunks.
+        let mut chunks_reader =
+            reader.filter_chunks(false, |_, _, _| true).map_err(|e| Self::error(path, e))?;
+        let mut chunks = Vec::with_capacity(chunks_reader.len());
+        let mut seen: Vec<Vec<bool>> = places.iter().map(|p| vec![false; p.len()]).collect();
+        while let Some(chunk) = chunks_reader.read_next_chunk() {
+            let chunk = chunk.map_err(|e| match e {
+                exr::error::Error::Invalid(_) => truncated(path),
+                other => Self::error(path, other),
+            })?;
+            let part = chunk.layer_index;
+            let place = chunks_reader.headers()[part]
+                .get_block_data_indices(&chunk.compressed_block)
+                .map_err(|e| Self::error(path, e))?;
+            let Some(&index) = places[part].get(&place) else { return Err(truncated(path)) };
+            if std::mem::replace(&mut seen[part][index], true) {
+                return Err(truncated(path));
+            }
+            chunks.push(StoredChunk { part, index, chunk });
+        }
+        if seen.iter().flatten().any(|s| !s) {
+            return Err(truncated(path));
+        }
+
+        let meta = chunks_reader.meta_data().clone();
+        let mut frame = Self { path: path.into(), byte_len: info.len(), meta, parts: Vec::new(), chunks };
+        frame.describe();
+        Ok(frame)
+    }
+}
+
+fn check_magic(file: &mut BufReader<File>, path: &Path, byte_len: u64) -> Result<()> {
+    use std::io::{Read, Seek};
+    if byte_len == 0 {
+        return Err(Error::invalid(path, "is empty; render it or copy it again"));
+    }
+    let mut magic = Vec::with_capacity(MAGIC.len());
+    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(Error::io("read", path))?;
+    if magic != MAGIC {
+        return Err(Error::invalid(path, "is not an EXR file; render to OpenEXR MultiLayer"));
+    }
+    file.rewind().map_err(Error::io("read", path))
+}
+
+fn truncated(path: &Path) -> Error {
+    Error::invalid(path, "is truncated or damaged: pixel blocks are missing; render it or copy it again")
+}

@@ -1,0 +1,245 @@
+//! Which view layers a frame holds, which passes each has and in which channels, and their decoding.
+
+use std::collections::BTreeMap;
+
+use super::{
+    Pass, PassSet,
+    names::{ChannelName, POSITION_AOV, TABLE},
+};
+use crate::{
+    Error, Result,
+    frame::{Frame, Window},
+    planes::Planes,
+};
+
+/// One view layer of a frame, in one stereo view.
+#[derive(Clone, Debug)]
+pub struct Layer {
+    /// Name of the view layer; empty in files without layers.
+    pub name: String,
+    /// Stereo view, where the file has views.
+    pub view: Option<String>,
+    /// The passes recognised.
+    pub passes: BTreeMap<Pass, PassChannels>,
+    /// Whether the position is averaged over samples (a shader AOV) and not Cycles' aliased pass.
+    pub position_averaged: bool,
+    /// Names of channels that mean nothing to demc.
+    pub unrecognised: Vec<String>,
+}
+
+/// Where a pass is stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PassChannels {
+    /// Index of the part.
+    pub part: usize,
+    /// Channel indices within the part, in the order of the pass's components.
+    pub channels: Vec<usize>,
+    /// The renderer's name of the pass.
+    pub name: String,
+}
+
+/// A channel still without meaning: where it is and its component name.
+struct Unassigned {
+    part: usize,
+    channel: usize,
+    component: String,
+    full_name: String,
+}
+
+/// The view layers of a frame, in file order, once for each stereo view.
+pub fn layers(frame: &Frame) -> Vec<Layer> {
+    let views = frame.views();
+    // (layer, view) in file order, each with its channels by pass name.
+    let mut found: Vec<((String, Option<String>), BTreeMap<String, Vec<Unassigned>>)> = Vec::new();
+    for (p, part) in frame.parts().iter().enumerate() {
+        // A single part's name is the name of the file's only image, not of a pass.
+        let part_name = part.name.as_deref().filter(|n| frame.is_multi_part() || n.contains('.'));
+        for (c, channel) in part.channels.iter().enumerate() {
+            let name = ChannelName::parse(&channel.name, part_name, part.view.as_deref(), &views);
+            let key = (name.view_layer, name.view);
+            let at = found.iter().position(|(k, _)| *k == key).unwrap_or_else(|| {
+                found.push((key, BTreeMap::new()));
+                found.len() - 1
+            });
+            found[at].1.entry(name.pass).or_default().push(Unassigned {
+                part: p,
+                channel: c,
+                component: name.component,
+                full_name: channel.name.clone(),
+            });
+        }
+    }
+    found.into_iter().map(|((name, view), channels)| assign(name, view, channels)).collect()
+}
+
+fn assign(name: String, view: Option<String>, channels: BTreeMap<String, Vec<Unassigned>>) -> Layer {
+    let mut passes = BTreeMap::new();
+    let mut known = std::collections::HashSet::new();
+    for row in TABLE {
+        for pass_name in row.names {
+            let Some(candidates) = channels.get(*pass_name) else { continue };
+            let Some(found) = row.components.iter().find_map(|names| match_components(candidates, names))
+            else {
+                continue;
+            };
+            known.extend(found.channels.iter().map(|&c| (found.part, c)));
+            // Every name of the row is recognised; the first one present is the one used.
+            passes.entry(row.pass).or_insert(PassChannels { name: (*pass_name).into(), ..found });
+        }
+    }
+    // The fourth channel of an AOV or a noisy image is part of what was recognised.
+    for (pass_name, list) in &channels {
+        if passes.values().any(|p: &PassChannels| p.name == *pass_name) {
+            known.extend(list.iter().filter(|c| c.component == "A").map(|c| (c.part, c.channel)));
+        }
+    }
+    let mut unrecognised: Vec<(usize, usize, String)> = channels
+        .into_values()
+        .flatten()
+        .filter(|c| !known.contains(&(c.part, c.channel)))
+        .map(|c| (c.part, c.channel, c.full_name))
+        .collect();
+    unrecognised.sort();
+    Layer {
+        name,
+        view,
+        position_averaged: passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV),
+        passes,
+        unrecognised: unrecognised.into_iter().map(|(.., n)| n).collect(),
+    }
+}
+
+/// The channels with these component names, all in the part of the first.
+fn match_components(candidates: &[Unassigned], names: &[&str]) -> Option<PassChannels> {
+    let part = candidates.iter().find(|c| c.component == names[0])?.part;
+    let channels = names
+        .iter()
+        .map(|n| candidates.iter().find(|c| c.part == part && c.component == *n).map(|c| c.channel))
+        .collect::<Option<Vec<_>>>()?;
+    Some(PassChannels { part, channels, name: String::new() })
+}
+
+/// The view layer named, or without a name the one with the most recognised passes among those with
+/// Combined (Blender's compositor adds a layer that holds nothing else), and the first among equals.
+///
+/// # Errors
+/// There is no such view layer, or none with a Combined pass; the message lists those there are.
+pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) -> Result<&'a Layer> {
+    let listed = || {
+        let mut names: Vec<String> = layers.iter().map(|l| format!("'{}'", l.name)).collect();
+        names.dedup();
+        names.join(", ")
+    };
+    match view_layer {
+        Some(wanted) => layers.iter().find(|l| l.name == wanted).ok_or_else(|| {
+            Error::invalid(frame.path(), format!("has no view layer '{wanted}'; it has {}", listed()))
+        }),
+        None => layers
+            .iter()
+            .rev() // `max_by_key` keeps the last of equals
+            .filter(|l| l.passes.contains_key(&Pass::Combined))
+            .max_by_key(|l| l.passes.len())
+            .ok_or_else(|| {
+                Error::invalid(
+                    frame.path(),
+                    format!(
+                        "no layer has a Combined pass (layers: {}); {}",
+                        listed(),
+                        Pass::Combined.blender_setting()
+                    ),
+                )
+            }),
+    }
+}
+
+/// The passes of one view layer of a frame: see [`choose`].
+///
+/// # Errors
+/// No such view layer, or its pixels cannot be decoded.
+pub fn read(frame: &Frame, view_layer: Option<&str>) -> Result<PassSet> {
+    let layers = layers(frame);
+    read_layer(frame, choose(frame, &layers, view_layer)?, &Pass::ALL)
+}
+
+/// Those of the wanted passes that the layer has. Everything is cut to the data window of Combined;
+/// what another part does not store there is 0.
+///
+/// # Errors
+/// Pixels cannot be decoded.
+pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassSet> {
+    let held = || layer.passes.iter().filter(|(p, _)| wanted.contains(p));
+    let anchor = layer.passes.get(&Pass::Combined).or_else(|| layer.passes.values().next());
+    let Some(anchor) = anchor else {
+        return Err(Error::invalid(
+            frame.path(),
+            format!("layer '{}' has no pass that demc knows; see `demc inspect`", layer.name),
+        ));
+    };
+    let window = frame.parts()[anchor.part].data_window;
+    let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
+
+    // One decoding run for each part: in single-part files all passes share their blocks.
+    let mut by_part: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (_, at) in held() {
+        by_part.entry(at.part).or_default().extend(&at.channels);
+    }
+    let mut planes: BTreeMap<(usize, usize), Vec<f32>> = BTreeMap::new();
+    for (part, mut channels) in by_part {
+        channels.sort_unstable();
+        channels.dedup();
+        let decoded = frame.decode(part, &channels)?;
+        let stored = frame.parts()[part].data_window;
+        for (channel, plane) in channels.into_iter().zip(decoded) {
+            planes.insert((part, channel), crop(plane, stored, window));
+        }
+    }
+    for (&pass, at) in held() {
+        let mut data = Vec::with_capacity(at.channels.len() * window.width * window.height);
+        for &channel in &at.channels {
+            data.extend_from_slice(&planes[&(at.part, channel)]);
+        }
+        set.insert(pass, Planes::from_vec(at.channels.len(), window.width, window.height, data));
+    }
+    Ok(set)
+}
+
+/// The values of `plane`, stored in `from`, at the pixels of `to`.
+fn crop(plane: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
+    if from == to {
+        return plane;
+    }
+    let mut out = vec![0.0; to.width * to.height];
+    // Overlap in absolute coordinates, as i64: windows may lie anywhere in i32.
+    let span = |a: i32, n: usize, b: i32, m: usize| {
+        let start = i64::from(a).max(i64::from(b));
+        let end = (i64::from(a) + n as i64).min(i64::from(b) + m as i64);
+        (start, (end - start).max(0) as usize)
+    };
+    let (x, columns) = span(from.x, from.width, to.x, to.width);
+    let (y, rows) = span(from.y, from.height, to.y, to.height);
+    if columns == 0 {
+        return out;
+    }
+    for row in 0..rows as i64 {
+        let source = (y + row - i64::from(from.y)) as usize * from.width + (x - i64::from(from.x)) as usize;
+        let target = (y + row - i64::from(to.y)) as usize * to.width + (x - i64::from(to.x)) as usize;
+        out[target..][..columns].copy_from_slice(&plane[source..][..columns]);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crop_moves_pixels_between_windows() {
+        let from = Window { x: -1, y: 0, width: 3, height: 2 };
+        let to = Window { x: 0, y: -1, width: 3, height: 2 };
+        // Stored: y 0: [10 11 12] at x -1..2; wanted: y -1..1, x 0..3.
+        let plane = vec![10.0, 11.0, 12.0, 20.0, 21.0, 22.0];
+        assert_eq!(crop(plane.clone(), from, to), [0.0, 0.0, 0.0, 11.0, 12.0, 0.0]);
+        let away = Window { x: 100, y: 100, ..to };
+        assert_eq!(crop(plane, from, away), [0.0; 6]);
+    }
+}

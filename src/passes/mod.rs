@@ -1,0 +1,203 @@
+//! What a render pass means: the one table from renderer channel names to passes, and the decoded
+//! passes of one view layer.
+//!
+//! In: a [`Frame`](crate::frame::Frame). Out: a [`PassSet`] of f32 planes. Nothing is scaled or
+//! clamped here; `features` decides what a network sees.
+
+mod layers;
+mod names;
+mod sanitize;
+
+use std::{
+    collections::BTreeMap,
+    fmt,
+    path::{Path, PathBuf},
+};
+
+pub use layers::{Layer, PassChannels, choose, layers, read, read_layer};
+pub use names::{NOISY_IMAGE, POSITION_AOV};
+
+use crate::{Error, Result, frame::Frame, planes::Planes};
+
+/// A render pass that demc knows by meaning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Pass {
+    /// Noisy radiance, RGB.
+    Combined,
+    /// Coverage of Combined, one channel.
+    Alpha,
+    /// World-space shading normal, XYZ.
+    Normal,
+    /// World position, XYZ: averaged over samples where a shader AOV holds it, else Cycles' own pass.
+    Position,
+    /// Colour of diffuse reflection at the first hit, RGB.
+    DiffuseColor,
+    /// Colour of glossy reflection at the first hit, RGB.
+    GlossyColor,
+    /// Colour of transmission at the first hit, RGB.
+    TransmissionColor,
+    /// Camera-space normal carried through mirrors and glass, XYZ.
+    DenoisingNormal,
+    /// Albedo carried through mirrors and glass, RGB.
+    DenoisingAlbedo,
+    /// Distance along the ray carried through mirrors and glass, one channel.
+    DenoisingDepth,
+    /// The radiance before Blender denoised Combined itself, RGB.
+    NoisyImage,
+    /// Light off diffuse surfaces straight from lights, divided by the diffuse colour, RGB.
+    DiffuseDirect,
+    /// Light off diffuse surfaces after further bounces, divided by the diffuse colour, RGB.
+    DiffuseIndirect,
+    /// As [`Pass::DiffuseDirect`], off glossy surfaces, RGB.
+    GlossyDirect,
+    /// As [`Pass::DiffuseIndirect`], off glossy surfaces, RGB.
+    GlossyIndirect,
+    /// As [`Pass::DiffuseDirect`], through transmissive surfaces, RGB.
+    TransmissionDirect,
+    /// As [`Pass::DiffuseIndirect`], through transmissive surfaces, RGB.
+    TransmissionIndirect,
+    /// Light scattered once in volumes, RGB.
+    VolumeDirect,
+    /// Light scattered several times in volumes, RGB.
+    VolumeIndirect,
+    /// Light emitted by surfaces seen directly, RGB.
+    Emission,
+    /// Background seen directly, RGB.
+    Environment,
+    /// Distance from the camera of the first sample, one channel; 1e10 where nothing is hit.
+    Depth,
+    /// Motion to the previous (XY) and next (ZW) frame in pixels, four channels.
+    Vector,
+}
+
+impl Pass {
+    /// Every pass.
+    pub const ALL: [Pass; 23] = [
+        Pass::Combined,
+        Pass::Alpha,
+        Pass::Normal,
+        Pass::Position,
+        Pass::DiffuseColor,
+        Pass::GlossyColor,
+        Pass::TransmissionColor,
+        Pass::DenoisingNormal,
+        Pass::DenoisingAlbedo,
+        Pass::DenoisingDepth,
+        Pass::NoisyImage,
+        Pass::DiffuseDirect,
+        Pass::DiffuseIndirect,
+        Pass::GlossyDirect,
+        Pass::GlossyIndirect,
+        Pass::TransmissionDirect,
+        Pass::TransmissionIndirect,
+        Pass::VolumeDirect,
+        Pass::VolumeIndirect,
+        Pass::Emission,
+        Pass::Environment,
+        Pass::Depth,
+        Pass::Vector,
+    ];
+
+    /// Channels of the pass.
+    pub fn channels(self) -> usize {
+        match self {
+            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth => 1,
+            Pass::Vector => 4,
+            _ => 3,
+        }
+    }
+
+    /// Where Blender turns the pass on, as a sentence part.
+    pub fn blender_setting(self) -> &'static str {
+        names::row(self).setting
+    }
+}
+
+impl fmt::Display for Pass {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Pass::Alpha => "Alpha",
+            Pass::Position => "Position",
+            other => names::row(*other).names[0],
+        })
+    }
+}
+
+/// The decoded passes of one view layer of one frame, all of one size.
+#[derive(Clone, Debug)]
+pub struct PassSet {
+    /// The file the passes came from, for messages.
+    pub path: PathBuf,
+    /// The view layer they belong to.
+    pub view_layer: String,
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    planes: BTreeMap<Pass, Planes>,
+}
+
+impl PassSet {
+    /// An empty set.
+    pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
+        Self { path: path.into(), view_layer: view_layer.into(), width, height, planes: BTreeMap::new() }
+    }
+
+    /// Adds or replaces a pass.
+    ///
+    /// # Panics
+    /// If the size or the channel count differs from what the set and the pass demand.
+    pub fn insert(&mut self, pass: Pass, planes: Planes) {
+        assert_eq!(
+            (planes.channels, planes.width, planes.height),
+            (pass.channels(), self.width, self.height)
+        );
+        self.planes.insert(pass, planes);
+    }
+
+    /// Takes a pass out of the set.
+    pub fn remove(&mut self, pass: Pass) -> Option<Planes> {
+        self.planes.remove(&pass)
+    }
+
+    /// The pass, if the view layer holds it.
+    pub fn get(&self, pass: Pass) -> Option<&Planes> {
+        self.planes.get(&pass)
+    }
+
+    /// The pass, or an error that names file, pass and remedy.
+    pub fn require(&self, pass: Pass, needed_by: &str) -> Result<&Planes> {
+        self.get(pass).ok_or_else(|| Error::MissingPass {
+            path: self.path.clone(),
+            view_layer: self.view_layer.clone(),
+            pass,
+            needed_by: needed_by.into(),
+        })
+    }
+
+    /// Every pass held.
+    pub fn iter(&self) -> impl Iterator<Item = (Pass, &Planes)> {
+        self.planes.iter().map(|(p, v)| (*p, v))
+    }
+
+    /// Where Blender denoised the render itself, Combined is the result and `Noisy Image` the render:
+    /// makes the render Combined. Returns whether there was one.
+    pub fn use_noisy_image(&mut self) -> bool {
+        match self.planes.remove(&Pass::NoisyImage) {
+            Some(noisy) => {
+                self.planes.insert(Pass::Combined, noisy);
+                true
+            }
+            None => false,
+        }
+    }
+}
+
+/// Reads a file and the passes of one view layer: the one named, the only one, or else the one with
+/// the most recognised passes. Stereo files give their first view.
+///
+/// # Errors
+/// The file is unusable, or has no such view layer.
+pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet> {
+    read(&Frame::read(path)?, view_layer)
+}
