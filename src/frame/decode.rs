@@ -79,9 +79,9 @@ fn channel_values(header: &Header, block: &UncompressedBlock, channel: usize) ->
     for y in 0..block.index.pixel_size.height() {
         let bytes = &block.data[row_bytes(header, block.index, channel, y)];
         match header.channels.list[channel].sample_type {
-            SampleType::F16 => values.extend(
-                bytes.as_chunks::<2>().0.iter().map(|b| half::f16::from_ne_bytes(*b).to_f32()),
-            ),
+            SampleType::F16 => {
+                values.extend(bytes.as_chunks::<2>().0.iter().map(|b| half::f16::from_ne_bytes(*b).to_f32()))
+            }
             SampleType::F32 => values.extend(bytes.as_chunks::<4>().0.iter().map(|b| f32::from_ne_bytes(*b))),
             SampleType::U32 => {
                 values.extend(bytes.as_chunks::<4>().0.iter().map(|b| u32::from_ne_bytes(*b) as f32));

@@ -122,7 +122,8 @@ mod tests {
     fn check(channel: &str, part: Option<&str>, views: &[&str], expected: (&str, &str, Option<&str>, &str)) {
         let views: Vec<String> = views.iter().map(ToString::to_string).collect();
         let name = ChannelName::parse(channel, part, None, &views);
-        let got = (name.view_layer.as_str(), name.pass.as_str(), name.view.as_deref(), name.component.as_str());
+        let got =
+            (name.view_layer.as_str(), name.pass.as_str(), name.view.as_deref(), name.component.as_str());
         assert_eq!(got, expected, "{channel} in part {part:?}");
     }
 
