@@ -1,1 +1,146 @@
-//! (skeleton)
+//! Convolution arithmetic on `f32`: slices in, slices out, no type of the project.
+//!
+//! Activations are stored channel-blocked and padded (NCHW16c): a [`Block`] is 16 consecutive channels
+//! of one pixel, a plane is `(h + 2 pad) x (w + 2 pad)` blocks whose border is zero, and an image is
+//! `ceil(c / 16)` planes. Lanes beyond `c` are zero in every activation.
+//!
+//! Each kernel is written once, generic over [`simd::Simd`]; the portable instance is the oracle of
+//! the AVX2 and AVX-512 ones, and [`simd::Tier`] chooses among them once at run time.
+//! This is the only module with `unsafe`.
+#![allow(unsafe_code)]
+
+pub mod conv;
+pub mod peak;
+pub mod pool;
+pub mod simd;
+pub mod weight_grad;
+
+/// Channels in a [`Block`].
+pub const LANES: usize = 16;
+
+/// Sixteen channels of one pixel, aligned to a cache line so that no vector load straddles two.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C, align(64))]
+pub struct Block(pub [f32; LANES]);
+
+/// The extent of a blocked activation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Shape {
+    /// Images.
+    pub n: usize,
+    /// Channels.
+    pub c: usize,
+    /// Rows.
+    pub h: usize,
+    /// Pixels in a row.
+    pub w: usize,
+    /// Zero pixels around every plane: 1 serves 3x3 and transposed 4x4 convolutions, 2 serves 5x5.
+    pub pad: usize,
+}
+
+impl Shape {
+    /// A shape with a border of one pixel.
+    pub fn new(n: usize, c: usize, h: usize, w: usize) -> Self {
+        Self { n, c, h, w, pad: 1 }
+    }
+
+    /// The same pixels with other channels.
+    pub fn with_channels(self, c: usize) -> Self {
+        Self { c, ..self }
+    }
+
+    /// The same channels with other rows and columns.
+    pub fn with_size(self, h: usize, w: usize) -> Self {
+        Self { h, w, ..self }
+    }
+
+    /// Planes of one image.
+    pub fn planes(self) -> usize {
+        self.c.div_ceil(LANES)
+    }
+
+    /// Blocks from one row to the next.
+    pub fn row_stride(self) -> usize {
+        self.w + 2 * self.pad
+    }
+
+    /// Blocks from one plane to the next.
+    pub fn plane_stride(self) -> usize {
+        (self.h + 2 * self.pad) * self.row_stride()
+    }
+
+    /// Blocks of the whole activation, borders included.
+    pub fn blocks(self) -> usize {
+        self.n * self.planes() * self.plane_stride()
+    }
+
+    /// Channels in use in plane `plane`: 16, or fewer in the last.
+    pub fn lanes(self, plane: usize) -> usize {
+        (self.c - plane * LANES).min(LANES)
+    }
+
+    /// Index of the block at row `y`, column 0.
+    pub fn row(self, n: usize, plane: usize, y: usize) -> usize {
+        (n * self.planes() + plane) * self.plane_stride() + (y + self.pad) * self.row_stride() + self.pad
+    }
+}
+
+/// A blocked activation to read.
+#[derive(Clone, Copy)]
+pub struct View<'a> {
+    /// Its extent.
+    pub shape: Shape,
+    /// `shape.blocks()` blocks.
+    pub data: &'a [Block],
+}
+
+/// A blocked activation to write. Kernels write interiors only: borders stay as they are.
+pub struct ViewMut<'a> {
+    /// Its extent.
+    pub shape: Shape,
+    /// `shape.blocks()` blocks.
+    pub data: &'a mut [Block],
+}
+
+impl<'a> View<'a> {
+    /// Pairs data with its shape.
+    ///
+    /// # Panics
+    /// If the length differs from what the shape demands.
+    pub fn new(shape: Shape, data: &'a [Block]) -> Self {
+        assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
+        Self { shape, data }
+    }
+}
+
+impl<'a> ViewMut<'a> {
+    /// Pairs data with its shape.
+    ///
+    /// # Panics
+    /// If the length differs from what the shape demands.
+    pub fn new(shape: Shape, data: &'a mut [Block]) -> Self {
+        assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
+        Self { shape, data }
+    }
+}
+
+/// A pointer that tasks share to write disjoint parts of one buffer.
+#[derive(Clone, Copy)]
+struct Shared(*mut Block);
+
+// SAFETY: every kernel that shares one gives each task its own rows of its own planes, so no two
+// tasks ever touch the same block.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    /// The pointer `offset` blocks on. A method, so that closures capture the whole wrapper.
+    ///
+    /// # Safety
+    /// `offset` lies inside the buffer.
+    unsafe fn at(self, offset: usize) -> *mut Block {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.add(offset) }
+    }
+}

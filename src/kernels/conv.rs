@@ -1,0 +1,416 @@
+//! Dense convolutions and their input gradients, all of them one register-tiled loop.
+//!
+//! Whatever the operation, an output pixel is a sum over taps: input pixel at a fixed offset times a
+//! 16x16 slab of weights. A k x k convolution has k*k taps; a transposed 4x4 convolution of stride 2
+//! is four interleaved output phases of 2x2 taps; its input gradient reads every second pixel through
+//! 16 taps; a 1x1 fusion of several sources is a one-tap convolution whose input planes come from
+//! several activations, so that nothing is ever concatenated.
+//!
+//! Packed weights are `[output plane][input plane][tap][16 input lanes]` blocks of 16 output lanes.
+
+use rayon::prelude::*;
+
+use super::{
+    Block, LANES, Shape, Shared, View, ViewMut,
+    simd::{Kernel, Simd, Tier},
+};
+
+/// What happens to the sum before it is stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Epilogue {
+    /// `max(0, .)`.
+    pub relu: bool,
+    /// Adds to what the output holds, instead of starting from the bias.
+    pub accumulate: bool,
+}
+
+/// The geometry of a convolution.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Geometry {
+    /// k x k, stride 1, "same" zero padding; k is odd.
+    Same(usize),
+    /// Transposed 4x4, stride 2, padding 1: doubles rows and columns.
+    Transposed,
+    /// 4x4, stride 2, padding 1: halves rows and columns; the input gradient of [`Geometry::Transposed`].
+    Strided,
+}
+
+impl Geometry {
+    /// Taps, which is also how many 16x16 slabs a pair of planes has.
+    pub fn taps(self) -> usize {
+        match self {
+            Geometry::Same(k) => k * k,
+            Geometry::Transposed | Geometry::Strided => 16,
+        }
+    }
+
+    /// Rows and columns of the output for `h` x `w` of input.
+    pub fn output(self, h: usize, w: usize) -> (usize, usize) {
+        match self {
+            Geometry::Same(_) => (h, w),
+            Geometry::Transposed => (2 * h, 2 * w),
+            Geometry::Strided => (h / 2, w / 2),
+        }
+    }
+
+    /// The border an input needs so that no tap leaves it.
+    fn reach(self) -> usize {
+        match self {
+            Geometry::Same(k) => k / 2,
+            Geometry::Transposed | Geometry::Strided => 1,
+        }
+    }
+}
+
+/// Blocks that packed weights take.
+pub fn packed_len(inputs: &[usize], outputs: usize, geometry: Geometry) -> usize {
+    let planes: usize = inputs.iter().map(|c| c.div_ceil(LANES)).sum();
+    outputs.div_ceil(LANES) * planes * geometry.taps() * LANES
+}
+
+/// Which way weights are used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// From inputs to outputs.
+    Forward,
+    /// From output gradients to input gradients: channels swapped, taps mirrored.
+    Backward,
+}
+
+/// Where the weight of (output, input, tap) lies in an unpacked tensor: convolutions are
+/// `(O, I, k, k)`, transposed ones `(I, O, 4, 4)`, as everywhere.
+pub fn weight_index(geometry: Geometry, outputs: usize, inputs: usize, o: usize, i: usize, t: usize) -> usize {
+    match geometry {
+        Geometry::Same(_) => (o * inputs + i) * geometry.taps() + t,
+        Geometry::Transposed | Geometry::Strided => (i * outputs + o) * geometry.taps() + t,
+    }
+}
+
+/// Packs the weights of a layer whose input channels come from `inputs` sources one after another.
+///
+/// For [`Direction::Backward`] the result serves the gradient of source `source` alone: its outputs
+/// are that source's channels and its single input is the layer's output.
+///
+/// # Panics
+/// If `weights` or `packed` have the wrong length.
+pub fn pack(
+    weights: &[f32],
+    inputs: &[usize],
+    outputs: usize,
+    geometry: Geometry,
+    direction: Direction,
+    source: usize,
+    packed: &mut [Block],
+) {
+    let taps = geometry.taps();
+    let total: usize = inputs.iter().sum();
+    assert_eq!(weights.len(), total * outputs * taps);
+    packed.fill(Block::default());
+    let first: usize = inputs[..source].iter().sum();
+    match direction {
+        Direction::Forward => {
+            assert_eq!(packed.len(), packed_len(inputs, outputs, geometry));
+            let planes: usize = inputs.iter().map(|c| c.div_ceil(LANES)).sum();
+            let (mut plane0, mut channel0) = (0, 0);
+            for &c in inputs {
+                for o in 0..outputs {
+                    for i in 0..c {
+                        let base = ((o / LANES) * planes + plane0 + i / LANES) * taps * LANES + i % LANES;
+                        for t in 0..taps {
+                            packed[base + t * LANES].0[o % LANES] =
+                                weights[weight_index(geometry, outputs, total, o, channel0 + i, t)];
+                        }
+                    }
+                }
+                plane0 += c.div_ceil(LANES);
+                channel0 += c;
+            }
+        }
+        Direction::Backward => {
+            let c = inputs[source];
+            assert_eq!(packed.len(), packed_len(&[outputs], c, geometry));
+            let planes = outputs.div_ceil(LANES);
+            for o in 0..outputs {
+                for i in 0..c {
+                    let base = ((i / LANES) * planes + o / LANES) * taps * LANES + o % LANES;
+                    for t in 0..taps {
+                        // Mirrored for a stride-1 convolution; a strided read visits the taps in order.
+                        let mirrored = if matches!(geometry, Geometry::Same(_)) { taps - 1 - t } else { t };
+                        packed[base + mirrored * LANES].0[i % LANES] =
+                            weights[weight_index(geometry, outputs, total, o, first + i, t)];
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// One tap: where the input pixel lies, in blocks from the output pixel's, and which slab it uses.
+#[derive(Clone, Copy)]
+struct Tap {
+    input: isize,
+    slab: usize,
+}
+
+/// `output = epilogue(bias + conv(sources, weights))`, or `output += ...` when accumulating.
+///
+/// `sources` are the input channels one after another, each with the same size; `weights` come from
+/// [`pack`]; `bias` is one block an output plane (ignored when accumulating).
+///
+/// # Panics
+/// If sizes, borders or lengths do not fit together.
+pub fn convolve(
+    tier: Tier,
+    sources: &[View],
+    weights: &[Block],
+    bias: &[Block],
+    geometry: Geometry,
+    epilogue: Epilogue,
+    output: ViewMut,
+) {
+    let input = sources[0].shape;
+    let channels: Vec<usize> = sources.iter().map(|s| s.shape.c).collect();
+    for source in sources {
+        assert_eq!((source.shape.n, source.shape.h, source.shape.w), (input.n, input.h, input.w));
+        assert_eq!(source.data.len(), source.shape.blocks());
+        assert!(source.shape.pad >= geometry.reach(), "border too small for {geometry:?}");
+    }
+    let out = output.shape;
+    assert_eq!(output.data.len(), out.blocks());
+    assert_eq!((out.n, (out.h, out.w)), (input.n, geometry.output(input.h, input.w)));
+    assert_eq!(weights.len(), packed_len(&channels, out.c, geometry));
+    assert!(epilogue.accumulate || bias.len() == out.planes());
+
+    // Two output planes share every broadcast input where the tier has registers for both. Bands of
+    // rows make enough tasks to keep every thread busy without cutting the rows themselves.
+    let groups = out.planes().div_ceil(2);
+    let phases = if geometry == Geometry::Transposed { 2 } else { 1 };
+    let rows = out.h / phases;
+    let bands = (64 / (out.n * groups).max(1)).clamp(1, rows.div_ceil(2).max(1));
+    let band = rows.div_ceil(bands).max(1);
+    let bands = rows.div_ceil(band);
+    let pointer = Shared(output.data.as_mut_ptr());
+    (0..groups * out.n * bands).into_par_iter().for_each(|task| {
+        let (group, rest) = (task / (out.n * bands), task % (out.n * bands));
+        let (n, y0) = (rest / bands, rest % bands * band);
+        tier.run(Band {
+            sources,
+            weights,
+            bias,
+            geometry,
+            epilogue,
+            out,
+            pointer,
+            n,
+            planes: (2 * group, out.planes().min(2 * group + 2)),
+            rows: (y0, rows.min(y0 + band)),
+        });
+    });
+}
+
+/// The work of one task: some rows of one or two output planes of one image.
+struct Band<'a> {
+    sources: &'a [View<'a>],
+    weights: &'a [Block],
+    bias: &'a [Block],
+    geometry: Geometry,
+    epilogue: Epilogue,
+    out: Shape,
+    pointer: Shared,
+    n: usize,
+    planes: (usize, usize),
+    rows: (usize, usize),
+}
+
+/// An input plane of the current row and how many of its lanes are in use.
+#[derive(Clone, Copy)]
+struct Plane {
+    pixel: *const Block,
+    lanes: usize,
+}
+
+impl Kernel for Band<'_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        // SAFETY: `convolve` checked that every buffer has its shape's length and that the inputs'
+        // borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
+        unsafe {
+            match self.geometry {
+                Geometry::Same(k) => {
+                    let taps = self.taps(0..k * k, |t| {
+                        (t / k, t % k, (t / k) as isize - (k / 2) as isize, (t % k) as isize - (k / 2) as isize)
+                    });
+                    self.rows::<S, 1>(&taps, 1, (0, 0));
+                }
+                // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
+                Geometry::Transposed => {
+                    for (py, px) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                        let taps = self.taps(0..4, |t| {
+                            let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
+                            (ky, kx, (py as isize + 1 - ky as isize) / 2, (px as isize + 1 - kx as isize) / 2)
+                        });
+                        self.rows::<S, 1>(&taps, 2, (py, px));
+                    }
+                }
+                Geometry::Strided => {
+                    let taps = self
+                        .taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
+                    self.rows::<S, 2>(&taps, 1, (0, 0));
+                }
+            }
+        }
+    }
+}
+
+impl Band<'_> {
+    /// Taps from `(ky, kx, dy, dx)`: the slab's place in the kernel and the input's offset.
+    #[inline(always)]
+    fn taps(
+        &self,
+        range: std::ops::Range<usize>,
+        place: impl Fn(usize) -> (usize, usize, isize, isize),
+    ) -> ([Tap; 25], usize) {
+        let k = if let Geometry::Same(k) = self.geometry { k } else { 4 };
+        let stride = self.sources[0].shape.row_stride() as isize;
+        let mut taps = [Tap { input: 0, slab: 0 }; 25];
+        let len = range.len();
+        for t in range {
+            let (ky, kx, dy, dx) = place(t);
+            taps[t] = Tap { input: dy * stride + dx, slab: (ky * k + kx) * LANES };
+        }
+        (taps, len)
+    }
+
+    /// Every row of the band for one output phase; `STEP` input pixels an output pixel.
+    #[inline(always)]
+    unsafe fn rows<S: Simd, const STEP: usize>(
+        &self,
+        taps: &([Tap; 25], usize),
+        spread: usize,
+        phase: (usize, usize),
+    ) {
+        let taps = &taps.0[..taps.1];
+        let mut inputs: Vec<Plane> = Vec::with_capacity(64);
+        for y in self.rows.0..self.rows.1 {
+            inputs.clear();
+            for source in self.sources {
+                let s = source.shape;
+                for plane in 0..s.planes() {
+                    let pixel = &source.data[s.row(self.n, plane, y * STEP)] as *const Block;
+                    inputs.push(Plane { pixel, lanes: s.lanes(plane) });
+                }
+            }
+            let width = self.out.w / spread;
+            // SAFETY: `y` is a row of the band, see `run`.
+            unsafe {
+                let at = |plane| {
+                    self.pointer.at(self.out.row(self.n, plane, y * spread + phase.0) + phase.1)
+                };
+                let (first, end) = self.planes;
+                if end - first == 2 && S::TILE.0 == 2 {
+                    self.row::<S, STEP, 2>(taps, &inputs, first, [at(first), at(first + 1)], width, spread);
+                } else {
+                    for plane in first..end {
+                        self.row::<S, STEP, 1>(taps, &inputs, plane, [at(plane)], width, spread);
+                    }
+                }
+            }
+        }
+    }
+
+    /// One row of `OUT` output planes, cut into tiles of nearly equal width.
+    #[inline(always)]
+    unsafe fn row<S: Simd, const STEP: usize, const OUT: usize>(
+        &self,
+        taps: &[Tap],
+        inputs: &[Plane],
+        plane: usize,
+        output: [*mut Block; OUT],
+        width: usize,
+        spread: usize,
+    ) {
+        // A single plane leaves registers free for more pixels, which hides the latency of its FMAs.
+        let tiles = width.div_ceil(S::TILE.1);
+        let mut x = 0;
+        for tile in 0..tiles {
+            let pixels = (width - x).div_ceil(tiles - tile);
+            let args = Tile { band: self, taps, inputs, plane, output, x, spread };
+            // SAFETY: `x + pixels <= width`.
+            unsafe {
+                match pixels {
+                    1 => args.run::<S, STEP, 1>(),
+                    2 => args.run::<S, STEP, 2>(),
+                    3 => args.run::<S, STEP, 3>(),
+                    4 => args.run::<S, STEP, 4>(),
+                    5 => args.run::<S, STEP, 5>(),
+                    6 => args.run::<S, STEP, 6>(),
+                    7 => args.run::<S, STEP, 7>(),
+                    8 => args.run::<S, STEP, 8>(),
+                    9 => args.run::<S, STEP, 9>(),
+                    10 => args.run::<S, STEP, 10>(),
+                    11 => args.run::<S, STEP, 11>(),
+                    12 => args.run::<S, STEP, 12>(),
+                    13 => args.run::<S, STEP, 13>(),
+                    _ => args.run::<S, STEP, 14>(),
+                }
+            }
+            x += pixels;
+        }
+    }
+}
+
+/// `PX` neighbouring pixels of `OUT` output planes.
+struct Tile<'a, const OUT: usize> {
+    band: &'a Band<'a>,
+    taps: &'a [Tap],
+    inputs: &'a [Plane],
+    plane: usize,
+    output: [*mut Block; OUT],
+    x: usize,
+    spread: usize,
+}
+
+impl<const OUT: usize> Tile<'_, OUT> {
+    #[inline(always)]
+    unsafe fn run<S: Simd, const STEP: usize, const PX: usize>(self) {
+        let slab = self.band.geometry.taps() * LANES;
+        let row = self.inputs.len() * slab;
+        // SAFETY: `convolve` checked the lengths that these offsets stay within.
+        unsafe {
+            let mut acc = [[S::splat(0.0); PX]; OUT];
+            let output: [*mut Block; OUT] = std::array::from_fn(|o| self.output[o].add(self.x * self.spread));
+            for (o, acc) in acc.iter_mut().enumerate() {
+                for (p, acc) in acc.iter_mut().enumerate() {
+                    *acc = if self.band.epilogue.accumulate {
+                        S::load(output[o].add(p * self.spread))
+                    } else {
+                        S::load(&self.band.bias[self.plane + o])
+                    };
+                }
+            }
+            let weights = self.band.weights.as_ptr().add(self.plane * row);
+            for (i, input) in self.inputs.iter().enumerate() {
+                let pixel = input.pixel.add(self.x * STEP);
+                for tap in self.taps {
+                    let pixel = pixel.offset(tap.input).cast::<f32>();
+                    let weights = weights.add(i * slab + tap.slab);
+                    for lane in 0..input.lanes {
+                        let w: [S::V; OUT] = std::array::from_fn(|o| S::load(weights.add(o * row + lane)));
+                        for p in 0..PX {
+                            let x = S::splat(*pixel.add(p * STEP * LANES + lane));
+                            for o in 0..OUT {
+                                acc[o][p] = S::fma(w[o], x, acc[o][p]);
+                            }
+                        }
+                    }
+                }
+            }
+            for (o, acc) in acc.iter().enumerate() {
+                for (p, &acc) in acc.iter().enumerate() {
+                    let v = if self.band.epilogue.relu { S::max(acc, S::splat(0.0)) } else { acc };
+                    S::store(output[o].add(p * self.spread), v);
+                }
+            }
+        }
+    }
+}

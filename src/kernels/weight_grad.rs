@@ -1,0 +1,221 @@
+//! Weight and bias gradients of the convolutions in [`super::conv`].
+
+use rayon::prelude::*;
+
+use super::{
+    Block, LANES, Shape, Shared, View,
+    conv::{Geometry, weight_index},
+    simd::{Kernel, Simd, Tier},
+};
+
+/// Lanes of the input that one pass over the pixels serves: 2 output planes x 8 lanes, or 1 x 8,
+/// accumulators stay in registers.
+const CHUNK: usize = 8;
+
+/// Adds the weight gradient of one source to `gradient`, laid out like the layer's weights
+/// (`(O, I, k, k)`, transposed: `(I, O, 4, 4)`); `first` is the source's first input channel of
+/// `inputs` in all.
+///
+/// Sums run in an order that depends on the shapes alone, so results do not change with the number
+/// of threads.
+///
+/// # Panics
+/// If sizes or lengths do not fit together.
+pub fn weight_gradient(
+    tier: Tier,
+    source: View,
+    output_gradient: View,
+    geometry: Geometry,
+    (first, inputs): (usize, usize),
+    gradient: &mut [f32],
+) {
+    let (s, g) = (source.shape, output_gradient.shape);
+    assert!(geometry != Geometry::Strided, "the strided convolution has no weights of its own");
+    assert_eq!((g.n, (g.h, g.w)), (s.n, geometry.output(s.h, s.w)));
+    assert_eq!((source.data.len(), output_gradient.data.len()), (s.blocks(), g.blocks()));
+    let taps = geometry.taps();
+    assert_eq!(gradient.len(), inputs * g.c * taps);
+
+    // Few planes leave too few tasks, so images become tasks as well, each with its own sum.
+    let pairs = g.planes().div_ceil(2) * s.planes();
+    let parts = if pairs >= 8 { 1 } else { s.n.min(8) };
+    let slabs = g.planes() * s.planes() * taps * LANES;
+    let mut partial = vec![Block::default(); slabs * parts];
+    let pointer = Shared(partial.as_mut_ptr());
+    (0..parts * pairs).into_par_iter().for_each(|task| {
+        let (part, pair) = (task / pairs, task % pairs);
+        let (group, input) = (pair / s.planes(), pair % s.planes());
+        tier.run(Pair {
+            source,
+            gradient: output_gradient,
+            geometry,
+            images: (part * s.n / parts, (part + 1) * s.n / parts),
+            input,
+            outputs: (2 * group, g.planes().min(2 * group + 2)),
+            pointer,
+            offset: part * slabs,
+        });
+    });
+
+    gradient.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
+        let (o, i) = match geometry {
+            Geometry::Same(_) => (at / inputs, at % inputs),
+            _ => (at % g.c, at / g.c),
+        };
+        if i < first || i >= first + s.c {
+            return;
+        }
+        debug_assert_eq!(weight_index(geometry, g.c, inputs, o, i, 0), at * taps);
+        let i = i - first;
+        for (t, value) in chunk.iter_mut().enumerate() {
+            let slab = (((o / LANES) * s.planes() + i / LANES) * taps + t) * LANES + i % LANES;
+            for part in 0..parts {
+                *value += partial[part * slabs + slab].0[o % LANES];
+            }
+        }
+    });
+}
+
+/// One input plane against one or two output planes.
+struct Pair<'a> {
+    source: View<'a>,
+    gradient: View<'a>,
+    geometry: Geometry,
+    images: (usize, usize),
+    input: usize,
+    outputs: (usize, usize),
+    pointer: Shared,
+    offset: usize,
+}
+
+impl Kernel for Pair<'_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        // SAFETY: `weight_gradient` checked the lengths; every task owns its slabs.
+        unsafe {
+            let (first, end) = self.outputs;
+            if S::TILE.0 == 2 && end - first == 2 {
+                self.taps::<S, 2>(first);
+            } else {
+                for output in first..end {
+                    self.taps::<S, 1>(output);
+                }
+            }
+        }
+    }
+}
+
+impl Pair<'_> {
+    #[inline(always)]
+    unsafe fn taps<S: Simd, const OUT: usize>(&self, output: usize) {
+        let taps = self.geometry.taps();
+        let s = self.source.shape;
+        // Rows are taken in bands that stay in the first-level cache over all taps.
+        let band = (256 / s.w.max(1)).clamp(1, s.h.max(1));
+        let lanes = s.lanes(self.input);
+        for n in self.images.0..self.images.1 {
+            for y0 in (0..s.h).step_by(band) {
+                let rows = (y0, s.h.min(y0 + band));
+                for t in 0..taps {
+                    // SAFETY: see `run`.
+                    unsafe {
+                        let slabs: [*mut Block; OUT] = std::array::from_fn(|o| {
+                            self.pointer.at(
+                                self.offset + (((output + o) * s.planes() + self.input) * taps + t) * LANES,
+                            )
+                        });
+                        for lane in (0..lanes).step_by(CHUNK) {
+                            let slabs = slabs.map(|p| p.add(lane));
+                            match self.geometry {
+                                Geometry::Same(k) => {
+                                    self.accumulate::<S, OUT, 1>(n, rows, output, lane, k, t, slabs)
+                                }
+                                _ => self.accumulate::<S, OUT, 2>(n, rows, output, lane, 4, t, slabs),
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// `slab[lane] += sum over pixels of input[lane] * gradient`, for `CHUNK` lanes and one tap;
+    /// `STEP` gradient pixels an input pixel.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
+    unsafe fn accumulate<S: Simd, const OUT: usize, const STEP: usize>(
+        &self,
+        n: usize,
+        rows: (usize, usize),
+        output: usize,
+        lane: usize,
+        k: usize,
+        tap: usize,
+        slabs: [*mut Block; OUT],
+    ) {
+        let (s, g) = (self.source.shape, self.gradient.shape);
+        let (ky, kx) = ((tap / k) as isize, (tap % k) as isize);
+        // Stride 1: the input moves with the tap. Transposed: out[2 m + k - 1] += in[m] w[k].
+        let centre = (k / 2) as isize;
+        let (input_shift, gradient_shift) = if STEP == 1 {
+            ((ky - centre) * s.row_stride() as isize + kx - centre, 0)
+        } else {
+            (0, (ky - 1) * g.row_stride() as isize + kx - 1)
+        };
+        // SAFETY: borders cover the taps' reach; `weight_gradient` checked the lengths.
+        unsafe {
+            let mut acc: [[S::V; CHUNK]; OUT] =
+                std::array::from_fn(|o| std::array::from_fn(|c| S::load(slabs[o].add(c))));
+            for y in rows.0..rows.1 {
+                let input = self.source.data.as_ptr().add(s.row(n, self.input, y)).offset(input_shift);
+                let input = input.cast::<f32>().add(lane);
+                let gradient: [*const Block; OUT] = std::array::from_fn(|o| {
+                    self.gradient.data.as_ptr().add(g.row(n, output + o, y * STEP)).offset(gradient_shift)
+                });
+                for x in 0..s.w {
+                    let g: [S::V; OUT] = std::array::from_fn(|o| S::load(gradient[o].add(x * STEP)));
+                    for c in 0..CHUNK {
+                        let v = S::splat(*input.add(x * LANES + c));
+                        for o in 0..OUT {
+                            acc[o][c] = S::fma(g[o], v, acc[o][c]);
+                        }
+                    }
+                }
+            }
+            for o in 0..OUT {
+                for c in 0..CHUNK {
+                    S::store(slabs[o].add(c), acc[o][c]);
+                }
+            }
+        }
+    }
+}
+
+/// Adds the bias gradient, the sum of the output gradient over images and pixels, to `gradient`.
+///
+/// # Panics
+/// If `gradient` is not one value a channel.
+pub fn bias_gradient(output_gradient: View, gradient: &mut [f32]) {
+    let g: Shape = output_gradient.shape;
+    assert_eq!(gradient.len(), g.c);
+    gradient.par_chunks_mut(LANES).enumerate().for_each(|(plane, chunk)| {
+        let mut total = [0.0f64; LANES];
+        for n in 0..g.n {
+            for y in 0..g.h {
+                // Row sums in f32, rows in f64: exact enough, and vectorised.
+                let mut sum = [0.0f32; LANES];
+                for block in &output_gradient.data[g.row(n, plane, y)..][..g.w] {
+                    for (s, v) in sum.iter_mut().zip(block.0) {
+                        *s += v;
+                    }
+                }
+                for (t, s) in total.iter_mut().zip(sum) {
+                    *t += f64::from(s);
+                }
+            }
+        }
+        for (value, total) in chunk.iter_mut().zip(total) {
+            *value += total as f32;
+        }
+    });
+}

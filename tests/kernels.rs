@@ -1,0 +1,233 @@
+//! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
+//! remainders included; and every tier against the portable one.
+
+use demc::kernels::{
+    Block, LANES, Shape, View, ViewMut,
+    conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
+    pool::{from_blocked, max_pool, max_pool_gradient, to_blocked},
+    simd::Tier,
+    weight_grad::{bias_gradient, weight_gradient},
+};
+use proptest::prelude::*;
+
+/// A reproducible stream of values in -1..1.
+fn noise(seed: u64, len: usize) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    (0..len)
+        .map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+        })
+        .collect()
+}
+
+fn blocked(shape: Shape, values: &[f32]) -> Vec<Block> {
+    let mut data = vec![Block::default(); shape.blocks()];
+    to_blocked(values, ViewMut::new(shape, &mut data));
+    data
+}
+
+fn plain(shape: Shape, data: &[Block]) -> Vec<f32> {
+    let mut out = vec![0.0; shape.n * shape.c * shape.h * shape.w];
+    from_blocked(View::new(shape, data), &mut out);
+    out
+}
+
+/// `out[n, o, y, x] += in[n, i, iy, ix] * w[o, i, t]` for every pair of pixels a tap connects.
+fn connections(
+    geometry: Geometry,
+    input: Shape,
+    outputs: usize,
+    mut visit: impl FnMut(usize, usize, usize),
+) {
+    let (oh, ow) = geometry.output(input.h, input.w);
+    let k = if let Geometry::Same(k) = geometry { k } else { 4 };
+    for n in 0..input.n {
+        for o in 0..outputs {
+            for i in 0..input.c {
+                for t in 0..k * k {
+                    for iy in 0..input.h as isize {
+                        for ix in 0..input.w as isize {
+                            let (ky, kx) = ((t / k) as isize, (t % k) as isize);
+                            let r = (k / 2) as isize;
+                            let (y, x) = match geometry {
+                                Geometry::Same(_) => (iy - ky + r, ix - kx + r),
+                                _ => (2 * iy + ky - 1, 2 * ix + kx - 1),
+                            };
+                            if y < 0 || x < 0 || y >= oh as isize || x >= ow as isize {
+                                continue;
+                            }
+                            let out = ((n * outputs + o) * oh + y as usize) * ow + x as usize;
+                            let inp = ((n * input.c + i) * input.h + iy as usize) * input.w + ix as usize;
+                            visit(out, inp, weight_index(geometry, outputs, input.c, o, i, t));
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn assert_close(got: &[f32], want: &[f64], what: &str) {
+    assert_eq!(got.len(), want.len());
+    let scale = want.iter().fold(1e-3f64, |m, v| m.max(v.abs()));
+    for (i, (g, w)) in got.iter().zip(want).enumerate() {
+        assert!((f64::from(*g) - w).abs() <= 2e-5 * scale, "{what}: element {i}: {g} for {w}");
+    }
+}
+
+/// Forward, input gradient and weight gradient of one layer on one tier.
+fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
+    let sources = if split == 0 || split >= shape.c { vec![shape.c] } else { vec![split, shape.c - split] };
+    let (oh, ow) = geometry.output(shape.h, shape.w);
+    let out_shape = shape.with_channels(outputs).with_size(oh, ow);
+    let x = noise(seed, shape.n * shape.c * shape.h * shape.w);
+    let w = noise(seed + 1, shape.c * outputs * geometry.taps());
+    let bias = noise(seed + 2, outputs);
+    let g = noise(seed + 3, shape.n * outputs * oh * ow);
+
+    let mut want: Vec<f64> = (0..g.len()).map(|i| f64::from(bias[i / (oh * ow) % outputs])).collect();
+    let mut want_dx = vec![0.0f64; x.len()];
+    let mut want_dw = vec![0.0f64; w.len()];
+    connections(geometry, shape, outputs, |o, i, k| {
+        want[o] += f64::from(x[i]) * f64::from(w[k]);
+        want_dx[i] += f64::from(g[o]) * f64::from(w[k]);
+        want_dw[k] += f64::from(g[o]) * f64::from(x[i]);
+    });
+
+    // Split the channels of x over the sources.
+    let pixels = shape.h * shape.w;
+    let mut first = 0;
+    let parts: Vec<(Shape, Vec<Block>, usize)> = sources
+        .iter()
+        .map(|&c| {
+            let values: Vec<f32> = (0..shape.n)
+                .flat_map(|n| x[(n * shape.c + first) * pixels..][..c * pixels].to_vec())
+                .collect();
+            first += c;
+            let s = shape.with_channels(c);
+            (s, blocked(s, &values), first - c)
+        })
+        .collect();
+    let views: Vec<View> = parts.iter().map(|(s, d, _)| View::new(*s, d)).collect();
+    let mut packed = vec![Block::default(); packed_len(&sources, outputs, geometry)];
+    pack(&w, &sources, outputs, geometry, Direction::Forward, 0, &mut packed);
+    let mut bias_blocks = vec![Block::default(); outputs.div_ceil(LANES)];
+    for (i, b) in bias.iter().enumerate() {
+        bias_blocks[i / LANES].0[i % LANES] = *b;
+    }
+    let mut out = vec![Block::default(); out_shape.blocks()];
+    let what = format!("{tier:?} {geometry:?} {shape:?} -> {outputs}");
+    convolve(tier, &views, &packed, &bias_blocks, geometry, Epilogue::default(), ViewMut::new(out_shape, &mut out));
+    assert_close(&plain(out_shape, &out), &want, &format!("{what} forward"));
+    let relu = Epilogue { relu: true, accumulate: false };
+    convolve(tier, &views, &packed, &bias_blocks, geometry, relu, ViewMut::new(out_shape, &mut out));
+    let rectified: Vec<f64> = want.iter().map(|v| v.max(0.0)).collect();
+    assert_close(&plain(out_shape, &out), &rectified, &format!("{what} relu"));
+
+    let g_blocks = blocked(out_shape, &g);
+    let g_view = View::new(out_shape, &g_blocks);
+    let mut dw = vec![0.0; w.len()];
+    for (index, (s, data, first)) in parts.iter().enumerate() {
+        weight_gradient(tier, View::new(*s, data), g_view, geometry, (*first, shape.c), &mut dw);
+        let mut packed = vec![Block::default(); packed_len(&[outputs], s.c, geometry)];
+        pack(&w, &sources, outputs, geometry, Direction::Backward, index, &mut packed);
+        let mut dx = blocked(*s, &vec![0.5; s.n * s.c * pixels]);
+        let back = if geometry == Geometry::Transposed { Geometry::Strided } else { geometry };
+        let add = Epilogue { relu: false, accumulate: true };
+        convolve(tier, &[g_view], &packed, &[], back, add, ViewMut::new(*s, &mut dx));
+        let want: Vec<f64> = (0..shape.n)
+            .flat_map(|n| want_dx[(n * shape.c + first) * pixels..][..s.c * pixels].to_vec())
+            .map(|v| v + 0.5)
+            .collect();
+        assert_close(&plain(*s, &dx), &want, &format!("{what} input gradient {index}"));
+    }
+    assert_close(&dw, &want_dw, &format!("{what} weight gradient"));
+    let mut db = vec![0.0; outputs];
+    bias_gradient(g_view, &mut db);
+    let want_db: Vec<f64> = (0..outputs)
+        .map(|o| {
+            (0..g.len()).filter(|i| i / (oh * ow) % outputs == o).map(|i| f64::from(g[i])).sum()
+        })
+        .collect();
+    assert_close(&db, &want_db, &format!("{what} bias gradient"));
+}
+
+fn geometry() -> impl Strategy<Value = Geometry> {
+    prop_oneof![
+        Just(Geometry::Same(1)),
+        Just(Geometry::Same(3)),
+        Just(Geometry::Same(5)),
+        Just(Geometry::Transposed)
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+
+    #[test]
+    fn layers_match_the_textbook_sum_on_every_tier(
+        geometry in geometry(),
+        n in 1usize..3, c in 1usize..40, outputs in 1usize..50, h in 1usize..9, w in 1usize..33,
+        split in 0usize..40, seed in any::<u64>(),
+    ) {
+        let shape = Shape { pad: 2, ..Shape::new(n, c, h, w) };
+        for tier in Tier::available() {
+            check_layer(tier, geometry, shape, split, outputs, seed);
+        }
+    }
+
+    #[test]
+    fn pooling_takes_the_maximum_and_returns_its_gradient_once(
+        n in 1usize..3, c in 1usize..20, h in 1usize..6, w in 1usize..10, seed in any::<u64>(),
+    ) {
+        let shape = Shape::new(n, c, 2 * h, 2 * w);
+        let half = shape.with_size(h, w);
+        // Few distinct values make ties.
+        let x: Vec<f32> = noise(seed, n * c * 4 * h * w).iter().map(|v| (v * 2.0).round()).collect();
+        let g = noise(seed + 1, n * c * h * w);
+        let xb = blocked(shape, &x);
+        let mut out = vec![Block::default(); half.blocks()];
+        max_pool(View::new(shape, &xb), ViewMut::new(half, &mut out));
+        let out = plain(half, &out);
+        let mut dx = vec![Block::default(); shape.blocks()];
+        let gb = blocked(half, &g);
+        max_pool_gradient(View::new(shape, &xb), View::new(half, &gb), ViewMut::new(shape, &mut dx));
+        let dx = plain(shape, &dx);
+        for (o, (&v, &grad)) in out.iter().zip(&g).enumerate() {
+            let (image, y, x0) = (o / (h * w), o / w % h, o % w);
+            let at = [(0, 0), (0, 1), (1, 0), (1, 1)]
+                .map(|(dy, dx)| (image * 2 * h + 2 * y + dy) * 2 * w + 2 * x0 + dx);
+            let first = at.into_iter().find(|&i| x[i] == v).expect("the maximum is one of the four");
+            prop_assert!(at.iter().all(|&i| x[i] <= v));
+            for i in at {
+                prop_assert_eq!(dx[i], if i == first { grad } else { 0.0 });
+            }
+        }
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let shape = Shape::new(3, 24, 12, 20);
+    let x = blocked(shape, &noise(1, 3 * 24 * 12 * 20));
+    let g = blocked(shape, &noise(2, 3 * 24 * 12 * 20));
+    let run = |threads: usize| {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a small pool").install(|| {
+            let mut dw = vec![0.0; 24 * 24 * 9];
+            let geometry = Geometry::Same(3);
+            weight_gradient(
+                Tier::detect(),
+                View::new(shape, &x),
+                View::new(shape, &g),
+                geometry,
+                (0, 24),
+                &mut dw,
+            );
+            dw
+        })
+    };
+    assert_eq!(run(1), run(5));
+}
