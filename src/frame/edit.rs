@@ -1,3 +1,368 @@
-//! (edit)
-pub struct NewChannel;
-pub struct Recoded;
+//! Adding and replacing layers. Parts left alone keep their compressed chunks; the part that takes
+//! channels is recompressed from its raw bytes, so kept channels never pass through f32.
+//!
+//! In: full-resolution f32 planes. Out: the frame, ready to be written.
+
+use std::fmt;
+
+use exr::{
+    block::{BlockIndex, UncompressedBlock},
+    compression::Compression,
+    math::Vec2,
+    meta::{
+        BlockDescription, MetaData,
+        attribute::{ChannelDescription, ChannelList, LineOrder, SampleType, Text},
+        compute_level_size,
+        header::{Header, LayerAttributes},
+    },
+};
+use half::f16;
+use rayon::prelude::*;
+
+use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text};
+use crate::Result;
+
+/// A channel to store: values of the whole data window, row-major.
+#[derive(Clone, Copy, Debug)]
+pub struct NewChannel<'a> {
+    /// Component name: `R`, `G`, `B`, `A` ...
+    pub component: &'a str,
+    /// Number type to store. Halves hold at most 65504: larger values are stored as that.
+    pub kind: SampleKind,
+    /// `height * width` values.
+    pub values: &'a [f32],
+}
+
+/// A part had to change its compression, because compressing its other channels a second time with
+/// the lossy kind it had would have lost more. They are now stored as ZIP, exactly as they decoded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Recoded {
+    /// The lossy compression it had.
+    pub from: &'static str,
+}
+
+impl fmt::Display for Recoded {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "stored as ZIP instead of {}, which loses a little each time it is written",
+            self.from.to_uppercase()
+        )
+    }
+}
+
+/// Channels by full name, bound for one part.
+type Named<'a> = Vec<(String, NewChannel<'a>)>;
+
+impl Frame {
+    /// Adds the layer `name` (such as `ViewLayer.Denoised`) with the data window of the part `beside`,
+    /// or replaces the channels of that name. A multi-part file gets a new part after the others, a
+    /// single-part file new channels.
+    ///
+    /// # Errors
+    /// The part cannot be decoded or encoded.
+    ///
+    /// # Panics
+    /// If a channel has not as many values as the part has pixels.
+    pub fn set_layer(
+        &mut self,
+        beside: usize,
+        name: &str,
+        channels: &[NewChannel<'_>],
+    ) -> Result<Option<Recoded>> {
+        let header = self.header(beside)?.clone();
+        for channel in channels {
+            assert_eq!(channel.values.len(), header.layer_size.area(), "one value for each pixel");
+        }
+        let named: Named<'_> = channels.iter().map(|c| (format!("{name}.{}", c.component), *c)).collect();
+        let holder = self.parts.iter().position(|p| p.channels.iter().any(|c| c.name == named[0].0));
+        match holder {
+            Some(part) => self.set_channels(part, &named),
+            None if self.is_part_per_pass(beside) => {
+                self.add_part(&header, name, &named)?;
+                Ok(None)
+            }
+            None => self.set_channels(beside, &named),
+        }
+    }
+
+    /// Overwrites existing channels of a part, by index.
+    ///
+    /// # Errors
+    /// The part cannot be decoded or encoded.
+    ///
+    /// # Panics
+    /// If a channel has not as many values as the part has pixels.
+    pub fn replace(&mut self, part: usize, channels: &[(usize, &[f32])]) -> Result<Option<Recoded>> {
+        let header = self.header(part)?;
+        let named: Named<'_> = channels
+            .iter()
+            .map(|&(index, values)| {
+                assert_eq!(values.len(), header.layer_size.area(), "one value for each pixel");
+                let stored = &self.parts[part].channels[index];
+                (stored.name.clone(), NewChannel { component: "", kind: stored.kind, values })
+            })
+            .collect();
+        self.set_channels(part, &named)
+    }
+
+    /// Blender 5 writes one part per pass: a file of several parts, or of one that is named like all of
+    /// its channels (`ViewLayer.Combined`).
+    fn is_part_per_pass(&self, part: usize) -> bool {
+        let of_its_own = |p: &super::Part| match &p.name {
+            Some(name) if name.contains('.') => p
+                .channels
+                .iter()
+                .all(|c| c.name.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('.'))),
+            _ => false,
+        };
+        self.is_multi_part() || of_its_own(&self.parts[part])
+    }
+
+    fn add_part(&mut self, like: &Header, name: &str, channels: &Named<'_>) -> Result<()> {
+        let own = &like.own_attributes;
+        let blocks = match like.blocks {
+            BlockDescription::ScanLines => BlockDescription::ScanLines,
+            BlockDescription::Tiles(mut tiles) => {
+                tiles.level_mode = exr::meta::attribute::LevelMode::Singular;
+                BlockDescription::Tiles(tiles)
+            }
+        };
+        let mut header = like.clone().with_encoding(like.compression, blocks, like.line_order);
+        header.channels = channel_list(channels.iter().map(|(n, c)| describe(n, c.kind)).collect());
+        header.own_attributes = LayerAttributes {
+            layer_name: Some(text(name)),
+            layer_position: own.layer_position,
+            screen_window_center: own.screen_window_center,
+            screen_window_width: own.screen_window_width,
+            view_name: own.view_name.clone(),
+            ..LayerAttributes::default()
+        };
+        let part = self.meta.headers.len();
+        self.meta.headers.push(header);
+        let encoder = Encoder::new(&self.meta, part, None, channels);
+        let header = &self.meta.headers[part];
+        let chunks = header
+            .enumerate_ordered_blocks()
+            .collect::<Vec<_>>()
+            .into_par_iter()
+            .map(|(index, tile)| {
+                let at = header.get_absolute_block_pixel_coordinates(tile.location)?;
+                let at = BlockIndex {
+                    layer: part,
+                    pixel_position: at.position.to_usize("block position")?,
+                    pixel_size: at.size,
+                    level: tile.location.level_index,
+                };
+                encoder.encode(index, at, None)
+            })
+            .collect::<exr::error::Result<Vec<_>>>();
+        match chunks {
+            Ok(chunks) => {
+                self.chunks.extend(chunks);
+                self.describe();
+                Ok(())
+            }
+            Err(error) => {
+                self.meta.headers.pop();
+                Err(Self::error(&self.path, error))
+            }
+        }
+    }
+
+    /// Adds channels to a part, or replaces those of the same name.
+    fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
+        self.refuse_subsampling(part)?;
+        let old = self.header(part)?.clone();
+        let is_new = |name: &Text| new.iter().any(|(n, _)| text(n) == *name);
+        let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name));
+        let loses = kept().any(|c| !survives(old.compression, c.sample_type));
+        let compression = if loses { Compression::ZIP16 } else { old.compression };
+
+        let mut meta = self.meta.clone();
+        let list = kept().cloned().chain(new.iter().map(|(n, c)| describe(n, c.kind))).collect();
+        let mut header = old.clone().with_encoding(compression, old.blocks, old.line_order);
+        header.channels = channel_list(list);
+        meta.headers[part] = header;
+
+        let encoder = Encoder::new(&meta, part, Some(&old), new);
+        let encoded: Vec<Vec<StoredChunk>> = self
+            .chunks
+            .par_iter()
+            .filter(|stored| stored.part == part)
+            .map(|stored| encoder.recode(stored.index, &self.decompress(stored)?, &self.path))
+            .collect::<Result<_>>()?;
+        drop(encoder);
+
+        // New chunks take the old ones' places in the file.
+        let mut encoded = encoded.into_iter();
+        let mut chunks = Vec::with_capacity(self.chunks.len());
+        for stored in std::mem::take(&mut self.chunks) {
+            match stored.part == part {
+                true => chunks.extend(encoded.next().expect("every chunk of the part was encoded")),
+                false => chunks.push(stored),
+            }
+        }
+        self.chunks = chunks;
+        self.meta = meta;
+        self.describe();
+        Ok(loses.then(|| Recoded { from: super::compression_name(old.compression) }))
+    }
+}
+
+/// Whether channels that this compression once stored and decoded come out the same when stored so
+/// again: lossless kinds, and PXR24, whose 24-bit floats are exact the second time.
+fn survives(compression: Compression, kind: SampleType) -> bool {
+    compression == Compression::PXR24 || compression.is_lossless_for(kind)
+}
+
+fn describe(name: &str, kind: SampleKind) -> ChannelDescription {
+    let kind = match kind {
+        SampleKind::Half => SampleType::F16,
+        SampleKind::Float => SampleType::F32,
+        SampleKind::Uint => SampleType::U32,
+    };
+    // Not "perceptually linear": radiance, as Blender marks it.
+    ChannelDescription::new(text(name), kind, false)
+}
+
+fn channel_list(mut channels: Vec<ChannelDescription>) -> ChannelList {
+    channels.sort_by(|a, b| a.name.as_slice().cmp(b.name.as_slice()));
+    ChannelList::new(channels.into())
+}
+
+/// Where a channel of the new part comes from.
+enum Source<'a> {
+    /// The channel at this index of the part as it was.
+    Kept(usize),
+    New(&'a [f32]),
+}
+
+/// Builds the blocks of one part from its old blocks and new planes.
+struct Encoder<'a> {
+    meta: &'a MetaData,
+    part: usize,
+    old: Option<&'a Header>,
+    /// One for each channel of the new part.
+    sources: Vec<Source<'a>>,
+}
+
+impl<'a> Encoder<'a> {
+    fn new(meta: &'a MetaData, part: usize, old: Option<&'a Header>, new: &'a Named<'a>) -> Self {
+        let source = |channel: &ChannelDescription| {
+            let fresh = new.iter().find(|(n, _)| text(n) == channel.name);
+            fresh.map(|(_, c)| Source::New(c.values)).unwrap_or_else(|| {
+                let kept = old.and_then(|h| h.channels.find_index_of_channel(&channel.name));
+                Source::Kept(kept.expect("a channel that is not new was there before"))
+            })
+        };
+        let sources = meta.headers[part].channels.list.iter().map(source).collect();
+        Self { meta, part, old, sources }
+    }
+
+    fn header(&self) -> &Header {
+        &self.meta.headers[self.part]
+    }
+
+    /// The new chunks of one old block: one, or several where ZIP's 16 rows replace longer blocks
+    /// (all block heights divide one another, and blocks start at the top of the data window).
+    fn recode(
+        &self,
+        index: usize,
+        block: &UncompressedBlock,
+        path: &std::path::Path,
+    ) -> Result<Vec<StoredChunk>> {
+        let whole = block.index;
+        let rows = match self.header().blocks {
+            BlockDescription::Tiles(_) => whole.pixel_size.height(),
+            BlockDescription::ScanLines => self.header().compression.scan_lines_per_block(),
+        };
+        let (top, height) = (whole.pixel_position.y(), whole.pixel_size.height());
+        let mut chunks = (0..height)
+            .step_by(rows)
+            .map(|y| {
+                let at = BlockIndex {
+                    pixel_position: Vec2(whole.pixel_position.x(), top + y),
+                    pixel_size: Vec2(whole.pixel_size.width(), rows.min(height - y)),
+                    ..whole
+                };
+                let index = match self.header().blocks {
+                    BlockDescription::Tiles(_) => index,
+                    BlockDescription::ScanLines => (top + y) / rows,
+                };
+                self.encode(index, at, Some((block, y)))
+            })
+            .collect::<exr::error::Result<Vec<_>>>()
+            .map_err(|e| Frame::error(path, e))?;
+        if self.header().line_order == LineOrder::Decreasing {
+            chunks.reverse();
+        }
+        Ok(chunks)
+    }
+
+    /// One block: kept channels from the old block (from its row `y` on), new ones from their planes.
+    fn encode(
+        &self,
+        index: usize,
+        at: BlockIndex,
+        old: Option<(&UncompressedBlock, usize)>,
+    ) -> exr::error::Result<StoredChunk> {
+        let header = self.header();
+        let mut data = Vec::with_capacity(at.pixel_size.area() * header.channels.bytes_per_pixel);
+        for row in 0..at.pixel_size.height() {
+            for (channel, source) in header.channels.list.iter().zip(&self.sources) {
+                match (source, old, self.old) {
+                    (Source::Kept(c), Some((block, y)), Some(old_header)) => {
+                        data.extend_from_slice(&block.data[row_bytes(old_header, block.index, *c, y + row)]);
+                    }
+                    (Source::Kept(_), ..) => unreachable!("kept channels come with the old block"),
+                    (Source::New(values), ..) => {
+                        let line = self.line(values, at, row);
+                        push_values(&mut data, &line, channel.sample_type);
+                    }
+                }
+            }
+        }
+        let block = UncompressedBlock { index: at, data };
+        let chunk = block.compress_to_chunk(&self.meta.headers)?;
+        Ok(StoredChunk { part: self.part, index, chunk })
+    }
+
+    /// One row of a block of new values; smaller resolution levels take the mean of what they cover.
+    fn line(&self, values: &'a [f32], at: BlockIndex, row: usize) -> std::borrow::Cow<'a, [f32]> {
+        let (width, height) = (self.header().layer_size.width(), self.header().layer_size.height());
+        let (x0, y) = (at.pixel_position.x(), at.pixel_position.y() + row);
+        let count = at.pixel_size.width();
+        if at.level == Vec2(0, 0) {
+            return values[y * width + x0..][..count].into();
+        }
+        let BlockDescription::Tiles(tiles) = self.header().blocks else {
+            unreachable!("only tiled parts have resolution levels")
+        };
+        let level_width = compute_level_size(tiles.rounding_mode, width, at.level.x());
+        let level_height = compute_level_size(tiles.rounding_mode, height, at.level.y());
+        let span = |i: usize, small: usize, full: usize| {
+            let start = i * full / small;
+            start..((i + 1) * full / small).max(start + 1)
+        };
+        let mean = |x: usize| {
+            let (columns, rows) = (span(x, level_width, width), span(y, level_height, height));
+            let n = (columns.len() * rows.len()) as f32;
+            rows.flat_map(|y| &values[y * width..][columns.clone()]).sum::<f32>() / n
+        };
+        (x0..x0 + count).map(mean).collect()
+    }
+}
+
+/// Appends values in native byte order, as `exr` wants uncompressed blocks.
+fn push_values(data: &mut Vec<u8>, values: &[f32], kind: SampleType) {
+    match kind {
+        // A finite value beyond the range of half must not become infinite.
+        SampleType::F16 => data.extend(values.iter().flat_map(|&v| {
+            let clamped = if v.is_finite() { v.clamp(f16::MIN.to_f32(), f16::MAX.to_f32()) } else { v };
+            f16::from_f32(clamped).to_ne_bytes()
+        })),
+        SampleType::F32 => data.extend(values.iter().flat_map(|v| v.to_ne_bytes())),
+        SampleType::U32 => data.extend(values.iter().flat_map(|v| (v.round() as u32).to_ne_bytes())),
+    }
+}

@@ -16,10 +16,15 @@ use std::{
 
 use exr::{
     block::chunk::Chunk,
-    meta::{BlockDescription, MetaData, attribute::SampleType, header::Header},
+    meta::{
+        BlockDescription, MetaData,
+        attribute::{SampleType, Text},
+        header::Header,
+    },
 };
 
 pub use edit::{NewChannel, Recoded};
+pub use write::atomically;
 
 use crate::{Error, Result};
 
@@ -129,7 +134,7 @@ impl Frame {
     pub fn views(&self) -> Vec<String> {
         let declared = self.meta.headers.iter().filter_map(|h| h.own_attributes.multi_view_names.as_ref());
         let own = self.parts.iter().filter_map(|p| p.view.clone());
-        let mut views: Vec<String> = declared.flatten().map(ToString::to_string).chain(own).collect();
+        let mut views: Vec<String> = declared.flatten().map(string).chain(own).collect();
         let mut seen = std::collections::HashSet::new();
         views.retain(|v| seen.insert(v.clone()));
         views
@@ -178,14 +183,14 @@ impl Frame {
 impl Part {
     fn new(header: &Header, stored_bytes: usize) -> Self {
         let channels = header.channels.list.iter().map(|c| Channel {
-            name: c.name.to_string(),
+            name: string(&c.name),
             kind: c.sample_type.into(),
             subsampled: c.sampling != exr::math::Vec2(1, 1),
         });
         let position = header.own_attributes.layer_position;
         Self {
-            name: header.own_attributes.layer_name.as_ref().map(ToString::to_string),
-            view: header.own_attributes.view_name.as_ref().map(ToString::to_string),
+            name: header.own_attributes.layer_name.as_ref().map(string),
+            view: header.own_attributes.view_name.as_ref().map(string),
             channels: channels.collect(),
             compression: compression_name(header.compression),
             tiles: match header.blocks {
@@ -239,6 +244,15 @@ fn compression_name(compression: exr::compression::Compression) -> &'static str 
         C::HTJ2K32 => "htj2k32",
         C::HTJ2K256 => "htj2k256",
     }
+}
+
+/// EXR text is bytes without a declared encoding: Blender writes UTF-8; Latin-1 reads anything else.
+fn string(text: &Text) -> String {
+    std::str::from_utf8(text.as_slice()).map_or_else(|_| text.to_string(), str::to_owned)
+}
+
+fn text(string: &str) -> Text {
+    Text::from_slice_unchecked(string.as_bytes())
 }
 
 fn chunk_bytes(chunk: &Chunk) -> usize {
