@@ -1,1 +1,22 @@
-//! (skeleton)
+//! Differentiable image operations on dfdx's tape, over [`crate::kernels`].
+//!
+//! dfdx 0.13 has no convolution on stable Rust, so these operations are demc's own. An
+//! [`Activation`] keeps its values in the kernels' blocked layout from the first layer to the last
+//! and carries a dfdx tape; parameters, losses and the optimiser are ordinary dfdx tensors.
+
+mod activation;
+mod layers;
+mod param;
+mod pool;
+pub mod weights;
+
+pub use activation::Activation;
+pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
+pub use param::{Init, Param, Rng};
+pub use pool::clear as clear_buffers;
+
+use dfdx::tensor::Cpu;
+
+/// A dfdx tensor of images, (N, C, H, W).
+pub type Images<T = dfdx::tensor::NoneTape> =
+    dfdx::tensor::Tensor<(usize, usize, usize, usize), f32, Cpu, T>;

@@ -1,0 +1,126 @@
+//! Activations in the blocked layout, with a dfdx tape and a place for their gradient.
+
+use std::{cell::RefCell, rc::Rc, sync::Arc};
+
+use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
+
+use super::{Images, pool::Buffer};
+use crate::kernels::{
+    Shape,
+    pool::{from_blocked, to_blocked},
+};
+
+/// The gradient of one activation while the tape runs backward; `None` until something flows in.
+pub(super) type Gradient = Rc<RefCell<Option<Buffer>>>;
+
+/// What an operation remembers of an activation: its values, and where its gradient goes.
+#[derive(Clone, Debug)]
+pub(super) struct Saved {
+    pub data: Arc<Buffer>,
+    /// `None` for network inputs, whose gradient nobody asks for.
+    pub gradient: Option<Gradient>,
+}
+
+/// The output of a layer: shared values in the kernels' blocked layout and the tape that made them.
+///
+/// dfdx's tape orders the backward operations; the gradients of activations live beside the
+/// activations, in the same blocked layout, and only those of parameters in dfdx's `Gradients`.
+#[derive(Debug)]
+pub struct Activation<T = NoneTape> {
+    pub(super) saved: Saved,
+    pub(super) tape: T,
+}
+
+impl<T: Tape<f32, Cpu>> Activation<T> {
+    /// A network input from `(N, C, H, W)` values, with an empty tape. No gradient flows into it.
+    ///
+    /// # Panics
+    /// If the length of `values` is not what `shape` demands.
+    pub fn input(shape: Shape, values: &[f32]) -> Self {
+        let mut data = Buffer::new(shape);
+        to_blocked(values, data.view_mut());
+        Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
+    }
+
+    /// A network input from a dfdx tensor, whose gradient is written to the tensor's.
+    pub fn from_images(images: Images<T>) -> Self {
+        let (images, mut tape) = images.split_tape();
+        let &(n, c, h, w) = dfdx::shapes::HasShape::shape(&images);
+        let shape = Shape::new(n, c, h, w);
+        let mut data = Buffer::new(shape);
+        to_blocked(&images.as_vec(), data.view_mut());
+        let gradient = Gradient::default();
+        if T::OWNS_TAPE {
+            let gradient = gradient.clone();
+            tape.add_backward_op(move |gradients| {
+                if let Some(g) = gradient.take() {
+                    let mut values = vec![0.0; n * c * h * w];
+                    from_blocked(g.view(), &mut values);
+                    let into = gradients.get_or_alloc_mut(&images)?;
+                    into.iter_mut().zip(&values).for_each(|(a, b)| *a += b);
+                }
+                Ok(())
+            });
+        }
+        Self { saved: Saved { data: Arc::new(data), gradient: Some(gradient) }, tape }
+    }
+
+    /// A second handle on the same activation, with an empty tape: the other branch of a skip.
+    pub fn fork(&self) -> Self {
+        Self { saved: self.saved.clone(), tape: T::default() }
+    }
+
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        self.saved.data.shape()
+    }
+
+    /// The values as a dfdx tensor, (N, C, H, W), with the tape.
+    pub fn into_images(self) -> Images<T> {
+        let Shape { n, c, h, w, .. } = self.shape();
+        let mut values = vec![0.0; n * c * h * w];
+        from_blocked(self.saved.data.view(), &mut values);
+        let images: Images = Cpu::default().tensor_from_vec(values, (n, c, h, w));
+        let mut tape = self.tape;
+        if T::OWNS_TAPE {
+            let (of_tensor, saved) = (images.clone(), self.saved);
+            tape.add_backward_op(move |gradients| {
+                let values = std::mem::take(&mut **gradients.get_or_alloc_mut(&of_tensor)?);
+                saved.accumulate(|gradient, fresh| {
+                    if fresh {
+                        to_blocked(&values, gradient.view_mut());
+                    } else {
+                        let mut addend = Buffer::new(gradient.shape());
+                        to_blocked(&values, addend.view_mut());
+                        crate::kernels::pool::add(gradient.view_mut(), addend.view());
+                    }
+                });
+                Ok(())
+            });
+        }
+        images.put_tape(tape)
+    }
+
+    /// Wraps the output of an operation.
+    pub(super) fn output(data: Buffer, tape: T) -> (Self, Saved) {
+        let saved = Saved { data: Arc::new(data), gradient: Some(Gradient::default()) };
+        (Self { saved: saved.clone(), tape }, saved)
+    }
+}
+
+impl Saved {
+    /// Hands the gradient buffer to `write`, saying whether it is fresh (arbitrary interior) or holds
+    /// a sum to add to. Does nothing for an input without gradient.
+    pub fn accumulate(&self, write: impl FnOnce(&mut Buffer, bool)) {
+        if let Some(slot) = &self.gradient {
+            let mut slot = slot.borrow_mut();
+            let fresh = slot.is_none();
+            write(slot.get_or_insert_with(|| Buffer::new(self.data.shape())), fresh);
+        }
+    }
+
+    /// Takes the gradient that has flowed in, if any.
+    pub fn take_gradient(&self) -> Option<Buffer> {
+        self.gradient.as_ref().and_then(|g| g.take())
+    }
+}

@@ -1,0 +1,362 @@
+//! The layers: convolution (k x k, 1x1 fusion, transposed 4x4), 2x2 max-pool, batch norm.
+//!
+//! Each splits the tape off its input, computes, and pushes one backward operation, as dfdx's own
+//! operations do.
+
+use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
+
+use super::{
+    Activation, Init, Param, Rng,
+    activation::Saved,
+    pool::Buffer,
+};
+use crate::kernels::{
+    Block, LANES,
+    conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len},
+    pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
+    simd::Tier,
+    weight_grad::{bias_gradient, weight_gradient},
+};
+
+/// A convolution of one or several sources, with bias and optional ReLU.
+#[derive(Clone, Debug)]
+pub struct Conv {
+    /// `(O, I, k, k)`; transposed: `(I, O, 4, 4)`.
+    pub weight: Param,
+    /// `(O)`.
+    pub bias: Param,
+    inputs: Vec<usize>,
+    outputs: usize,
+    geometry: Geometry,
+    relu: bool,
+}
+
+impl Conv {
+    /// A k x k convolution with ReLU from sources of `inputs` channels to `outputs`.
+    pub fn new(rng: &mut Rng, name: &str, inputs: &[usize], outputs: usize, k: usize, init: Init) -> Self {
+        Self::with_geometry(rng, name, inputs, outputs, Geometry::Same(k), init)
+    }
+
+    /// A transposed 4x4 convolution of stride 2 with ReLU, beginning as bilinear upsampling.
+    pub fn transposed(rng: &mut Rng, name: &str, inputs: usize, outputs: usize) -> Self {
+        Self::with_geometry(rng, name, &[inputs], outputs, Geometry::Transposed, Init::Bilinear)
+    }
+
+    fn with_geometry(
+        rng: &mut Rng,
+        name: &str,
+        inputs: &[usize],
+        outputs: usize,
+        geometry: Geometry,
+        init: Init,
+    ) -> Self {
+        let device = Cpu::default();
+        let total: usize = inputs.iter().sum();
+        let (k, shape) = match geometry {
+            Geometry::Same(k) => (k, [outputs, total, k, k]),
+            _ => (4, [total, outputs, 4, 4]),
+        };
+        let weights = init.weights(rng, inputs, outputs, k);
+        Self {
+            weight: Param::new(&device, format!("{name}.weight"), &shape, weights),
+            bias: Param::new(&device, format!("{name}.bias"), &[outputs], vec![0.0; outputs]),
+            inputs: inputs.into(),
+            outputs,
+            geometry,
+            relu: true,
+        }
+    }
+
+    /// The same layer without its ReLU.
+    pub fn linear(self) -> Self {
+        Self { relu: false, ..self }
+    }
+
+    /// The same layer with every bias at `value`.
+    pub fn with_bias(mut self, value: f32) -> Self {
+        self.bias.set(&vec![value; self.outputs]);
+        self
+    }
+
+    /// Multiply-accumulates for one pixel of the layer's output.
+    pub fn macs_per_output_pixel(&self) -> usize {
+        // An output pixel of the transposed convolution sees 4 of its 16 taps.
+        let taps = if self.geometry == Geometry::Transposed { 4 } else { self.geometry.taps() };
+        self.inputs.iter().sum::<usize>() * self.outputs * taps
+    }
+
+    /// Its parameters, in a fixed order.
+    pub fn params(&mut self) -> [&mut Param; 2] {
+        [&mut self.weight, &mut self.bias]
+    }
+
+    /// Applies the layer to sources that are taken as concatenated, without concatenating them.
+    /// (N, I, H, W) -> (N, O, H', W')
+    ///
+    /// # Panics
+    /// If the sources do not have the layer's channels, or differ in size.
+    pub fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, sources: Vec<Activation<T>>) -> Activation<T> {
+        let channels: Vec<usize> = sources.iter().map(|s| s.shape().c).collect();
+        assert_eq!(channels, self.inputs, "{} reads {:?} channels", self.weight.name, self.inputs);
+        let shape = sources[0].shape();
+        let (h, w) = self.geometry.output(shape.h, shape.w);
+        let mut output = Buffer::new(shape.with_channels(self.outputs).with_size(h, w));
+
+        let weights = self.weight.tensor.as_vec();
+        let mut packed = vec![Block::default(); packed_len(&self.inputs, self.outputs, self.geometry)];
+        pack(&weights, &self.inputs, self.outputs, self.geometry, Direction::Forward, 0, &mut packed);
+        let bias = to_blocks(&self.bias.tensor.as_vec());
+        let tier = Tier::detect();
+        let views: Vec<_> = sources.iter().map(|s| s.saved.data.view()).collect();
+        let epilogue = Epilogue { relu: self.relu, accumulate: false };
+        convolve(tier, &views, &packed, &bias, self.geometry, epilogue, output.view_mut());
+
+        let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
+        let mut tape = T::default();
+        for source in sources {
+            saved.push(source.saved);
+            tape = tape.merge(source.tape);
+        }
+        let (mut activation, out) = Activation::output(output, tape);
+        if T::OWNS_TAPE {
+            let (weight, bias) = (self.weight.tensor.clone(), self.bias.tensor.clone());
+            let Self { inputs, outputs, geometry, relu, .. } = self.clone();
+            activation.tape.add_backward_op(move |gradients| {
+                let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
+                if relu {
+                    relu_mask(out.data.view(), gradient.view_mut());
+                }
+                bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
+                let total = inputs.iter().sum();
+                let weights = weight.as_vec();
+                let mut first = 0;
+                for (index, source) in saved.iter().enumerate() {
+                    weight_gradient(
+                        tier,
+                        source.data.view(),
+                        gradient.view(),
+                        geometry,
+                        (first, total),
+                        gradients.get_or_alloc_mut(&weight)?,
+                    );
+                    first += inputs[index];
+                    source.accumulate(|into, fresh| {
+                        let mut packed =
+                            vec![Block::default(); packed_len(&[outputs], inputs[index], geometry)];
+                        pack(&weights, &inputs, outputs, geometry, Direction::Backward, index, &mut packed);
+                        let zero = vec![Block::default(); into.shape().planes()];
+                        let back =
+                            if geometry == Geometry::Transposed { Geometry::Strided } else { geometry };
+                        let epilogue = Epilogue { relu: false, accumulate: !fresh };
+                        convolve(tier, &[gradient.view()], &packed, &zero, back, epilogue, into.view_mut());
+                    });
+                }
+                Ok(())
+            });
+        }
+        activation
+    }
+}
+
+/// Channel values as blocks of 16 lanes.
+fn to_blocks(values: &[f32]) -> Vec<Block> {
+    values
+        .chunks(LANES)
+        .map(|chunk| {
+            let mut block = Block::default();
+            block.0[..chunk.len()].copy_from_slice(chunk);
+            block
+        })
+        .collect()
+}
+
+/// The 2x2 max-pool of stride 2. (N, C, H, W) -> (N, C, H/2, W/2)
+#[derive(Clone, Copy, Debug)]
+pub struct MaxPool;
+
+impl MaxPool {
+    /// Applies the pool.
+    ///
+    /// # Panics
+    /// If rows or columns are odd in number.
+    pub fn forward<T: Tape<f32, Cpu>>(self, input: Activation<T>) -> Activation<T> {
+        let shape = input.shape();
+        let mut output = Buffer::new(shape.with_size(shape.h / 2, shape.w / 2));
+        max_pool(input.saved.data.view(), output.view_mut());
+        let (mut activation, out) = Activation::output(output, input.tape);
+        if T::OWNS_TAPE {
+            let source = input.saved;
+            activation.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take_gradient() else { return Ok(()) };
+                source.accumulate(|into, fresh| {
+                    if fresh {
+                        into.fill(Block::default());
+                    }
+                    max_pool_gradient(source.data.view(), gradient.view(), into.view_mut());
+                });
+                Ok(())
+            });
+        }
+        activation
+    }
+}
+
+/// What one training step saw in one batch-norm layer: mean and variance of each channel.
+#[derive(Clone, Debug)]
+pub struct BatchStats {
+    /// Mean of each channel.
+    pub mean: Vec<f32>,
+    /// Unbiased variance of each channel.
+    pub variance: Vec<f32>,
+}
+
+/// Whether batch norm uses the batch's statistics (and records them) or the running ones.
+#[derive(Debug)]
+pub enum Stats {
+    /// Inference: the running statistics.
+    Running,
+    /// Training: the batch's own, recorded layer by layer.
+    Batch(Vec<BatchStats>),
+}
+
+/// Batch normalisation (Ioffe and Szegedy 2015) with ReLU.
+#[derive(Clone, Debug)]
+pub struct BatchNorm {
+    /// Scale of each channel.
+    pub scale: Param,
+    /// Shift of each channel.
+    pub shift: Param,
+    /// Running mean.
+    pub mean: Param,
+    /// Running variance.
+    pub variance: Param,
+}
+
+impl BatchNorm {
+    /// Added to the variance before the root.
+    pub const EPSILON: f32 = 1e-5;
+    /// Weight of the newest batch in the running statistics.
+    pub const MOMENTUM: f32 = 0.1;
+
+    /// The identity on normalised channels.
+    pub fn new(name: &str, channels: usize) -> Self {
+        let device = Cpu::default();
+        let param = |part: &str, value: f32, trainable| {
+            let values = vec![value; channels];
+            Param { trainable, ..Param::new(&device, format!("{name}.{part}"), &[channels], values) }
+        };
+        Self {
+            scale: param("scale", 1.0, true),
+            shift: param("shift", 0.0, true),
+            mean: param("mean", 0.0, false),
+            variance: param("variance", 1.0, false),
+        }
+    }
+
+    /// Its parameters, in a fixed order.
+    pub fn params(&mut self) -> [&mut Param; 4] {
+        [&mut self.scale, &mut self.shift, &mut self.mean, &mut self.variance]
+    }
+
+    /// Moves the running statistics towards a batch's.
+    pub fn update(&mut self, batch: &BatchStats) {
+        for (param, new) in [(&mut self.mean, &batch.mean), (&mut self.variance, &batch.variance)] {
+            let blend = |(old, new): (f32, &f32)| old + Self::MOMENTUM * (new - old);
+            let values: Vec<f32> = param.values().into_iter().zip(new).map(blend).collect();
+            param.set(&values);
+        }
+    }
+
+    /// Normalises, scales, shifts, rectifies. (N, C, H, W) -> (N, C, H, W)
+    pub fn forward<T: Tape<f32, Cpu>>(&self, input: Activation<T>, stats: &mut Stats) -> Activation<T> {
+        let shape = input.shape();
+        let count = (shape.n * shape.h * shape.w) as f64;
+        let moments: Vec<(f32, f32)> = match stats {
+            Stats::Running => self.mean.values().into_iter().zip(self.variance.values()).collect(),
+            Stats::Batch(seen) => {
+                let moments = channel_moments(input.saved.data.view());
+                let unbias = count / (count - 1.0).max(1.0);
+                seen.push(BatchStats {
+                    mean: moments.iter().map(|m| m.0 as f32).collect(),
+                    variance: moments.iter().map(|m| (m.1 * unbias) as f32).collect(),
+                });
+                moments.into_iter().map(|(m, v)| (m as f32, v as f32)).collect()
+            }
+        };
+        let inverse: Vec<f32> = moments.iter().map(|(_, v)| (v + Self::EPSILON).sqrt().recip()).collect();
+        let gamma = self.scale.values();
+        let scale: Vec<f32> = gamma.iter().zip(&inverse).map(|(g, i)| g * i).collect();
+        let shift: Vec<f32> = (self.shift.values().iter().zip(&scale).zip(&moments))
+            .map(|((b, s), (m, _))| b - s * m)
+            .collect();
+        let mut output = Buffer::new(shape);
+        scale_shift(input.saved.data.view(), &scale, &shift, true, output.view_mut());
+
+        let batch = matches!(stats, Stats::Batch(_));
+        let (mut activation, out) = Activation::output(output, input.tape);
+        if T::OWNS_TAPE {
+            let source = input.saved;
+            let (scale_tensor, shift_tensor) = (self.scale.tensor.clone(), self.shift.tensor.clone());
+            activation.tape.add_backward_op(move |gradients| {
+                let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
+                relu_mask(out.data.view(), gradient.view_mut());
+                // Sums of g and of g * normalised input, each channel.
+                let mut sums = vec![(0.0f64, 0.0f64); shape.c];
+                each_row(shape, |c0, row| {
+                    for (x, g) in source.data[row.clone()].iter().zip(&gradient[row]) {
+                        for (l, sum) in sums[c0..].iter_mut().take(LANES).enumerate() {
+                            let normal = (x.0[l] - moments[c0 + l].0) * inverse[c0 + l];
+                            sum.0 += f64::from(g.0[l]);
+                            sum.1 += f64::from(g.0[l] * normal);
+                        }
+                    }
+                });
+                let into = gradients.get_or_alloc_mut(&scale_tensor)?;
+                into.iter_mut().zip(&sums).for_each(|(a, s)| *a += s.1 as f32);
+                let into = gradients.get_or_alloc_mut(&shift_tensor)?;
+                into.iter_mut().zip(&sums).for_each(|(a, s)| *a += s.0 as f32);
+                source.accumulate(|into, fresh| {
+                    each_row(shape, |c0, row| {
+                        let lanes = (shape.c - c0).min(LANES);
+                        for at in row {
+                            let (x, g) = (source.data[at].0, gradient[at].0);
+                            for l in 0..lanes {
+                                let c = c0 + l;
+                                let normal = (x[l] - moments[c].0) * inverse[c];
+                                // The batch's own statistics depend on the input as well.
+                                let through = if batch {
+                                    (sums[c].0 / count) as f32 + normal * (sums[c].1 / count) as f32
+                                } else {
+                                    0.0
+                                };
+                                let value = scale[c] * (g[l] - through);
+                                let old = if fresh { 0.0 } else { into[at].0[l] };
+                                into[at].0[l] = old + value;
+                            }
+                            into[at].0[lanes..].fill(0.0);
+                        }
+                    });
+                });
+                Ok(())
+            });
+        }
+        activation
+    }
+}
+
+/// Calls `visit(first channel, blocks of the row)` for every row of every plane.
+fn each_row(shape: crate::kernels::Shape, mut visit: impl FnMut(usize, std::ops::Range<usize>)) {
+    for n in 0..shape.n {
+        for plane in 0..shape.planes() {
+            for y in 0..shape.h {
+                let start = shape.row(n, plane, y);
+                visit(plane * LANES, start..start + shape.w);
+            }
+        }
+    }
+}
+
+/// The values of an activation without its tape.
+pub fn detached<T: Tape<f32, Cpu>>(activation: &Activation<T>) -> Activation<NoneTape> {
+    Activation { saved: activation.saved.clone(), tape: NoneTape }
+}

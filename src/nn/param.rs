@@ -1,0 +1,124 @@
+//! Parameters: named dfdx tensors with a shape, and how they begin.
+
+use dfdx::tensor::{Cpu, Tensor, TensorFromVec};
+
+/// A parameter of a layer: a dfdx tensor, flat, with its logical shape beside it.
+#[derive(Clone, Debug)]
+pub struct Param {
+    /// Its path in the network, `decoder.0.up.weight`.
+    pub name: String,
+    /// Its logical shape, for example (O, I, 3, 3).
+    pub shape: Vec<usize>,
+    /// Whether the optimiser changes it; running statistics are not trainable.
+    pub trainable: bool,
+    /// Its values, row-major.
+    pub tensor: Tensor<(usize,), f32, Cpu>,
+}
+
+impl Param {
+    /// A parameter from its first values.
+    ///
+    /// # Panics
+    /// If the number of values is not what the shape demands.
+    pub fn new(device: &Cpu, name: String, shape: &[usize], values: Vec<f32>) -> Self {
+        assert_eq!(values.len(), shape.iter().product::<usize>(), "{name} has shape {shape:?}");
+        let len = (values.len(),);
+        Self { name, shape: shape.into(), trainable: true, tensor: device.tensor_from_vec(values, len) }
+    }
+
+    /// Its values, row-major.
+    pub fn values(&self) -> Vec<f32> {
+        self.tensor.as_vec()
+    }
+
+    /// Replaces its values, keeping the tensor's identity (optimiser moments stay attached).
+    ///
+    /// # Panics
+    /// If the number of values differs.
+    pub fn set(&mut self, values: &[f32]) {
+        self.tensor.copy_from(values);
+    }
+}
+
+/// A small counter-based generator (SplitMix64): any position can be reached directly, so a resumed
+/// run draws what an uninterrupted one would.
+#[derive(Clone, Debug)]
+pub struct Rng(u64);
+
+impl Rng {
+    /// The stream `stream` of seed `seed`.
+    pub fn new(seed: u64, stream: u64) -> Self {
+        let mut rng = Self(seed ^ stream.wrapping_mul(0xA076_1D64_78BD_642F));
+        rng.next_u64();
+        rng
+    }
+
+    /// Sixty-four random bits.
+    pub fn next_u64(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+
+    /// Uniform in 0..1.
+    pub fn uniform(&mut self) -> f32 {
+        (self.next_u64() >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    /// Uniform in 0..n.
+    pub fn below(&mut self, n: usize) -> usize {
+        (((self.next_u64() >> 32) * n as u64) >> 32) as usize
+    }
+}
+
+/// How the weights of a convolution begin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Init {
+    /// Glorot and Bengio 2010: uniform, variance 2 / (fan in + fan out).
+    Xavier,
+    /// The paper's Eq. 3: `[I I I]`, each source copied to the output and summed.
+    Identities,
+    /// Bilinear upsampling, channel by channel, as the paper begins its transposed convolutions.
+    Bilinear,
+    /// [`Init::Xavier`] times a factor: heads begin near zero.
+    Scaled(f32),
+}
+
+impl Init {
+    /// Weights for `inputs` (channels of each source) and `outputs`, k x k taps; `(O, I, k, k)`, or
+    /// `(I, O, 4, 4)` for [`Init::Bilinear`].
+    pub fn weights(self, rng: &mut Rng, inputs: &[usize], outputs: usize, k: usize) -> Vec<f32> {
+        let total: usize = inputs.iter().sum();
+        let taps = k * k;
+        let mut w = vec![0.0; total * outputs * taps];
+        match self {
+            Init::Xavier | Init::Scaled(_) => {
+                let gain = if let Init::Scaled(s) = self { s } else { 1.0 };
+                let limit = gain * (6.0 / ((total + outputs) * taps) as f32).sqrt();
+                w.iter_mut().for_each(|w| *w = limit * (2.0 * rng.uniform() - 1.0));
+            }
+            Init::Identities => {
+                let mut first = 0;
+                for &c in inputs {
+                    for o in 0..outputs.min(c) {
+                        w[(o * total + first + o) * taps + taps / 2] = 1.0;
+                    }
+                    first += c;
+                }
+            }
+            Init::Bilinear => {
+                // Where the channel count falls, an output averages the inputs that fold onto it.
+                let line = [0.25, 0.75, 0.75, 0.25];
+                let fold = total.div_ceil(outputs) as f32;
+                for i in 0..total {
+                    for t in 0..taps {
+                        w[(i * outputs + i % outputs) * taps + t] = line[t / 4] * line[t % 4] / fold;
+                    }
+                }
+            }
+        }
+        w
+    }
+}

@@ -1,0 +1,76 @@
+//! Recycled activation buffers: after the first pass no layer allocates, and no page is faulted in.
+
+use std::{
+    collections::HashMap,
+    ops::{Deref, DerefMut},
+    sync::{LazyLock, Mutex, PoisonError},
+};
+
+use crate::kernels::{Block, Shape, View, ViewMut};
+
+/// Free buffers by shape. A buffer keeps its zero border for life, because kernels write interiors
+/// only; sharing buffers between shapes would break that.
+static FREE: LazyLock<Mutex<HashMap<Shape, Vec<Vec<Block>>>>> = LazyLock::new(Mutex::default);
+
+/// A blocked activation's memory, returned to the pool when dropped. Its interior holds whatever the
+/// last user left.
+#[derive(Debug)]
+pub struct Buffer {
+    shape: Shape,
+    data: Vec<Block>,
+}
+
+impl Buffer {
+    /// A buffer whose border is zero and whose interior is arbitrary.
+    pub fn new(shape: Shape) -> Self {
+        let reused = FREE.lock().unwrap_or_else(PoisonError::into_inner).get_mut(&shape).and_then(Vec::pop);
+        Self { shape, data: reused.unwrap_or_else(|| vec![Block::default(); shape.blocks()]) }
+    }
+
+    /// A buffer of zeros.
+    pub fn zeros(shape: Shape) -> Self {
+        let mut buffer = Self::new(shape);
+        buffer.data.fill(Block::default());
+        buffer
+    }
+
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// To read.
+    pub fn view(&self) -> View<'_> {
+        View::new(self.shape, &self.data)
+    }
+
+    /// To write.
+    pub fn view_mut(&mut self) -> ViewMut<'_> {
+        ViewMut::new(self.shape, &mut self.data)
+    }
+}
+
+impl Deref for Buffer {
+    type Target = [Block];
+    fn deref(&self) -> &[Block] {
+        &self.data
+    }
+}
+
+impl DerefMut for Buffer {
+    fn deref_mut(&mut self) -> &mut [Block] {
+        &mut self.data
+    }
+}
+
+impl Drop for Buffer {
+    fn drop(&mut self) {
+        let data = std::mem::take(&mut self.data);
+        FREE.lock().unwrap_or_else(PoisonError::into_inner).entry(self.shape).or_default().push(data);
+    }
+}
+
+/// Gives every free buffer back to the system: for when frames of another size follow.
+pub fn clear() {
+    FREE.lock().unwrap_or_else(PoisonError::into_inner).clear();
+}
