@@ -1,8 +1,12 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
+mod compare;
+
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::Error;
 
 #[derive(Parser)]
 #[command(
@@ -17,6 +21,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
+    Compare(compare::Args),
     /// List the built-in models
     Models,
 }
@@ -28,7 +34,12 @@ pub const USAGE: u8 = 2;
 
 /// Parses the process arguments and runs the subcommand.
 pub fn main() -> ExitCode {
-    match Cli::parse().command {
-        Command::Models => ExitCode::SUCCESS,
-    }
+    let done = match Cli::parse().command {
+        Command::Compare(args) => compare::run(&args),
+        Command::Models => Ok(ExitCode::SUCCESS),
+    };
+    done.unwrap_or_else(|error| {
+        eprintln!("demc: {error}");
+        ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
+    })
 }

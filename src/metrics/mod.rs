@@ -136,3 +136,11 @@ fn mean(image: &Planes, reference: &Planes, value: impl Fn(f64, f64) -> f64 + Sy
         .collect();
     sums.iter().sum::<f64>() / image.data.len() as f64
 }
+
+/// Why a score is none against this reference, for a message.
+pub fn why_undefined(reference: &Planes) -> String {
+    match display::exposure(reference) {
+        None => "the reference is black".into(),
+        Some(_) => format!("the images are smaller than its window of {0}x{0}", ssim::WINDOW),
+    }
+}
