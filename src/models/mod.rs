@@ -1,5 +1,8 @@
 //! Every denoising method behind one trait. A new method is one file here and one line in the catalogue.
 
+pub mod demc;
+pub mod network;
+
 use crate::{
     Error, Result,
     passes::{Pass, PassSet},

@@ -26,6 +26,12 @@ impl Param {
         Self { name, shape: shape.into(), trainable: true, tensor: device.tensor_from_vec(values, len) }
     }
 
+    /// A copy that is another tensor: neither gradients nor moments are shared.
+    pub fn duplicate(&self) -> Self {
+        let Self { name, shape, trainable, .. } = self.clone();
+        Self { trainable, ..Self::new(self.tensor.device(), name, &shape, self.values()) }
+    }
+
     /// Its values, row-major.
     pub fn values(&self) -> Vec<f32> {
         self.tensor.as_vec()

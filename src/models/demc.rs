@@ -1,0 +1,291 @@
+//! The network of the paper and its two variants, width a parameter.
+//!
+//! "DEMC: A Deep Dual-Encoder Network for Denoising Monte Carlo Rendering" (Yang et al.), Section
+//! 3.2. In: colour `c^(1/2.2)` (3 channels) and 12 z-scored feature channels; out: radiance.
+//! `semc` encodes detail map and colour together (Section 4.4); `demc-nofusion` feeds the features
+//! straight into the feature encoder (Section 4.3).
+
+use dfdx::{
+    tensor::{Cpu, Merge, NoneTape, Tape},
+    tensor_ops::powf,
+};
+
+use super::network::{Architecture, Batch, Config, Inputs, Network, Taped};
+use crate::{
+    Result,
+    features::{GAMMA, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
+    nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
+    passes::{Pass, PassSet},
+};
+
+/// Channels at each level in the paper.
+pub const PAPER_WIDTHS: [usize; 5] = [64, 128, 256, 512, 512];
+
+/// Channels of the detail map.
+const DETAIL: usize = 3;
+
+/// The bias of the last layer at the start: ReLU is its activation as everywhere in the paper, and an
+/// output that begins at or below zero would never learn.
+const OUTPUT_BIAS: f32 = 0.2;
+
+/// DEMC, DEMC without fusion, or SEMC.
+#[derive(Clone)]
+pub struct Demc {
+    config: Config,
+    fusion: Option<Fusion>,
+    /// Feature encoder and colour encoder, or SEMC's single one.
+    encoders: Vec<Encoder>,
+    decoder: Vec<Level>,
+    output: Conv,
+}
+
+/// The feature fusion sub-network: 12 channels to the 3 of the detail map.
+#[derive(Clone)]
+struct Fusion {
+    first: Conv,
+    middle: Vec<(Conv, BatchNorm)>,
+    last: Conv,
+}
+
+/// Five units of three convolutions and a pool.
+#[derive(Clone)]
+struct Encoder {
+    units: Vec<[Conv; 3]>,
+}
+
+/// One level of the decoder: upsampling and skip fusion.
+#[derive(Clone)]
+struct Level {
+    up: Conv,
+    fuse: Conv,
+}
+
+impl Fusion {
+    /// Channels between the blocks, which the paper leaves open: those of the first level.
+    fn new(rng: &mut Rng, width: usize) -> Self {
+        let mut conv = |name: &str, i: usize, o: usize| Conv::new(rng, name, &[i], o, 3, Init::Xavier);
+        Self {
+            first: conv("fusion.0", PAPER_FEATURES, width),
+            middle: (1..3)
+                .map(|i| {
+                    let name = format!("fusion.{i}");
+                    (conv(&name, width, width).linear(), BatchNorm::new(&format!("{name}.norm"), width))
+                })
+                .collect(),
+            last: conv("fusion.3", width, DETAIL),
+        }
+    }
+
+    /// (N, 12, H, W) -> (N, 3, H, W)
+    fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, x: Activation<T>, stats: &mut Stats) -> Activation<T> {
+        let mut x = self.first.forward(vec![x]);
+        for (conv, norm) in &self.middle {
+            x = norm.forward(conv.forward(vec![x]), stats);
+        }
+        self.last.forward(vec![x])
+    }
+}
+
+impl Encoder {
+    fn new(rng: &mut Rng, name: &str, inputs: &[usize], widths: &[usize]) -> Self {
+        let mut inputs = inputs.to_vec();
+        let units = widths.iter().enumerate().map(|(level, &width)| {
+            std::array::from_fn(|i| {
+                let from = std::mem::replace(&mut inputs, vec![width]);
+                Conv::new(rng, &format!("{name}.{level}.{i}"), &from, width, 3, Init::Xavier)
+            })
+        });
+        Self { units: units.collect() }
+    }
+
+    /// The activations before each pool, finest first, and the latent after the last.
+    fn forward<T: Tape<f32, Cpu> + Merge<T>>(
+        &self,
+        input: Vec<Activation<T>>,
+    ) -> (Vec<Activation<T>>, Activation<T>) {
+        let mut x = input;
+        let mut skips = Vec::with_capacity(self.units.len());
+        for unit in &self.units {
+            for conv in unit {
+                x = vec![conv.forward(x)];
+            }
+            let before = x.pop().expect("a unit has one output");
+            skips.push(before.fork());
+            x.push(MaxPool.forward(before)); // (N, K, H, W) -> (N, K, H/2, W/2)
+        }
+        (skips, x.pop().expect("the last unit has one output"))
+    }
+}
+
+impl Demc {
+    /// A network with fresh weights drawn from `seed`.
+    ///
+    /// # Panics
+    /// If `widths` does not hold five levels.
+    pub fn new(architecture: Architecture, widths: &[usize], seed: u64) -> Self {
+        assert_eq!(widths.len(), PAPER_WIDTHS.len(), "the paper's network has five levels");
+        let rng = &mut Rng::new(seed, 0);
+        let fusion = (architecture != Architecture::DemcNofusion).then(|| Fusion::new(rng, widths[0]));
+        let features = if fusion.is_some() { DETAIL } else { PAPER_FEATURES };
+        let encoders = if architecture == Architecture::Semc {
+            vec![Encoder::new(rng, "encoder", &[DETAIL, 3], widths)]
+        } else {
+            vec![
+                Encoder::new(rng, "encoder.feature", &[features], widths),
+                Encoder::new(rng, "encoder.colour", &[3], widths),
+            ]
+        };
+        // Decoder levels run from the coarsest skip to the finest.
+        let decoder = (0..widths.len()).rev().map(|level| {
+            let (width, below) = (widths[level], widths[(level + 1).min(widths.len() - 1)]);
+            Level {
+                up: Conv::transposed(rng, &format!("decoder.{level}.up"), below, width),
+                fuse: Conv::new(
+                    rng,
+                    &format!("decoder.{level}.fuse"),
+                    &vec![width; encoders.len() + 1],
+                    width,
+                    1,
+                    Init::Identities,
+                ),
+            }
+        });
+        let decoder = decoder.collect();
+        let output = Conv::new(rng, "output", &[widths[0]], 3, 1, Init::Xavier).with_bias(OUTPUT_BIAS);
+        Self { config: Config { architecture, widths: widths.into() }, fusion, encoders, decoder, output }
+    }
+
+    /// The detail map, and each encoder's skips and latent.
+    #[allow(clippy::type_complexity)]
+    fn encode<T: Tape<f32, Cpu> + Merge<T>>(
+        &self,
+        batch: &Batch,
+        stats: &mut Stats,
+    ) -> Vec<(Vec<Activation<T>>, Activation<T>)> {
+        let [colour, features] = [0, 1].map(|i| Activation::<T>::input(batch[i].0, &batch[i].1));
+        let detail = match &self.fusion {
+            Some(fusion) => fusion.forward(features, stats),
+            None => features,
+        };
+        match &self.encoders[..] {
+            [single] => vec![single.forward(vec![detail, colour])],
+            [of_features, of_colour] => {
+                vec![of_features.forward(vec![detail]), of_colour.forward(vec![colour])]
+            }
+            _ => unreachable!("there are one or two encoders"),
+        }
+    }
+
+    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch, stats: &mut Stats) -> Images<T> {
+        let mut encoded = self.encode::<T>(batch, stats);
+        // The decoder starts from the colour latent (Section 3.2); the feature encoder's latent goes unused.
+        let (colour_skips, mut x) = encoded.pop().expect("there is at least one encoder");
+        let mut skips: Vec<Vec<Activation<T>>> = encoded.into_iter().map(|(skips, _)| skips).collect();
+        skips.push(colour_skips);
+        for level in &self.decoder {
+            let up = level.up.forward(vec![x]); // (N, K', H, W) -> (N, K, 2H, 2W)
+            let mut sources = vec![up];
+            for encoder in &mut skips {
+                sources.push(encoder.pop().expect("one skip a level"));
+            }
+            x = level.fuse.forward(sources); // Eq. 2: (N, 3K, H, W) -> (N, K, H, W)
+        }
+        let compressed = self.output.forward(vec![x]); // (N, K, H, W) -> (N, 3, H, W)
+        powf(compressed.into_images(), GAMMA)
+    }
+
+    /// The extent of the latent, (channels, rows, columns), for a frame of `width` x `height`.
+    pub fn latent(&self, width: usize, height: usize) -> (usize, usize, usize) {
+        let batch: Batch = [3, PAPER_FEATURES]
+            .map(|c| {
+                let shape = crate::kernels::Shape::new(1, c, height, width);
+                (shape, vec![0.0; c * width * height])
+            })
+            .into();
+        let encoded = self.encode::<NoneTape>(&batch, &mut Stats::Running);
+        let shape = encoded.last().expect("there is at least one encoder").1.shape();
+        (shape.c, shape.h, shape.w)
+    }
+
+    fn convolutions(&self) -> impl Iterator<Item = (&Conv, usize)> {
+        let fusion = self.fusion.iter().flat_map(|f| {
+            [&f.first].into_iter().chain(f.middle.iter().map(|m| &m.0)).chain([&f.last]).map(|c| (c, 0))
+        });
+        let encoders = self.encoders.iter().flat_map(|e| {
+            e.units.iter().enumerate().flat_map(|(level, unit)| unit.iter().map(move |c| (c, level)))
+        });
+        let decoder = self.decoder.iter().rev().enumerate();
+        let decoder = decoder.flat_map(|(level, l)| [(&l.up, level), (&l.fuse, level)]);
+        fusion.chain(encoders).chain(decoder).chain([(&self.output, 0)])
+    }
+}
+
+impl Network for Demc {
+    fn config(&self) -> Config {
+        self.config.clone()
+    }
+
+    fn passes(&self) -> &'static [Pass] {
+        &PAPER_PASSES
+    }
+
+    fn multiple(&self) -> usize {
+        1 << self.config.widths.len()
+    }
+
+    fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
+        let name = "demc";
+        Ok(Inputs { planes: vec![paper_colour(passes, name)?, paper_features(passes, name)?], scale: 1.0 })
+    }
+
+    fn params(&mut self) -> Vec<&mut Param> {
+        let mut params = Vec::new();
+        if let Some(fusion) = &mut self.fusion {
+            params.extend(fusion.first.params());
+            for (conv, norm) in &mut fusion.middle {
+                params.extend(conv.params());
+                params.extend(norm.params());
+            }
+            params.extend(fusion.last.params());
+        }
+        for conv in self.encoders.iter_mut().flat_map(|e| e.units.iter_mut().flatten()) {
+            params.extend(conv.params());
+        }
+        for level in &mut self.decoder {
+            params.extend(level.up.params());
+            params.extend(level.fuse.params());
+        }
+        params.extend(self.output.params());
+        params
+    }
+
+    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
+        self.fusion.iter_mut().flat_map(|f| f.middle.iter_mut().map(|m| &mut m.1)).collect()
+    }
+
+    fn forward(&self, batch: &Batch, stats: &mut Stats) -> Images {
+        self.run::<NoneTape>(batch, stats)
+    }
+
+    fn forward_taped(&self, batch: &Batch, stats: &mut Stats) -> Images<Taped> {
+        self.run::<Taped>(batch, stats)
+    }
+
+    fn macs_per_pixel(&self) -> f64 {
+        self.convolutions().map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32)).sum()
+    }
+
+    fn reach(&self) -> usize {
+        // Three 3x3 convolutions and a pool a level on the way down, a 4x4 upsampling on the way up.
+        let fusion = if self.fusion.is_some() { 4 } else { 0 };
+        fusion + (0..self.config.widths.len()).map(|level| (3 + 1 + 2) << level).sum::<usize>()
+    }
+
+    fn duplicate(&self) -> Box<dyn Network> {
+        let mut copy = self.clone();
+        for param in copy.params() {
+            *param = param.duplicate();
+        }
+        Box::new(copy)
+    }
+}
