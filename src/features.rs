@@ -84,8 +84,7 @@ fn z_score(channel: &mut [f32]) {
 /// Grows planes to a multiple of `multiple` in both directions by repeating the last row and column:
 /// what a network that halves its input `log2(multiple)` times needs.
 pub fn pad_to_multiple(planes: &Planes, multiple: usize) -> Planes {
-    let (width, height) =
-        (planes.width.next_multiple_of(multiple), planes.height.next_multiple_of(multiple));
+    let (width, height) = (planes.width.next_multiple_of(multiple), planes.height.next_multiple_of(multiple));
     if (width, height) == (planes.width, planes.height) {
         return planes.clone();
     }

@@ -36,12 +36,7 @@ fn plain(shape: Shape, data: &[Block]) -> Vec<f32> {
 }
 
 /// `out[n, o, y, x] += in[n, i, iy, ix] * w[o, i, t]` for every pair of pixels a tap connects.
-fn connections(
-    geometry: Geometry,
-    input: Shape,
-    outputs: usize,
-    mut visit: impl FnMut(usize, usize, usize),
-) {
+fn connections(geometry: Geometry, input: Shape, outputs: usize, mut visit: impl FnMut(usize, usize, usize)) {
     let (oh, ow) = geometry.output(input.h, input.w);
     let k = if let Geometry::Same(k) = geometry { k } else { 4 };
     for n in 0..input.n {
@@ -120,7 +115,15 @@ fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outpu
     }
     let mut out = vec![Block::default(); out_shape.blocks()];
     let what = format!("{tier:?} {geometry:?} {shape:?} -> {outputs}");
-    convolve(tier, &views, &packed, &bias_blocks, geometry, Epilogue::default(), ViewMut::new(out_shape, &mut out));
+    convolve(
+        tier,
+        &views,
+        &packed,
+        &bias_blocks,
+        geometry,
+        Epilogue::default(),
+        ViewMut::new(out_shape, &mut out),
+    );
     assert_close(&plain(out_shape, &out), &want, &format!("{what} forward"));
     let relu = Epilogue { relu: true, accumulate: false };
     convolve(tier, &views, &packed, &bias_blocks, geometry, relu, ViewMut::new(out_shape, &mut out));
@@ -148,9 +151,7 @@ fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outpu
     let mut db = vec![0.0; outputs];
     bias_gradient(g_view, &mut db);
     let want_db: Vec<f64> = (0..outputs)
-        .map(|o| {
-            (0..g.len()).filter(|i| i / (oh * ow) % outputs == o).map(|i| f64::from(g[i])).sum()
-        })
+        .map(|o| (0..g.len()).filter(|i| i / (oh * ow) % outputs == o).map(|i| f64::from(g[i])).sum())
         .collect();
     assert_close(&db, &want_db, &format!("{what} bias gradient"));
 }

@@ -79,7 +79,14 @@ pub enum Direction {
 
 /// Where the weight of (output, input, tap) lies in an unpacked tensor: convolutions are
 /// `(O, I, k, k)`, transposed ones `(I, O, 4, 4)`, as everywhere.
-pub fn weight_index(geometry: Geometry, outputs: usize, inputs: usize, o: usize, i: usize, t: usize) -> usize {
+pub fn weight_index(
+    geometry: Geometry,
+    outputs: usize,
+    inputs: usize,
+    o: usize,
+    i: usize,
+    t: usize,
+) -> usize {
     match geometry {
         Geometry::Same(_) => (o * inputs + i) * geometry.taps() + t,
         Geometry::Transposed | Geometry::Strided => (i * outputs + o) * geometry.taps() + t,
@@ -238,7 +245,12 @@ impl Kernel for Band<'_> {
             match self.geometry {
                 Geometry::Same(k) => {
                     let taps = self.taps(0..k * k, |t| {
-                        (t / k, t % k, (t / k) as isize - (k / 2) as isize, (t % k) as isize - (k / 2) as isize)
+                        (
+                            t / k,
+                            t % k,
+                            (t / k) as isize - (k / 2) as isize,
+                            (t % k) as isize - (k / 2) as isize,
+                        )
                     });
                     self.rows::<S, 1>(&taps, 1, (0, 0));
                 }
@@ -253,8 +265,8 @@ impl Kernel for Band<'_> {
                     }
                 }
                 Geometry::Strided => {
-                    let taps = self
-                        .taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
+                    let taps =
+                        self.taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
                     self.rows::<S, 2>(&taps, 1, (0, 0));
                 }
             }
@@ -303,9 +315,7 @@ impl Band<'_> {
             let width = self.out.w / spread;
             // SAFETY: `y` is a row of the band, see `run`.
             unsafe {
-                let at = |plane| {
-                    self.pointer.at(self.out.row(self.n, plane, y * spread + phase.0) + phase.1)
-                };
+                let at = |plane| self.pointer.at(self.out.row(self.n, plane, y * spread + phase.0) + phase.1);
                 let (first, end) = self.planes;
                 if end - first == 2 && S::TILE.0 == 2 {
                     self.row::<S, STEP, 2>(taps, &inputs, first, [at(first), at(first + 1)], width, spread);

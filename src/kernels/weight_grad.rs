@@ -120,9 +120,9 @@ impl Pair<'_> {
                     // SAFETY: see `run`.
                     unsafe {
                         let slabs: [*mut Block; OUT] = std::array::from_fn(|o| {
-                            self.pointer.at(
-                                self.offset + (((output + o) * s.planes() + self.input) * taps + t) * LANES,
-                            )
+                            self.pointer
+                                .at(self.offset
+                                    + (((output + o) * s.planes() + self.input) * taps + t) * LANES)
                         });
                         for lane in (0..lanes).step_by(CHUNK) {
                             let slabs = slabs.map(|p| p.add(lane));

@@ -2,6 +2,9 @@
 
 pub mod demc;
 pub mod network;
+pub mod oidn;
+
+use std::time::Instant;
 
 use crate::{
     Error, Result,
@@ -22,6 +25,27 @@ pub trait Denoiser: Send + Sync {
     /// # Errors
     /// A pass is missing, or the method cannot run here; the message says why.
     fn denoise(&self, passes: &PassSet) -> Result<Planes>;
+
+    /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
+    /// reports its filter's time, without start and file traffic.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`].
+    fn denoise_timed(&self, passes: &PassSet) -> Result<Run> {
+        let start = Instant::now();
+        let image = self.denoise(passes)?;
+        Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
+    }
+}
+
+/// A denoised frame and what it cost.
+pub struct Run {
+    /// Denoised radiance, (3, H, W).
+    pub image: Planes,
+    /// Time that denoising took, without file input and output.
+    pub seconds: f64,
+    /// Memory taken outside this process, where the method runs in one of its own.
+    pub peak_mib: Option<f64>,
 }
 
 /// The input itself: the row every report begins with.
@@ -48,6 +72,9 @@ impl Denoiser for Noisy {
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     match name_or_file {
         "noisy" => Ok(Box::new(Noisy)),
+        name if oidn::NAMES.contains(&name) => {
+            Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
+        }
         other => Err(Error::Usage(format!("no model '{other}': `demc models` lists the built-in ones"))),
     }
 }

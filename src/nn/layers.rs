@@ -5,11 +5,7 @@
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::{
-    Activation, Init, Param, Rng,
-    activation::Saved,
-    pool::Buffer,
-};
+use super::{Activation, Init, Param, Rng, activation::Saved, pool::Buffer};
 use crate::kernels::{
     Block, LANES,
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len},

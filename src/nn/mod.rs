@@ -18,5 +18,4 @@ pub use pool::clear as clear_buffers;
 use dfdx::tensor::Cpu;
 
 /// A dfdx tensor of images, (N, C, H, W).
-pub type Images<T = dfdx::tensor::NoneTape> =
-    dfdx::tensor::Tensor<(usize, usize, usize, usize), f32, Cpu, T>;
+pub type Images<T = dfdx::tensor::NoneTape> = dfdx::tensor::Tensor<(usize, usize, usize, usize), f32, Cpu, T>;
