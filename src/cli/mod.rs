@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
 mod compare;
+mod train;
 
 use std::process::ExitCode;
 
@@ -23,6 +24,7 @@ struct Cli {
 enum Command {
     /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
     Compare(compare::Args),
+    Train(train::Args),
     /// List the built-in models
     Models,
 }
@@ -36,6 +38,7 @@ pub const USAGE: u8 = 2;
 pub fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::Compare(args) => compare::run(&args),
+        Command::Train(args) => train::run(&args),
         Command::Models => Ok(ExitCode::SUCCESS),
     };
     done.unwrap_or_else(|error| {

@@ -1,10 +1,14 @@
 //! Every denoising method behind one trait. A new method is one file here and one line in the catalogue.
 
 pub mod demc;
+pub mod learned;
 pub mod network;
 pub mod oidn;
+pub mod weights_file;
 
-use std::time::Instant;
+use std::{path::Path, time::Instant};
+
+use network::{Architecture, Config, Network};
 
 use crate::{
     Error, Result,
@@ -75,6 +79,51 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
         name if oidn::NAMES.contains(&name) => {
             Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
         }
-        other => Err(Error::Usage(format!("no model '{other}': `demc models` lists the built-in ones"))),
+        other if Path::new(other).extension().is_some_and(|e| e == "safetensors") => {
+            Ok(Box::new(learned::Learned::from_file(Path::new(other))?))
+        }
+        other => match learned::Learned::built_in(other) {
+            Some(model) => Ok(Box::new(model)),
+            None => Err(Error::Usage(format!(
+                "no model '{other}': `demc models` lists the built-in ones; weights files end in .safetensors"
+            ))),
+        },
+    }
+}
+
+/// Names of the networks that can be trained, and the configuration each begins with.
+pub fn trainable() -> Vec<(&'static str, Config)> {
+    let paper = |architecture| Config { architecture, widths: vec![16, 32, 64, 96, 96] };
+    vec![
+        ("demc", paper(Architecture::Demc)),
+        ("demc-nofusion", paper(Architecture::DemcNofusion)),
+        ("semc", paper(Architecture::Semc)),
+    ]
+}
+
+/// Whether a configuration describes a network that [`build`] can make.
+///
+/// # Errors
+/// Says what is wrong with it.
+pub fn check(config: &Config) -> Result<(), String> {
+    let levels = demc::PAPER_WIDTHS.len();
+    if config.widths.len() != levels {
+        return Err(format!("{} widths, but the network has {levels} levels", config.widths.len()));
+    }
+    if let Some(width) = config.widths.iter().find(|w| !(1..=4096).contains(*w)) {
+        return Err(format!("width {width} is out of range; use 1 to 4096"));
+    }
+    Ok(())
+}
+
+/// A network with fresh weights drawn from `seed`.
+///
+/// # Panics
+/// If [`check`] finds the configuration wrong.
+pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
+    match config.architecture {
+        Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => {
+            Box::new(demc::Demc::new(config.architecture, &config.widths, seed))
+        }
     }
 }

@@ -27,13 +27,6 @@ impl Buffer {
         Self { shape, data: reused.unwrap_or_else(|| vec![Block::default(); shape.blocks()]) }
     }
 
-    /// A buffer of zeros.
-    pub fn zeros(shape: Shape) -> Self {
-        let mut buffer = Self::new(shape);
-        buffer.data.fill(Block::default());
-        buffer
-    }
-
     /// Its extent.
     pub fn shape(&self) -> Shape {
         self.shape

@@ -1,1 +1,97 @@
-//! (weights)
+//! Tensors on disk: safetensors with one JSON text of metadata.
+//!
+//! A weights file alone is enough to run: the metadata says which network it is and how it was
+//! trained. Checkpoints use the same format with f32 values; shipped weights are stored as f16.
+
+use std::{collections::HashMap, io::Write, path::Path};
+
+use half::f16;
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+
+use crate::{Error, Result, frame::atomically};
+
+/// The metadata key that holds demc's JSON.
+const KEY: &str = "demc";
+
+/// One named tensor.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tensor {
+    /// Its name.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its values, row-major.
+    pub values: Vec<f32>,
+}
+
+/// How values are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// 32-bit: nothing is lost.
+    Full,
+    /// 16-bit: half the size, 3 decimal digits.
+    Half,
+}
+
+/// Writes tensors and metadata, whole or not at all.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn write(path: &Path, metadata: &str, tensors: &[Tensor], precision: Precision) -> Result<()> {
+    let dtype = if precision == Precision::Half { Dtype::F16 } else { Dtype::F32 };
+    let bytes: Vec<Vec<u8>> = tensors
+        .iter()
+        .map(|t| match precision {
+            Precision::Full => t.values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+            Precision::Half => t.values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect(),
+        })
+        .collect();
+    let views = tensors.iter().zip(&bytes).map(|(t, bytes)| {
+        let view = TensorView::new(dtype, t.shape.clone(), bytes);
+        (&t.name, view.expect("a tensor's values fill its shape"))
+    });
+    let metadata = HashMap::from([(KEY.to_string(), metadata.to_string())]);
+    let data = safetensors::serialize(views, &Some(metadata)).map_err(|e| Error::invalid(path, e))?;
+    atomically(path, |mut file| file.write_all(&data).map_err(Error::io("write", path)))
+}
+
+/// Reads a weights file.
+///
+/// # Errors
+/// The file cannot be read or is not one of demc's.
+pub fn read(path: &Path) -> Result<(String, Vec<Tensor>)> {
+    parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+}
+
+/// Parses the bytes of a weights file; `path` is for messages.
+///
+/// # Errors
+/// The bytes are not a weights file of demc's.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<(String, Vec<Tensor>)> {
+    let foreign = |e: &dyn std::fmt::Display| {
+        Error::invalid(path, format!("not a demc weights file ({e}); take one that `demc train` wrote"))
+    };
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| foreign(&e))?;
+    let metadata = header.metadata().as_ref().and_then(|m| m.get(KEY)).cloned();
+    let metadata = metadata.ok_or_else(|| foreign(&"it has no demc metadata"))?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| foreign(&e))?;
+    let mut tensors = file
+        .tensors()
+        .into_iter()
+        .map(|(name, view)| {
+            let bytes = view.data();
+            let values = match view.dtype() {
+                Dtype::F32 => {
+                    bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+                }
+                Dtype::F16 => {
+                    bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect()
+                }
+                other => return Err(foreign(&format!("tensor {name} is {other:?}, not F32 or F16"))),
+            };
+            Ok(Tensor { name, shape: view.shape().into(), values })
+        })
+        .collect::<Result<Vec<_>>>()?;
+    tensors.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok((metadata, tensors))
+}

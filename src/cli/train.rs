@@ -1,0 +1,234 @@
+//! `demc train`: fits a network to pairs of noisy and reference frames.
+
+use std::{
+    fs,
+    io::IsTerminal,
+    path::PathBuf,
+    process::ExitCode,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::{
+    Error, Result, models,
+    testset::{self, Pair},
+    train::{self, Event, Loss, Options},
+};
+
+/// Train a network on pairs of noisy and reference frames
+#[derive(clap::Args)]
+pub struct Args {
+    /// Directory, CSV manifest or quoted glob of <scene>_<spp>spp.exr and <scene>_ref.exr
+    #[arg(long, required_unless_present = "resume")]
+    data: Vec<String>,
+    /// Run folder to write: config.json, log.csv, loss.png, checkpoint, best.safetensors
+    #[arg(long)]
+    out: PathBuf,
+    /// Network to train
+    #[arg(long, default_value = "demc")]
+    model: String,
+    /// Channels at each level, finest first, instead of the model's own
+    #[arg(long, value_delimiter = ',')]
+    widths: Option<Vec<usize>>,
+    /// Optimiser steps
+    #[arg(long, default_value_t = 20_000)]
+    steps: usize,
+    /// Crops a step
+    #[arg(long, default_value_t = 8)]
+    batch: usize,
+    /// Rows and columns of a crop, a multiple of 32
+    #[arg(long, default_value_t = 128)]
+    patch: usize,
+    /// Learning rate of the first and last step
+    #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
+    lr: (f64, f64),
+    /// What is minimised: relmse or smape
+    #[arg(long, default_value = "relmse", value_parser = parse_loss)]
+    loss: Loss,
+    /// Weight of the past in the average of the weights that is kept
+    #[arg(long, default_value_t = 0.999)]
+    average: f64,
+    /// Pairs to validate on, never trained on; without it one scene in ten is held out
+    #[arg(long)]
+    val: Vec<String>,
+    /// Steps between validations
+    #[arg(long, default_value_t = 500)]
+    every: usize,
+    /// Seed of initial weights, crops and augmentation
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Go on from the run folder's checkpoint, with its config.json
+    #[arg(long)]
+    resume: bool,
+    /// Threads to use; all processors without it
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// One scene in this many is held out for validation.
+const HOLD_OUT: u64 = 10;
+
+fn parse_rates(text: &str) -> Result<(f64, f64), String> {
+    let rates = text.split_once(':').and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+    match rates {
+        Some((first, last)) if first > 0.0 && last > 0.0 => Ok((first, last)),
+        _ => Err("expected FIRST:LAST, two positive numbers such as 1e-4:5e-6".into()),
+    }
+}
+
+fn parse_loss(text: &str) -> Result<Loss, String> {
+    let names: Vec<String> = Loss::ALL.iter().map(Loss::to_string).collect();
+    let found = Loss::ALL.into_iter().find(|l| l.to_string() == text);
+    found.ok_or_else(|| format!("expected {}", names.join(" or ")))
+}
+
+fn usage(message: impl Into<String>) -> Error {
+    Error::Usage(message.into())
+}
+
+/// All pairs of several test sets.
+fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
+    let mut pairs = Vec::new();
+    for spec in specs {
+        pairs.extend(testset::pairs(spec)?);
+    }
+    Ok(pairs)
+}
+
+/// Whether a scene is held out: decided by its name alone, so that every sample count, seed and frame
+/// of it goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+fn held_out(scene: &str) -> bool {
+    let hash = scene.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| {
+        (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3)
+    });
+    // The low bits of this hash depend on few bits of the name.
+    (hash >> 32) % HOLD_OUT == 0
+}
+
+impl Args {
+    fn options(&self) -> Result<Options> {
+        let known = models::trainable();
+        let mut network = known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(
+            || {
+                let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
+                usage(format!("cannot train '{}'; trainable: {}", self.model, names.join(", ")))
+            },
+        )?;
+        if let Some(widths) = &self.widths {
+            network.widths.clone_from(widths);
+        }
+        models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
+        let multiple = models::build(&network, 0).multiple();
+        if self.patch == 0 || self.patch % multiple != 0 {
+            return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
+        }
+        for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {
+            if value == 0 {
+                return Err(usage(format!("{name} must be at least 1")));
+            }
+        }
+        if !(0.0..1.0).contains(&self.average) {
+            return Err(usage("--average must be at least 0 and less than 1"));
+        }
+        let pairs = all_pairs(&self.data)?;
+        let (validation, training) = if self.val.is_empty() {
+            pairs.into_iter().partition(|p| held_out(&p.scene))
+        } else {
+            (all_pairs(&self.val)?, pairs)
+        };
+        if let Some(pair) = training.iter().find(|p| validation.iter().any(|v| v.reference == p.reference)) {
+            return Err(Error::invalid(
+                &pair.reference,
+                "is both trained on and validated on; give --val other scenes than --data",
+            ));
+        }
+        if training.is_empty() {
+            return Err(usage("nothing left to train on once one scene in ten is held out; add pairs or --val"));
+        }
+        Ok(Options {
+            network,
+            train: training,
+            validation,
+            steps: self.steps,
+            batch: self.batch,
+            patch: self.patch,
+            lr: self.lr,
+            loss: self.loss,
+            average: self.average,
+            every: self.every,
+            seed: self.seed,
+        })
+    }
+}
+
+/// Runs the subcommand.
+pub fn run(args: &Args) -> Result<ExitCode> {
+    if let Some(threads) = args.threads {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+        pool.map_err(|e| usage(format!("--threads {threads}: {e}")))?;
+    }
+    let config = args.out.join("config.json");
+    let options = if args.resume {
+        let text = fs::read_to_string(&config).map_err(Error::io("read", &config))?;
+        serde_json::from_str(&text)
+            .map_err(|e| Error::invalid(&config, format!("not a run's configuration ({e})")))?
+    } else {
+        if config.exists() {
+            return Err(Error::invalid(
+                &args.out,
+                "holds a run already; pass --resume to go on with it, or another --out",
+            ));
+        }
+        let options = args.options()?;
+        fs::create_dir_all(&args.out).map_err(Error::io("create", &args.out))?;
+        let text = serde_json::to_string_pretty(&options).expect("options serialise");
+        fs::write(&config, text).map_err(Error::io("write", &config))?;
+        options
+    };
+    eprintln!(
+        "{} pairs to train on, {} to validate on; {} steps of {} crops of {p}x{p}",
+        options.train.len(),
+        options.validation.len(),
+        options.steps,
+        options.batch,
+        p = options.patch
+    );
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    // A second handler (in a process that embeds demc) is not ours to replace.
+    let _ = ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed));
+    let bar = ProgressBar::new(options.steps as u64);
+    if !std::io::stderr().is_terminal() {
+        bar.set_draw_target(indicatif::ProgressDrawTarget::hidden());
+    }
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {per_sec} eta {eta} loss {msg}");
+    bar.set_style(style.expect("the template is well formed"));
+    let mut on = |event| match event {
+        Event::Step { step, loss } => {
+            bar.set_position(step as u64);
+            bar.set_message(format!("{loss:.4}"));
+        }
+        Event::Row(row) => {
+            let optional = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
+            let (relmse, ssim) = (optional(row.val_relmse), optional(row.val_ssim));
+            let line = format!(
+                "step {} after {:.0} s: loss {:.4}, validation RelMSE {relmse}, SSIM {ssim}",
+                row.step, row.seconds, row.train_loss
+            );
+            bar.suspend(|| eprintln!("{line}"));
+        }
+    };
+    match train::run(&options, &args.out, args.resume, &stop, &mut on) {
+        Err(Error::Interrupted) => {
+            let out = args.out.display();
+            eprintln!("stopped; go on with: demc train --out {out} --resume");
+            Ok(ExitCode::from(super::SOME_FAILED))
+        }
+        other => other.map(|()| ExitCode::SUCCESS),
+    }
+}

@@ -1,0 +1,63 @@
+//! A trained network as a denoising method, built in or from a weights file.
+
+use std::path::Path;
+
+use super::{
+    Denoiser,
+    network::{self, Network},
+    weights_file::{self, Metadata},
+};
+use crate::{
+    Result,
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// The built-in weights: name and file, smallest first.
+pub const BUILT_IN: [(&str, &[u8]); 0] = [];
+
+/// A network with its weights.
+pub struct Learned {
+    name: String,
+    network: Box<dyn Network>,
+    /// The network's configuration and how it was trained.
+    pub metadata: Metadata,
+}
+
+impl Learned {
+    /// The built-in model of that name, if there is one.
+    pub fn built_in(name: &str) -> Option<Self> {
+        let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
+        let (network, metadata) =
+            weights_file::parse(bytes, Path::new(name)).expect("built-in weights are sound; a test reads them");
+        Some(Self { name: name.to_string(), network, metadata })
+    }
+
+    /// The model in a weights file, named like the file.
+    ///
+    /// # Errors
+    /// See [`weights_file::read`].
+    pub fn from_file(path: &Path) -> Result<Self> {
+        let (network, metadata) = weights_file::read(path)?;
+        Ok(Self { name: path.display().to_string(), network, metadata })
+    }
+
+    /// The network.
+    pub fn network(&mut self) -> &mut dyn Network {
+        &mut *self.network
+    }
+}
+
+impl Denoiser for Learned {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn passes(&self) -> &[Pass] {
+        self.network.passes()
+    }
+
+    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+        network::run(&*self.network, passes)
+    }
+}

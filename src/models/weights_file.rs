@@ -1,0 +1,103 @@
+//! Networks on disk: parameters with the configuration and the training facts in the metadata.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::network::{Config, Network};
+use crate::{
+    Error, Result,
+    nn::weights::{self, Precision, Tensor},
+};
+
+/// How a network was trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Facts {
+    /// Pairs trained on.
+    pub frames: usize,
+    /// Optimiser steps.
+    pub steps: usize,
+    /// Crops a step.
+    pub batch: usize,
+    /// Rows and columns of a crop.
+    pub patch: usize,
+    /// First and last learning rate.
+    pub lr: (f64, f64),
+    /// What was minimised.
+    pub loss: String,
+    /// The seed of weights, crops and augmentation.
+    pub seed: u64,
+    /// Seconds of training.
+    pub seconds: f64,
+    /// Pairs validated on.
+    pub validation_frames: usize,
+    /// Geometric mean RelMSE on them.
+    pub validation_relmse: Option<f64>,
+    /// Mean SSIM on them.
+    pub validation_ssim: Option<f64>,
+}
+
+/// The metadata of a weights file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Metadata {
+    /// The network.
+    pub network: Config,
+    /// How it was trained.
+    pub training: Facts,
+}
+
+/// Writes a network's parameters in half precision.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()> {
+    let metadata = Metadata { network: network.config(), training: facts.clone() };
+    let metadata = serde_json::to_string(&metadata).expect("metadata serialises");
+    let tensors: Vec<Tensor> = network
+        .params()
+        .into_iter()
+        .map(|p| Tensor { name: p.name.clone(), shape: p.shape.clone(), values: p.values() })
+        .collect();
+    weights::write(path, &metadata, &tensors, Precision::Half)
+}
+
+/// Reads a network from a weights file.
+///
+/// # Errors
+/// The file is unreadable, or not the weights of a network that this version knows.
+pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
+    parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+}
+
+/// Parses the bytes of a weights file; `path` is for messages.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
+    let (metadata, tensors) = weights::parse(bytes, path)?;
+    let metadata: Metadata = serde_json::from_str(&metadata).map_err(|e| {
+        Error::invalid(path, format!("no network in its metadata ({e}); use a run's best.safetensors"))
+    })?;
+    super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
+    let mut network = super::build(&metadata.network, 0);
+    for param in network.params() {
+        let found = tensors.binary_search_by(|t| t.name.cmp(&param.name)).ok().map(|i| &tensors[i]);
+        match found {
+            Some(tensor) if tensor.shape == param.shape => param.set(&tensor.values),
+            Some(tensor) => {
+                return Err(Error::invalid(
+                    path,
+                    format!(
+                        "tensor {} has shape {:?}, expected {:?}; the file is damaged or of another version",
+                        param.name, tensor.shape, param.shape
+                    ),
+                ));
+            }
+            None => {
+                let reason = format!("tensor {} is missing; the file is damaged or incomplete", param.name);
+                return Err(Error::invalid(path, reason));
+            }
+        }
+    }
+    Ok((network, metadata))
+}

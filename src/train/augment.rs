@@ -1,0 +1,172 @@
+//! Label-preserving changes to a crop: flips, quarter turns, a permutation of RGB, exposure.
+//!
+//! A vector pass must change with the picture. Camera-space normals turn as the image turns. World
+//! space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
+//! world, so the same flip and turn are applied to the horizontal axes of normals and positions,
+//! about the vertical one, which gravity makes special.
+
+use super::Sample;
+use crate::{
+    nn::Rng,
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// One drawn augmentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Augment {
+    /// Left and right change places (first).
+    pub flip: bool,
+    /// Counter-clockwise quarter turns (second).
+    pub turns: usize,
+    /// Which old colour channel each new one takes.
+    pub rgb: [usize; 3],
+    /// Radiance is multiplied by this.
+    pub exposure: f32,
+}
+
+/// Every order of three channels.
+const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+
+/// Radiance is scaled by up to two stops either way.
+const STOPS: f32 = 2.0;
+
+impl Augment {
+    /// Nothing changes.
+    pub const IDENTITY: Self = Self { flip: false, turns: 0, rgb: [0, 1, 2], exposure: 1.0 };
+
+    /// A random one.
+    pub fn draw(rng: &mut Rng) -> Self {
+        Self {
+            flip: rng.below(2) == 1,
+            turns: rng.below(4),
+            rgb: ORDERS[rng.below(6)],
+            exposure: ((2.0 * rng.uniform() - 1.0) * STOPS).exp2(),
+        }
+    }
+
+    /// Applies it to every pass and the reference.
+    ///
+    /// # Panics
+    /// If the sample is not square and a quarter turn is asked for.
+    pub fn apply(&self, sample: &mut Sample) {
+        let old = &sample.passes;
+        let mut new = PassSet::new(&old.path, &old.view_layer, old.width, old.height);
+        for (pass, planes) in old.iter() {
+            new.insert(pass, self.pass(pass, planes));
+        }
+        sample.passes = new;
+        sample.reference = self.pass(Pass::Combined, &sample.reference);
+    }
+
+    fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
+        let mut planes = self.moved(planes);
+        match pass {
+            Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes),
+            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Vector => {}
+            _ => planes = self.permuted(&planes),
+        }
+        if carries_radiance(pass) {
+            planes.data.iter_mut().for_each(|v| *v *= self.exposure);
+        }
+        planes
+    }
+
+    /// Moves pixels: flip, then turns.
+    fn moved(&self, planes: &Planes) -> Planes {
+        let (w, h) = (planes.width, planes.height);
+        assert!(self.turns % 2 == 0 || w == h, "only squares turn by a quarter");
+        let mut out = Planes::new(planes.channels, w, h);
+        for c in 0..planes.channels {
+            let from = planes.channel(c);
+            for (y, row) in out.channel_mut(c).chunks_mut(w).enumerate() {
+                for (x, value) in row.iter_mut().enumerate() {
+                    // Where the pixel that a counter-clockwise turn brings to (x, y) came from.
+                    let (sx, sy) = match self.turns {
+                        0 => (x, y),
+                        1 => (w - 1 - y, x),
+                        2 => (w - 1 - x, h - 1 - y),
+                        _ => (y, h - 1 - x),
+                    };
+                    *value = from[sy * w + if self.flip { w - 1 - sx } else { sx }];
+                }
+            }
+        }
+        out
+    }
+
+    /// Turns the first two axes of a vector pass as the picture turned (y points up).
+    fn turn_vectors(&self, planes: &mut Planes) {
+        let n = planes.pixels();
+        let (xs, rest) = planes.data.split_at_mut(n);
+        for (x, y) in xs.iter_mut().zip(rest) {
+            if self.flip {
+                *x = -*x;
+            }
+            (*x, *y) = match self.turns {
+                0 => (*x, *y),
+                1 => (-*y, *x),
+                2 => (-*x, -*y),
+                _ => (*y, -*x),
+            };
+        }
+    }
+
+    fn permuted(&self, planes: &Planes) -> Planes {
+        let mut out = planes.clone();
+        for (to, &from) in self.rgb.iter().enumerate() {
+            out.channel_mut(to).copy_from_slice(planes.channel(from));
+        }
+        out
+    }
+}
+
+/// Whether a pass scales with the light in the scene.
+fn carries_radiance(pass: Pass) -> bool {
+    use Pass::*;
+    matches!(
+        pass,
+        Combined | NoisyImage | DiffuseDirect | DiffuseIndirect | GlossyDirect | GlossyIndirect
+            | TransmissionDirect | TransmissionIndirect | VolumeDirect | VolumeIndirect | Emission
+            | Environment
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn square(values: Vec<f32>) -> Planes {
+        Planes::from_vec(values.len() / 4, 2, 2, values)
+    }
+
+    #[test]
+    fn a_turn_moves_right_to_top_and_turns_vectors_with_it() {
+        let turn = Augment { turns: 1, ..Augment::IDENTITY };
+        // The top right pixel goes to the top left; a normal to the right becomes one upward.
+        let moved = turn.moved(&square(vec![1.0, 2.0, 3.0, 4.0]));
+        assert_eq!(moved.data, [2.0, 4.0, 1.0, 3.0]);
+        let normal = square([vec![1.0; 4], vec![0.0; 4], vec![0.5; 4]].concat());
+        let turned = turn.pass(Pass::DenoisingNormal, &normal);
+        assert_eq!([turned.data[0], turned.data[4], turned.data[8]], [0.0, 1.0, 0.5]);
+    }
+
+    #[test]
+    fn four_turns_and_two_flips_are_the_identity() {
+        let start = square((0..12).map(|v| v as f32).collect());
+        let turn = Augment { turns: 1, ..Augment::IDENTITY };
+        let flip = Augment { flip: true, ..Augment::IDENTITY };
+        let turned = (0..4).fold(start.clone(), |p, _| turn.pass(Pass::Normal, &p));
+        let flipped = (0..2).fold(start.clone(), |p, _| flip.pass(Pass::Normal, &p));
+        assert_eq!((turned, flipped), (start.clone(), start));
+    }
+
+    #[test]
+    fn colours_permute_together_and_only_radiance_is_exposed() {
+        let augment = Augment { rgb: [2, 0, 1], exposure: 4.0, ..Augment::IDENTITY };
+        let colours = square([vec![1.0; 4], vec![2.0; 4], vec![3.0; 4]].concat());
+        let pick = |p: Planes| [p.data[0], p.data[4], p.data[8]];
+        assert_eq!(pick(augment.pass(Pass::Combined, &colours)), [12.0, 4.0, 8.0]);
+        assert_eq!(pick(augment.pass(Pass::DenoisingAlbedo, &colours)), [3.0, 1.0, 2.0]);
+    }
+}

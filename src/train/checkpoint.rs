@@ -1,0 +1,86 @@
+//! The state of a run between two steps: parameters, their average, Adam's moments, counters.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::Adam;
+use crate::{
+    Error, Result,
+    models::network::Network,
+    nn::weights::{self, Precision, Tensor},
+};
+
+/// The counters of a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Steps done.
+    pub step: usize,
+    /// Seconds spent, over all sittings.
+    pub seconds: f64,
+    /// Sum and number of training losses since the last line of the log.
+    pub losses: (f64, usize),
+    /// Steps skipped because their gradient was not finite.
+    pub skipped: usize,
+    /// The best validation RelMSE so far.
+    pub best: Option<f64>,
+}
+
+/// Writes the state, whole or not at all.
+pub fn save(
+    path: &Path,
+    progress: &Progress,
+    network: &mut dyn Network,
+    average: &mut dyn Network,
+    adam: &mut Adam,
+) -> Result<()> {
+    let mut tensors = Vec::new();
+    let mut push = |prefix: &str, name: &str, shape: &[usize], values: Vec<f32>| {
+        tensors.push(Tensor { name: format!("{prefix}{name}"), shape: shape.into(), values });
+    };
+    for param in network.params() {
+        push("", &param.name, &param.shape, param.values());
+        if param.trainable {
+            let [first, second] = adam.moments(param);
+            push("adam.first.", &param.name, &param.shape, first);
+            push("adam.second.", &param.name, &param.shape, second);
+        }
+    }
+    for param in average.params() {
+        push("average.", &param.name, &param.shape, param.values());
+    }
+    let metadata = serde_json::to_string(progress).expect("counters serialise");
+    weights::write(path, &metadata, &tensors, Precision::Full)
+}
+
+/// Restores what [`save`] wrote.
+pub fn load(
+    path: &Path,
+    network: &mut dyn Network,
+    average: &mut dyn Network,
+    adam: &mut Adam,
+) -> Result<Progress> {
+    let (metadata, tensors) = weights::read(path)?;
+    let progress = serde_json::from_str(&metadata)
+        .map_err(|e| Error::invalid(path, format!("not a checkpoint ({e}); train again without --resume")))?;
+    let find = |name: String, len: usize| {
+        let found = tensors.binary_search_by(|t| t.name.cmp(&name)).ok().map(|i| &tensors[i].values[..]);
+        found.filter(|v| v.len() == len).ok_or_else(|| {
+            Error::invalid(path, format!("tensor {name} is missing or has another shape; train again"))
+        })
+    };
+    for param in network.params() {
+        let len = param.values().len();
+        param.set(find(param.name.clone(), len)?);
+        if param.trainable {
+            let first = find(format!("adam.first.{}", param.name), len)?;
+            let second = find(format!("adam.second.{}", param.name), len)?;
+            adam.set_moments(param, [first, second]);
+        }
+    }
+    for param in average.params() {
+        let len = param.values().len();
+        param.set(find(format!("average.{}", param.name), len)?);
+    }
+    Ok(progress)
+}

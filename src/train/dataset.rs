@@ -1,0 +1,145 @@
+//! Training frames in memory, and the crops drawn from them.
+
+use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
+use rayon::prelude::*;
+
+use super::Augment;
+use crate::{
+    Error, Result,
+    frame::Frame,
+    nn::Rng,
+    passes::{self, Pass, PassSet},
+    planes::Planes,
+    testset::Pair,
+};
+
+/// Frames and references, decoded once and held as half floats (the precision they mostly come in).
+pub struct Dataset {
+    frames: Vec<Stored>,
+}
+
+struct Stored {
+    pair: Pair,
+    view_layer: String,
+    width: usize,
+    height: usize,
+    passes: Vec<(Pass, Vec<f16>)>,
+    reference: Vec<f16>,
+}
+
+/// A crop: noisy passes and the reference radiance, (3, H, W).
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// The noisy passes.
+    pub passes: PassSet,
+    /// The reference.
+    pub reference: Planes,
+}
+
+/// Largest finite half: brighter values are clipped in the training copy.
+const HALF_MAX: f32 = 65504.0;
+
+fn to_half(values: &[f32]) -> Vec<f16> {
+    let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
+    Vec::from_f32_slice(&clipped)
+}
+
+impl Dataset {
+    /// Decodes what `wanted` names of every pair. Frames smaller than `patch` in either direction are
+    /// an error, since no crop fits them.
+    ///
+    /// # Errors
+    /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
+    pub fn load(pairs: &[Pair], wanted: &[Pass], patch: usize) -> Result<Self> {
+        let frames = pairs.par_iter().map(|pair| Stored::load(pair, wanted, patch)).collect::<Result<_>>()?;
+        Ok(Self { frames })
+    }
+
+    /// Frames held.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Whether it holds no frame.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// The whole of frame `index`, and its name.
+    pub fn frame(&self, index: usize) -> (String, Sample) {
+        let stored = &self.frames[index];
+        (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
+    }
+
+    /// A random square crop of `patch` pixels from a random frame, augmented; all of it decided by `rng`.
+    pub fn draw(&self, patch: usize, rng: &mut Rng) -> Sample {
+        let stored = &self.frames[rng.below(self.frames.len())];
+        let x = rng.below(stored.width - patch + 1);
+        let y = rng.below(stored.height - patch + 1);
+        let mut sample = stored.crop(x, y, patch, patch);
+        Augment::draw(rng).apply(&mut sample);
+        sample
+    }
+}
+
+impl Stored {
+    fn load(pair: &Pair, wanted: &[Pass], patch: usize) -> Result<Self> {
+        let frame = Frame::read(&pair.noisy)?;
+        let mut noisy = passes::read(&frame, None)?;
+        for &pass in wanted {
+            noisy.require(pass, "training")?;
+        }
+        noisy.sanitize();
+        let mut reference = passes::load(&pair.reference, None)?;
+        reference.sanitize();
+        let target = reference.require(Pass::Combined, "training")?;
+        if (reference.width, reference.height) != (noisy.width, noisy.height) {
+            return Err(Error::invalid(
+                &pair.noisy,
+                format!(
+                    "{}x{} pixels, but its reference {} has {}x{}; render both at one size",
+                    noisy.width,
+                    noisy.height,
+                    pair.reference.display(),
+                    reference.width,
+                    reference.height
+                ),
+            ));
+        }
+        if noisy.width < patch || noisy.height < patch {
+            return Err(Error::invalid(
+                &pair.noisy,
+                format!(
+                    "{}x{} pixels hold no patch of {patch}x{patch}; pass --patch N with a smaller size",
+                    noisy.width, noisy.height
+                ),
+            ));
+        }
+        let kept = noisy.iter().filter(|(pass, _)| wanted.contains(pass));
+        Ok(Self {
+            pair: pair.clone(),
+            view_layer: noisy.view_layer.clone(),
+            width: noisy.width,
+            height: noisy.height,
+            passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
+            reference: to_half(&target.data),
+        })
+    }
+
+    fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
+        let cut = |data: &[f16], channels: usize| {
+            let mut planes = Planes::new(channels, width, height);
+            for c in 0..channels {
+                for (row, out) in planes.channel_mut(c).chunks_mut(width).enumerate() {
+                    data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
+                }
+            }
+            planes
+        };
+        let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
+        for (pass, data) in &self.passes {
+            passes.insert(*pass, cut(data, pass.channels()));
+        }
+        Sample { passes, reference: cut(&self.reference, 3) }
+    }
+}

@@ -1,0 +1,19 @@
+//! Fitting weights: pairs of noisy and reference frames in, a run folder out.
+//!
+//! A run folder holds `config.json`, `log.csv`, `loss.png`, `checkpoint.safetensors` and
+//! `best.safetensors`. Every random choice follows from the seed and the step's number, so a run that
+//! was stopped at any moment and resumed ends with the same bits as one that was not.
+
+mod augment;
+mod checkpoint;
+mod dataset;
+mod log;
+mod loss;
+mod optimizer;
+mod run;
+
+pub use augment::Augment;
+pub use dataset::{Dataset, Sample};
+pub use loss::Loss;
+pub use optimizer::Adam;
+pub use run::{Event, Options, run};

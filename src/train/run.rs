@@ -1,0 +1,238 @@
+//! The training loop.
+
+use std::{
+    path::PathBuf,
+    sync::atomic::{AtomicBool, Ordering},
+    time::Instant,
+};
+
+use dfdx::tensor_ops::Backward;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    Adam, Dataset, Loss, Sample,
+    checkpoint::{self, Progress},
+    log,
+};
+use crate::{
+    Error, Result, metrics,
+    models::{
+        self,
+        network::{Config, Inputs, Network, stack},
+        weights_file::{self, Facts},
+    },
+    nn::{Rng, Stats},
+    testset::Pair,
+};
+
+/// Everything that decides a run's result. Written to the run folder as `config.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Options {
+    /// The network.
+    pub network: Config,
+    /// Pairs trained on.
+    pub train: Vec<Pair>,
+    /// Pairs validated on, never trained on.
+    pub validation: Vec<Pair>,
+    /// Steps in all.
+    pub steps: usize,
+    /// Crops a step.
+    pub batch: usize,
+    /// Rows and columns of a crop.
+    pub patch: usize,
+    /// Learning rate of the first and of the last step; it falls geometrically.
+    pub lr: (f64, f64),
+    /// What is minimised.
+    pub loss: Loss,
+    /// Weight of the past in the running average of the weights, which is what is validated and kept.
+    pub average: f64,
+    /// Steps between rows of the log, each with a validation.
+    pub every: usize,
+    /// Decides initial weights, crops and augmentation.
+    pub seed: u64,
+}
+
+/// What the caller hears of.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A step was done.
+    Step {
+        /// Steps done.
+        step: usize,
+        /// Its loss.
+        loss: f64,
+    },
+    /// A row was added to the log.
+    Row(log::Row),
+}
+
+/// Seconds between checkpoints: what a kill costs at most.
+const CHECKPOINT_SECONDS: f64 = 60.0;
+
+/// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
+/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint.
+///
+/// # Errors
+/// A pair is unusable, or the run folder cannot be read or written.
+pub fn run(
+    options: &Options,
+    out: &PathBuf,
+    resume: bool,
+    stop: &AtomicBool,
+    on: &mut dyn FnMut(Event),
+) -> Result<()> {
+    log::create_dir(out)?;
+    let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
+    let mut network = models::build(&options.network, options.seed);
+    let mut average = network.duplicate();
+    let mut adam = Adam::default();
+    let mut progress = Progress::default();
+    if resume && checkpoint_path.exists() {
+        progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut adam)?;
+    }
+    let mut rows = log::read(&log_path, progress.step)?;
+    let training = Dataset::load(&options.train, network.passes(), options.patch)?;
+    let validation = Dataset::load(&options.validation, network.passes(), 1)?;
+    let (mut since, mut saved) = (Instant::now(), Instant::now());
+    while progress.step < options.steps {
+        let samples = draw(&training, options, progress.step);
+        let lr = learning_rate(options, progress.step);
+        let (loss, finite) = step(&mut *network, &mut adam, options, lr, progress.step + 1, &samples)?;
+        progress.step += 1;
+        if finite {
+            progress.losses.0 += loss;
+            progress.losses.1 += 1;
+            follow(&mut *average, &mut *network, options.average, progress.step);
+        } else {
+            progress.skipped += 1;
+        }
+        on(Event::Step { step: progress.step, loss });
+        let last = progress.step == options.steps;
+        if progress.step % options.every == 0 || last {
+            progress.seconds += since.elapsed().as_secs_f64();
+            let score = validate(&*average, &validation)?;
+            let (sum, count) = std::mem::take(&mut progress.losses);
+            let row = log::Row {
+                step: progress.step,
+                seconds: (progress.seconds * 10.0).round() / 10.0,
+                lr,
+                train_loss: sum / count as f64,
+                val_relmse: score.map(|s| s.0),
+                val_ssim: score.and_then(|s| s.1),
+            };
+            rows.push(row.clone());
+            log::write(&log_path, &rows)?;
+            // Without validation frames the latest weights are the best known.
+            if row.val_relmse.is_none_or(|v| progress.best.is_none_or(|best| v < best)) {
+                progress.best = row.val_relmse;
+                weights_file::write(&out.join("best.safetensors"), &mut *average, &facts(options, &row))?;
+            }
+            on(Event::Row(row));
+            since = Instant::now();
+        }
+        let stopping = stop.load(Ordering::Relaxed);
+        if last || stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS {
+            progress.seconds += std::mem::replace(&mut since, Instant::now()).elapsed().as_secs_f64();
+            checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut adam)?;
+            saved = Instant::now();
+        }
+        if stopping && !last {
+            return Err(Error::Interrupted);
+        }
+    }
+    Ok(())
+}
+
+/// The crops of a step, each from its own stream of the seed.
+fn draw(dataset: &Dataset, options: &Options, step: usize) -> Vec<Sample> {
+    let streams = step * options.batch..(step + 1) * options.batch;
+    // Stream 0 made the initial weights.
+    streams
+        .into_par_iter()
+        .map(|stream| dataset.draw(options.patch, &mut Rng::new(options.seed, 1 + stream as u64)))
+        .collect()
+}
+
+/// Falls geometrically from the first step to the last.
+fn learning_rate(options: &Options, step: usize) -> f64 {
+    let (first, last) = options.lr;
+    first * (last / first).powf(step as f64 / (options.steps.max(2) - 1) as f64)
+}
+
+/// One optimiser step. Returns the loss and whether its gradient was finite.
+fn step(
+    network: &mut dyn Network,
+    adam: &mut Adam,
+    options: &Options,
+    lr: f64,
+    step: usize,
+    samples: &[Sample],
+) -> Result<(f64, bool)> {
+    let inputs: Vec<Inputs> =
+        samples.par_iter().map(|s| network.inputs(&s.passes)).collect::<Result<_>>()?;
+    let scales: Vec<f32> = inputs.iter().map(|i| i.scale).collect();
+    let reference: Vec<f32> = (samples.iter().zip(&scales))
+        .flat_map(|(sample, scale)| sample.reference.data.iter().map(move |v| v / scale))
+        .collect();
+    let mut stats = Stats::Batch(Vec::new());
+    let image = network.forward_taped(&stack(&inputs), &mut stats);
+    let loss = options.loss.of(image, reference, &scales);
+    let value = f64::from(loss.as_vec()[0]);
+    let mut gradients = loss.backward();
+    let norm = adam.update(step, lr, network.params(), &mut gradients);
+    if norm.is_finite()
+        && let Stats::Batch(seen) = stats
+    {
+        network.batch_norms().into_iter().zip(&seen).for_each(|(layer, batch)| layer.update(batch));
+    }
+    Ok((value, norm.is_finite()))
+}
+
+/// Moves the averaged weights towards the current ones; young averages forget faster.
+fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step: usize) {
+    let decay = decay.min((1 + step) as f64 / (10 + step) as f64) as f32;
+    for (average, current) in average.params().into_iter().zip(network.params()) {
+        let keep = if current.trainable { decay } else { 0.0 };
+        let blend = |(a, c): (f32, f32)| c + keep * (a - c);
+        let values: Vec<f32> = average.values().into_iter().zip(current.values()).map(blend).collect();
+        average.set(&values);
+    }
+}
+
+/// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames.
+fn validate(network: &dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
+    let (mut logs, mut ssims) = (Vec::new(), Vec::new());
+    for index in 0..frames.len() {
+        let (name, sample) = frames.frame(index);
+        let image = models::network::run(network, &sample.passes)?;
+        let (image, reference) = (&image, &sample.reference);
+        if image.non_finite() > 0 {
+            return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
+        }
+        logs.push(metrics::error::relmse(image, reference).max(f64::MIN_POSITIVE).ln());
+        if let Some(exposure) = metrics::display::exposure(reference) {
+            let display = |p| metrics::display::display(p, exposure);
+            ssims.extend(metrics::ssim::ssim(&display(image), &display(reference)));
+        }
+    }
+    let mean = |v: &[f64]| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);
+    Ok(mean(&logs).map(|log| (log.exp(), mean(&ssims))))
+}
+
+/// What a weights file says of its training.
+fn facts(options: &Options, row: &log::Row) -> Facts {
+    Facts {
+        frames: options.train.len(),
+        steps: row.step,
+        batch: options.batch,
+        patch: options.patch,
+        lr: options.lr,
+        loss: options.loss.to_string(),
+        seed: options.seed,
+        seconds: row.seconds,
+        validation_frames: options.validation.len(),
+        validation_relmse: row.val_relmse,
+        validation_ssim: row.val_ssim,
+    }
+}
