@@ -65,7 +65,8 @@ fn check(
         };
         let direction: Vec<Vec<f32>> = gradients.iter().zip(&noise).map(mixed).collect();
         let moved = |sign: f32| -> Vec<Vec<f32>> {
-            let step = |(v, d): (&Vec<f32>, &Vec<f32>)| v.iter().zip(d).map(|(v, d)| v + sign * h * d).collect();
+            let step =
+                |(v, d): (&Vec<f32>, &Vec<f32>)| v.iter().zip(d).map(|(v, d)| v + sign * h * d).collect();
             values.iter().zip(&direction).map(step).collect()
         };
         let numeric = (loss(&moved(1.0)) - loss(&moved(-1.0))) / (2.0 * f64::from(h));
@@ -88,10 +89,12 @@ fn check_conv(name: &str, conv: Conv, channels: &[usize], h: usize, w: usize) {
     let mut values: Vec<Vec<f32>> = shapes.iter().map(|s| random(&mut rng, s.0 * s.1 * s.2 * s.3)).collect();
     let inputs: Vec<Images> = values.iter().zip(&shapes).map(|(v, s)| images(v.clone(), *s)).collect();
     let mut layer = conv.clone();
-    let weights: Vec<f32> = layer.weight.values().iter().map(|w| w + 0.1 * (2.0 * rng.uniform() - 1.0)).collect();
+    let weights: Vec<f32> =
+        layer.weight.values().iter().map(|w| w + 0.1 * (2.0 * rng.uniform() - 1.0)).collect();
     layer.weight.set(&weights);
     // Half the channels far above zero and half far below: no step reaches the kink of a ReLU.
-    let bias: Vec<f32> = (0..layer.bias.values().len()).map(|c| if c % 2 == 0 { 6.0 } else { -6.0 }).collect();
+    let bias: Vec<f32> =
+        (0..layer.bias.values().len()).map(|c| if c % 2 == 0 { 6.0 } else { -6.0 }).collect();
     layer.bias.set(&bias);
     let traced = inputs.iter().map(|i| Activation::<Taped>::from_images(i.leaky_trace())).collect();
     let gradients = projected(layer.forward(traced).into_images());
@@ -162,8 +165,11 @@ fn batch_norm_in_training_and_in_inference() {
         let traced = Activation::<Taped>::from_images(input.leaky_trace());
         let gradients = projected(norm.forward(traced, &mut stats()).into_images());
         let expected = [&input.clone()].map(|i| gradients.get(i).as_vec());
-        let expected =
-            [expected[0].clone(), gradients.get(&norm.scale.tensor).as_vec(), gradients.get(&norm.shift.tensor).as_vec()];
+        let expected = [
+            expected[0].clone(),
+            gradients.get(&norm.scale.tensor).as_vec(),
+            gradients.get(&norm.shift.tensor).as_vec(),
+        ];
         let values = [values, norm.scale.values(), norm.shift.values()];
         check(&format!("batch norm, training {training}"), &values, &expected, H, 3e-3, |v| {
             let mut norm = norm.clone();

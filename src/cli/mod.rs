@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
 mod compare;
+mod eval;
 mod train;
 
 use std::process::ExitCode;
@@ -25,6 +26,8 @@ enum Command {
     /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
     Compare(compare::Args),
     Train(train::Args),
+    /// Score and time methods over a test set: tables, charts, comparison sheets
+    Eval(eval::Args),
     /// List the built-in models
     Models,
 }
@@ -39,6 +42,7 @@ pub fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::Compare(args) => compare::run(&args),
         Command::Train(args) => train::run(&args),
+        Command::Eval(args) => eval::run(args),
         Command::Models => Ok(ExitCode::SUCCESS),
     };
     done.unwrap_or_else(|error| {

@@ -102,9 +102,9 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
 /// Whether a scene is held out: decided by its name alone, so that every sample count, seed and frame
 /// of it goes the same way. (FNV-1a, Fowler, Noll, Vo.)
 fn held_out(scene: &str) -> bool {
-    let hash = scene.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| {
-        (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3)
-    });
+    let hash = scene
+        .bytes()
+        .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
     // The low bits of this hash depend on few bits of the name.
     (hash >> 32) % HOLD_OUT == 0
 }
@@ -112,12 +112,11 @@ fn held_out(scene: &str) -> bool {
 impl Args {
     fn options(&self) -> Result<Options> {
         let known = models::trainable();
-        let mut network = known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(
-            || {
+        let mut network =
+            known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(|| {
                 let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
                 usage(format!("cannot train '{}'; trainable: {}", self.model, names.join(", ")))
-            },
-        )?;
+            })?;
         if let Some(widths) = &self.widths {
             network.widths.clone_from(widths);
         }
@@ -147,7 +146,9 @@ impl Args {
             ));
         }
         if training.is_empty() {
-            return Err(usage("nothing left to train on once one scene in ten is held out; add pairs or --val"));
+            return Err(usage(
+                "nothing left to train on once one scene in ten is held out; add pairs or --val",
+            ));
         }
         Ok(Options {
             network,

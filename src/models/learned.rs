@@ -28,8 +28,8 @@ impl Learned {
     /// The built-in model of that name, if there is one.
     pub fn built_in(name: &str) -> Option<Self> {
         let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
-        let (network, metadata) =
-            weights_file::parse(bytes, Path::new(name)).expect("built-in weights are sound; a test reads them");
+        let (network, metadata) = weights_file::parse(bytes, Path::new(name))
+            .expect("built-in weights are sound; a test reads them");
         Some(Self { name: name.to_string(), network, metadata })
     }
 

@@ -1,4 +1,58 @@
 //! Runs methods over a test set, times them, and writes what a reader needs to judge them.
+//!
+//! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
+//! `summary.csv`, `speed_vs_accuracy.png` and `.svg`, and `sheets/<pair>.png`. Rows are stored as
+//! they finish; the same command run again keeps those that still hold.
+
+mod canvas;
+mod chart;
+mod memory;
+mod rows;
+mod run;
+mod settings;
+mod sheet;
+mod summary;
+
+use std::path::PathBuf;
+
+pub use rows::{COLUMNS, Row, read_rows};
+pub use run::{Event, evaluate};
+pub use settings::file_stamp;
+pub use summary::{Method as MethodSummary, summarise};
+
+use crate::models::Denoiser;
+
+/// Name of the method that every report has: the input itself.
+pub const NOISY: &str = "noisy";
+
+/// A method under test.
+pub struct Method {
+    /// Its name in tables and charts, unique in a run.
+    pub name: String,
+    /// What runs.
+    pub denoiser: Box<dyn Denoiser>,
+    /// Changes whenever the method might give other results: finished rows are kept while it stays.
+    pub stamp: String,
+}
+
+/// How to run.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Folder for everything that is written.
+    pub out: PathBuf,
+    /// Timed runs of each method and pair, after one that warms up; their median counts.
+    pub repeats: usize,
+    /// Threads that all methods use.
+    pub threads: usize,
+    /// Method that ratios in the summary refer to.
+    pub baseline: String,
+    /// View layer to read; by default the one with the most passes.
+    pub view_layer: Option<String>,
+    /// Run everything anew.
+    pub overwrite: bool,
+    /// Write a comparison sheet for each pair.
+    pub sheets: bool,
+}
 
 /// A measured number as printed and stored: seven significant digits, an exponent
 /// only below a millionth.

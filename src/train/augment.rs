@@ -126,8 +126,17 @@ fn carries_radiance(pass: Pass) -> bool {
     use Pass::*;
     matches!(
         pass,
-        Combined | NoisyImage | DiffuseDirect | DiffuseIndirect | GlossyDirect | GlossyIndirect
-            | TransmissionDirect | TransmissionIndirect | VolumeDirect | VolumeIndirect | Emission
+        Combined
+            | NoisyImage
+            | DiffuseDirect
+            | DiffuseIndirect
+            | GlossyDirect
+            | GlossyIndirect
+            | TransmissionDirect
+            | TransmissionIndirect
+            | VolumeDirect
+            | VolumeIndirect
+            | Emission
             | Environment
     )
 }

@@ -29,8 +29,11 @@ pub fn read(path: &Path, step: usize) -> Result<Vec<Row>> {
         return Ok(Vec::new());
     }
     let foreign = |e: csv::Error| Error::invalid(path, format!("not a training log ({e}); remove it"));
-    let rows: Vec<Row> =
-        csv::Reader::from_path(path).map_err(foreign)?.deserialize().collect::<Result<_, _>>().map_err(foreign)?;
+    let rows: Vec<Row> = csv::Reader::from_path(path)
+        .map_err(foreign)?
+        .deserialize()
+        .collect::<Result<_, _>>()
+        .map_err(foreign)?;
     Ok(rows.into_iter().filter(|row| row.step <= step).collect())
 }
 

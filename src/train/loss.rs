@@ -41,7 +41,12 @@ impl Loss {
     ///
     /// `scale` is each image's scene radiance over network radiance: the epsilon of the relative error
     /// is meant in scene radiance.
-    pub fn of(self, image: Images<Taped>, reference: Vec<f32>, scale: &[f32]) -> Tensor<Rank0, f32, Cpu, Taped> {
+    pub fn of(
+        self,
+        image: Images<Taped>,
+        reference: Vec<f32>,
+        scale: &[f32],
+    ) -> Tensor<Rank0, f32, Cpu, Taped> {
         let shape = *dfdx::shapes::HasShape::shape(&image);
         let device = Cpu::default();
         let pixels = shape.1 * shape.2 * shape.3;

@@ -169,8 +169,7 @@ fn step(
     step: usize,
     samples: &[Sample],
 ) -> Result<(f64, bool)> {
-    let inputs: Vec<Inputs> =
-        samples.par_iter().map(|s| network.inputs(&s.passes)).collect::<Result<_>>()?;
+    let inputs: Vec<Inputs> = samples.par_iter().map(|s| network.inputs(&s.passes)).collect::<Result<_>>()?;
     let scales: Vec<f32> = inputs.iter().map(|i| i.scale).collect();
     let reference: Vec<f32> = (samples.iter().zip(&scales))
         .flat_map(|(sample, scale)| sample.reference.data.iter().map(move |v| v / scale))

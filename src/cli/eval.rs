@@ -1,0 +1,222 @@
+//! `demc eval`: methods against references, with times, tables, charts and comparison sheets.
+
+use std::{
+    collections::HashSet,
+    io::IsTerminal,
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+use clap::Args as ClapArgs;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::SOME_FAILED;
+use crate::{
+    Error, Result,
+    models::{self, Denoiser, oidn::Oidn},
+    report::{self, Event, Method, NOISY, Options, Row},
+    testset::{self, Unmatched},
+};
+
+/// Arguments of `demc eval`.
+#[derive(Debug, ClapArgs)]
+pub struct Args {
+    /// Directory of <scene>_<spp>spp.exr and <scene>_ref.exr, CSV manifest, or quoted glob
+    #[arg(long, value_name = "DIR|MANIFEST|GLOB")]
+    test_set: String,
+    /// Methods: built-in names, oidn-fast, oidn-balanced, oidn-high, oidn-high-prefilter, weights files
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
+    models: Vec<String>,
+    /// Folder for scores.csv, summary.csv, the charts and the comparison sheets
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Method that the summary's ratios refer to [default: the first of --models]
+    #[arg(long, value_name = "NAME")]
+    baseline: Option<String>,
+    /// Timed runs of each method and scene after one that warms up; their median counts
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..))]
+    repeats: u16,
+    /// Threads for every method [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    /// View layer to read [default: the one with the most passes]
+    #[arg(long, value_name = "NAME")]
+    view_layer: Option<String>,
+    /// The program oidnDenoise [default: $OIDN_DENOISE, else the one on PATH]
+    #[arg(long, value_name = "PATH")]
+    oidn: Option<PathBuf>,
+    /// Write no comparison sheets
+    #[arg(long)]
+    no_sheets: bool,
+    /// Run everything anew instead of keeping finished rows
+    #[arg(long)]
+    overwrite: bool,
+}
+
+/// Runs the evaluation.
+///
+/// # Errors
+/// The test set or a method does not exist, or the output folder cannot be written.
+pub fn run(args: Args) -> Result<ExitCode> {
+    let set = testset::read(&args.test_set)?;
+    let methods = methods(&args)?;
+    let baseline = baseline(&args, &methods)?;
+    let mut failed = 0;
+    for unmatched in &set.unmatched {
+        match unmatched {
+            Unmatched::Noisy { .. } => {
+                failed += 1;
+                eprintln!("demc: {unmatched}");
+            }
+            Unmatched::Reference(_) => eprintln!("warning: {unmatched}"),
+        }
+    }
+    let threads = args
+        .threads
+        .map(usize::from)
+        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
+    let options = Options {
+        out: args.out,
+        repeats: args.repeats.into(),
+        threads,
+        baseline,
+        view_layer: args.view_layer,
+        overwrite: args.overwrite,
+        sheets: !args.no_sheets,
+    };
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| Error::Usage(format!("cannot start {threads} threads: {e}; use fewer")))?;
+    let mut progress = Progress::new();
+    let rows = pool
+        .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
+    progress.finish();
+    failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
+    println!("{}", options.out.join("summary.csv").display());
+    if failed > 0 {
+        eprintln!("demc: {failed} failed; {} says why", options.out.join("scores.csv").display());
+        return Ok(ExitCode::from(SOME_FAILED));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The methods asked for, the noisy input first, each under a name of its own.
+fn methods(args: &Args) -> Result<Vec<Method>> {
+    // Built-in methods change with the program.
+    let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
+    let asked = args.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
+    let mut seen = HashSet::new();
+    let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
+    let mut methods = Vec::new();
+    for name in &asked {
+        let denoiser: Box<dyn Denoiser> = match Oidn::new(name, args.oidn.clone()) {
+            Some(oidn) => Box::new(oidn),
+            None => models::open(name)?,
+        };
+        let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
+        methods.push(Method { name: short_name(name, &asked), denoiser, stamp });
+    }
+    Ok(methods)
+}
+
+fn is_file(name: &str) -> bool {
+    Path::new(name).is_file()
+}
+
+/// A weights file goes by its stem, and by its folder too where the stem alone is another's.
+fn short_name(name: &str, all: &[&str]) -> String {
+    if !is_file(name) {
+        return name.into();
+    }
+    let stem = |name: &str| Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
+    let own = stem(name).unwrap_or_else(|| name.into());
+    let is_unique = all.iter().filter(|other| stem(other).as_ref() == Some(&own)).count() == 1;
+    if is_unique && own != "best" {
+        return own;
+    }
+    match Path::new(name).parent().and_then(Path::file_name) {
+        Some(folder) => format!("{}/{own}", folder.to_string_lossy()),
+        None => own,
+    }
+}
+
+fn baseline(args: &Args, methods: &[Method]) -> Result<String> {
+    let Some(wanted) = &args.baseline else {
+        return Ok(methods.get(1).unwrap_or(&methods[0]).name.clone());
+    };
+    let names: Vec<&str> = methods.iter().map(|m| m.name.as_str()).collect();
+    let wanted = short_name(wanted, &args.models.iter().map(String::as_str).collect::<Vec<_>>());
+    if !names.contains(&wanted.as_str()) {
+        return Err(Error::Usage(format!(
+            "--baseline {wanted} is not among the methods: {}; add it to --models",
+            names.join(", ")
+        )));
+    }
+    Ok(wanted)
+}
+
+/// A bar on a terminal, a line for each row otherwise.
+struct Progress {
+    bar: Option<ProgressBar>,
+    rows: usize,
+    done: usize,
+}
+
+impl Progress {
+    fn new() -> Self {
+        Self { bar: None, rows: 0, done: 0 }
+    }
+
+    fn tell(&mut self, event: &Event) {
+        match event {
+            Event::Start { rows, kept } => {
+                (self.rows, self.done) = (*rows, *kept);
+                if *kept > 0 {
+                    eprintln!("{kept} of {rows} rows are there already (--overwrite runs them anew)");
+                }
+                if std::io::stderr().is_terminal() {
+                    let style =
+                        ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} (left {eta}) {msg}")
+                            .expect("the template is valid");
+                    let bar = ProgressBar::new(*rows as u64).with_style(style);
+                    bar.set_position(*kept as u64);
+                    self.bar = Some(bar);
+                }
+            }
+            Event::Pair(pair) => {
+                if let Some(bar) = &self.bar {
+                    bar.set_message(pair.id());
+                }
+            }
+            Event::Row(row) => {
+                self.done += 1;
+                let line = self.line(row);
+                match &self.bar {
+                    Some(bar) if row.reason.is_empty() => bar.inc(1),
+                    Some(bar) => {
+                        bar.println(line);
+                        bar.inc(1);
+                    }
+                    None => eprintln!("{line}"),
+                }
+            }
+        }
+    }
+
+    fn line(&self, row: &Row) -> String {
+        let counted = format!("[{}/{}] {} {} spp {}", self.done, self.rows, row.scene, row.spp, row.model);
+        if !row.reason.is_empty() {
+            return format!("{counted}: {}", row.reason);
+        }
+        let value = |name: &str, v: Option<f64>| v.map(|v| format!("  {name} {v:.4}")).unwrap_or_default();
+        let time = row.seconds.map(|s| format!("  {:.0} ms", s * 1e3)).unwrap_or_default();
+        format!("{counted}{}{}{time}", value("relmse", row.relmse), value("ssim", row.ssim))
+    }
+
+    fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}

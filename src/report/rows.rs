@@ -1,0 +1,302 @@
+//! `scores.csv`: one row for each pair and method, appended as it finishes.
+
+use std::{
+    collections::HashMap,
+    fs::{self, OpenOptions},
+    io::Write,
+    path::{Path, PathBuf},
+};
+
+use serde::Deserialize;
+
+use super::number;
+use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
+
+/// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
+pub const COLUMNS: [&str; 22] = [
+    "scene",
+    "model",
+    "spp",
+    "width",
+    "height",
+    "relmse",
+    "ssim",
+    "rmse",
+    "max_error",
+    "seconds",
+    "ms_per_mpx",
+    "exposure",
+    "relmse_trimmed",
+    "smape",
+    "flip",
+    "peak_mib",
+    "threads",
+    "repeats",
+    "non_finite",
+    "noisy",
+    "reference",
+    "reason",
+];
+
+/// What one method scored on one pair. A number that could not be measured is none; `reason` says why.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+pub struct Row {
+    /// Scene, with the frame of a sequence.
+    pub scene: String,
+    /// Method.
+    pub model: String,
+    /// Samples per pixel of the noisy render.
+    pub spp: u32,
+    /// Pixels in a row.
+    pub width: Option<usize>,
+    /// Rows.
+    pub height: Option<usize>,
+    /// See [`crate::metrics`].
+    pub relmse: Option<f64>,
+    /// See [`crate::metrics`].
+    pub ssim: Option<f64>,
+    /// See [`crate::metrics`].
+    pub rmse: Option<f64>,
+    /// See [`crate::metrics`].
+    pub max_error: Option<f64>,
+    /// Median time to denoise the frame, without file traffic.
+    pub seconds: Option<f64>,
+    /// The same in milliseconds for a million pixels.
+    pub ms_per_mpx: Option<f64>,
+    /// Display exposure of the reference.
+    pub exposure: Option<f64>,
+    /// See [`crate::metrics`].
+    pub relmse_trimmed: Option<f64>,
+    /// See [`crate::metrics`].
+    pub smape: Option<f64>,
+    /// See [`crate::metrics`].
+    pub flip: Option<f64>,
+    /// Memory that the first run added at its peak.
+    pub peak_mib: Option<f64>,
+    /// Threads used.
+    pub threads: usize,
+    /// Timed runs.
+    pub repeats: usize,
+    /// NaN or infinite values in the method's output; any makes the row invalid.
+    pub non_finite: Option<usize>,
+    /// The noisy file.
+    pub noisy: PathBuf,
+    /// The reference file.
+    pub reference: PathBuf,
+    /// Why scores are missing; empty where all is well.
+    pub reason: String,
+}
+
+/// What makes a row the same row in another run.
+pub type Key = (PathBuf, PathBuf, String);
+
+impl Row {
+    /// A row without numbers.
+    pub fn new(pair: &Pair, model: &str) -> Self {
+        Self {
+            scene: pair.label(),
+            model: model.into(),
+            spp: pair.spp,
+            noisy: pair.noisy.clone(),
+            reference: pair.reference.clone(),
+            ..Self::default()
+        }
+    }
+
+    /// What identifies it.
+    pub fn key(&self) -> Key {
+        (self.noisy.clone(), self.reference.clone(), self.model.clone())
+    }
+
+    /// Whether the method gave scores here.
+    pub fn is_valid(&self) -> bool {
+        self.relmse.is_some()
+    }
+
+    /// Fills in the scores.
+    pub fn set_scores(&mut self, scores: &Scores) {
+        self.relmse = Some(scores.relmse);
+        self.ssim = scores.ssim;
+        self.rmse = Some(scores.rmse);
+        self.max_error = Some(scores.max_error);
+        self.exposure = scores.exposure;
+        self.relmse_trimmed = Some(scores.relmse_trimmed);
+        self.smape = Some(scores.smape);
+        self.flip = scores.flip;
+    }
+
+    /// Fills in the median of the measured times.
+    pub fn set_time(&mut self, times: &mut [f64], pixels: usize) {
+        times.sort_unstable_by(f64::total_cmp);
+        let Some(last) = times.len().checked_sub(1) else { return };
+        let seconds = f64::midpoint(times[last / 2], times[times.len() / 2]);
+        self.seconds = Some(seconds);
+        self.ms_per_mpx = Some(seconds * 1e3 / (pixels as f64 / 1e6));
+    }
+
+    /// Its cells in the order of [`COLUMNS`].
+    fn cells(&self) -> [String; COLUMNS.len()] {
+        let value = |v: Option<f64>| v.map(number).unwrap_or_default();
+        let count = |v: Option<usize>| v.map(|v| v.to_string()).unwrap_or_default();
+        [
+            self.scene.clone(),
+            self.model.clone(),
+            self.spp.to_string(),
+            count(self.width),
+            count(self.height),
+            value(self.relmse),
+            value(self.ssim),
+            value(self.rmse),
+            value(self.max_error),
+            value(self.seconds),
+            value(self.ms_per_mpx),
+            value(self.exposure),
+            value(self.relmse_trimmed),
+            value(self.smape),
+            value(self.flip),
+            value(self.peak_mib),
+            self.threads.to_string(),
+            self.repeats.to_string(),
+            count(self.non_finite),
+            self.noisy.display().to_string(),
+            self.reference.display().to_string(),
+            self.reason.clone(),
+        ]
+    }
+}
+
+/// A CSV document.
+pub fn to_csv<R: AsRef<[String]>>(columns: &[&str], rows: impl IntoIterator<Item = R>) -> String {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    let invariant = "writing to memory does not fail";
+    writer.write_record(columns).expect(invariant);
+    for row in rows {
+        writer.write_record(row.as_ref()).expect(invariant);
+    }
+    String::from_utf8(writer.into_inner().expect(invariant)).expect("cells are UTF-8")
+}
+
+/// Replaces a file by `text` in one step.
+pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
+    atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
+}
+
+/// The rows of a `scores.csv`; none where there is no such file. A last line that a killed run cut
+/// short is left out.
+///
+/// # Errors
+/// The file is unreadable or no such table.
+pub fn read_rows(path: &Path) -> Result<Vec<Row>> {
+    let mut text = match fs::read_to_string(path) {
+        Ok(text) => text,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(e) => return Err(Error::io("read", path)(e)),
+    };
+    text.truncate(text.rfind('\n').map_or(0, |end| end + 1));
+    csv::Reader::from_reader(text.as_bytes()).deserialize().collect::<Result<_, _>>().map_err(|e| {
+        Error::invalid(path, format!("is no table of scores: {e}; move it away, or say --overwrite"))
+    })
+}
+
+/// The table on disk while a run fills it.
+pub struct Table {
+    path: PathBuf,
+    rows: HashMap<Key, Row>,
+}
+
+impl Table {
+    /// Starts with the rows kept from an earlier run.
+    pub fn create(path: PathBuf, kept: Vec<Row>) -> Result<Self> {
+        let text = to_csv(&COLUMNS, kept.iter().map(Row::cells));
+        write_file(&path, text.as_bytes())?;
+        Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect() })
+    }
+
+    /// The row, where it is finished.
+    pub fn get(&self, key: &Key) -> Option<&Row> {
+        self.rows.get(key)
+    }
+
+    /// Stores a row at once.
+    pub fn push(&mut self, row: Row) -> Result<()> {
+        let text = to_csv(&COLUMNS, [row.cells()]);
+        let line = text.split_once('\n').map_or("", |(_header, line)| line);
+        let mut file =
+            OpenOptions::new().append(true).open(&self.path).map_err(Error::io("write", &self.path))?;
+        file.write_all(line.as_bytes()).map_err(Error::io("write", &self.path))?;
+        self.rows.insert(row.key(), row);
+        Ok(())
+    }
+
+    /// Rewrites the table in the order of `keys` and gives its rows.
+    pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
+        let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();
+        write_file(&self.path, to_csv(&COLUMNS, rows.iter().map(Row::cells)).as_bytes())?;
+        Ok(rows)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(scene: &str, model: &str) -> Row {
+        let pair = Pair {
+            scene: scene.into(),
+            noisy: format!("{scene}_0004spp.exr").into(),
+            reference: format!("{scene}_ref.exr").into(),
+            spp: 4,
+            frame: None,
+        };
+        Row::new(&pair, model)
+    }
+
+    #[test]
+    fn table_survives_a_cut_line_and_ends_in_order() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scores.csv");
+        let mut table = Table::create(path.clone(), vec![row("b", "noisy")]).unwrap();
+        let mut full = row("a", "oidn, \"high\"");
+        full.relmse = Some(0.0123);
+        full.non_finite = Some(0);
+        full.reason = "line one".into();
+        table.push(full.clone()).unwrap();
+        assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), full.clone()]);
+
+        let mut file = OpenOptions::new().append(true).open(&path).unwrap();
+        file.write_all(b"c,noisy,4,12").unwrap();
+        assert_eq!(read_rows(&path).unwrap().len(), 2, "a cut line is no row");
+
+        let rows = table.finish([full.key(), row("b", "noisy").key(), row("z", "noisy").key()]).unwrap();
+        assert_eq!(rows, [full.clone(), row("b", "noisy")]);
+        assert_eq!(read_rows(&path).unwrap(), rows);
+    }
+
+    #[test]
+    fn header_begins_with_the_contract() {
+        let contract = "scene,model,spp,width,height,relmse,ssim,rmse,max_error,seconds,ms_per_mpx,exposure";
+        assert_eq!(COLUMNS[..12].join(","), contract);
+    }
+
+    #[test]
+    fn time_is_the_median() {
+        for (mut times, expected) in [(vec![3.0, 1.0, 2.0], 2.0), (vec![4.0, 1.0], 2.5), (vec![7.0], 7.0)] {
+            let mut row = row("a", "m");
+            row.set_time(&mut times, 500_000);
+            assert_eq!(row.seconds, Some(expected));
+            assert_eq!(row.ms_per_mpx, Some(expected * 2000.0));
+        }
+        let mut untimed = row("a", "noisy");
+        untimed.set_time(&mut [], 1);
+        assert_eq!(untimed.seconds, None);
+    }
+
+    #[test]
+    fn a_foreign_file_is_an_error_with_a_remedy() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scores.csv");
+        fs::write(&path, "a,b\n1,2\n").unwrap();
+        assert!(read_rows(&path).unwrap_err().to_string().contains("--overwrite"));
+        assert_eq!(read_rows(&dir.path().join("none.csv")).unwrap(), []);
+    }
+}

@@ -1,0 +1,228 @@
+//! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
+//!
+//! On a pair each method runs once to warm up (that output is scored), then all take turns for the
+//! timed runs: a machine that slows down slows them all.
+
+use std::{collections::HashMap, fs};
+
+use super::{
+    Method, NOISY, Options, chart, memory,
+    rows::{Key, Row, Table, read_rows, write_file},
+    settings::Settings,
+    sheet::{self, Shown},
+    summary,
+};
+use crate::{
+    Error, Result,
+    metrics::{self, Incomparable},
+    passes::{self, Pass, PassSet},
+    planes::Planes,
+    testset::Pair,
+};
+
+/// What a run tells while it goes on.
+#[derive(Debug)]
+pub enum Event<'a> {
+    /// Rows in all, and those kept from an earlier run.
+    Start {
+        /// Rows when all is done.
+        rows: usize,
+        /// Rows that are there already.
+        kept: usize,
+    },
+    /// A pair is being read.
+    Pair(&'a Pair),
+    /// A row is finished.
+    Row(&'a Row),
+}
+
+/// Scores every method on every pair and writes the report into `options.out`. Returns all rows,
+/// those kept from an earlier run included, pair by pair in the order of the methods.
+///
+/// # Errors
+/// The folder cannot be written. A pair or method that fails is no error: its row says why.
+pub fn evaluate(
+    pairs: &[Pair],
+    methods: &[Method],
+    options: &Options,
+    on: &mut dyn FnMut(Event),
+) -> Result<Vec<Row>> {
+    let out = &options.out;
+    let sheets = out.join("sheets");
+    let folder = if options.sheets { &sheets } else { out };
+    fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
+    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options));
+    let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
+    // A row that failed is tried again.
+    kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
+    let keep_sheets = !options.overwrite && before.same_methods(&now);
+
+    on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
+    let mut table = Table::create(scores, kept)?;
+    now.write(&stored)?;
+    for pair in pairs {
+        let finished: Vec<bool> =
+            methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
+        let sheet = options.sheets.then(|| sheets.join(format!("{}.png", sheet_name(pairs, pair))));
+        let sheet = sheet.filter(|path| !(keep_sheets && finished.iter().all(|f| *f) && path.is_file()));
+        if finished.iter().all(|f| *f) && sheet.is_none() {
+            continue;
+        }
+        on(Event::Pair(pair));
+        let done = run_pair(pair, methods, &finished, sheet.is_some(), options);
+        for row in done.rows {
+            on(Event::Row(&row));
+            table.push(row)?;
+        }
+        if let (Some(path), Some(scene)) = (sheet, done.scene) {
+            let rows: HashMap<&str, &Row> = methods
+                .iter()
+                .filter_map(|m| Some((m.name.as_str(), table.get(&Row::new(pair, &m.name).key())?)))
+                .collect();
+            sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
+        }
+    }
+
+    let keys = pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key()));
+    let rows = table.finish(keys.collect::<Vec<Key>>())?;
+    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
+    let summaries = summary::summarise(&rows, &names, &options.baseline);
+    write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
+    chart::write(out, &summaries, options.threads)?;
+    Ok(rows)
+}
+
+/// A file name for the pair's sheet, unique in the test set even where a manifest repeats a scene.
+fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
+    let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
+    let id = pair.id().replace(['/', '\\'], "_");
+    match twins.iter().position(|p| *p == pair) {
+        Some(at) if at > 0 => format!("{id}_{}", at + 1),
+        _ => id,
+    }
+}
+
+/// What running a pair gave.
+struct Done {
+    /// Rows of the methods that were not finished.
+    rows: Vec<Row>,
+    /// Images for the sheet, where the pair could be read.
+    scene: Option<Scene>,
+}
+
+struct Scene {
+    reference: Planes,
+    images: Vec<Shown>,
+}
+
+/// The decoded pair.
+struct Loaded {
+    /// As stored: what `noisy` is judged by.
+    noisy: Planes,
+    /// Non-finite values replaced: what methods see.
+    passes: PassSet,
+    reference: Planes,
+}
+
+fn load(pair: &Pair, options: &Options) -> Result<Loaded> {
+    let view_layer = options.view_layer.as_deref();
+    let mut passes = passes::load(&pair.noisy, view_layer)?;
+    passes.use_noisy_image();
+    let noisy = passes.require(Pass::Combined, NOISY)?.clone();
+    passes.sanitize();
+    let reference =
+        passes::load(&pair.reference, view_layer)?.require(Pass::Combined, "a reference")?.clone();
+    if (reference.width, reference.height) != (noisy.width, noisy.height) {
+        let why = Incomparable::Size {
+            image: (3, noisy.width, noisy.height),
+            reference: (3, reference.width, reference.height),
+        };
+        return Err(Error::invalid(&pair.noisy, format!("{why}; render both at one size")));
+    }
+    Ok(Loaded { noisy, passes, reference })
+}
+
+fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, options: &Options) -> Done {
+    let open = || methods.iter().zip(finished).filter(|(_, finished)| !**finished).map(|(m, _)| m);
+    let new_row = |method: &Method| {
+        let mut row = Row::new(pair, &method.name);
+        row.threads = options.threads;
+        row
+    };
+    let loaded = match load(pair, options) {
+        Ok(loaded) => loaded,
+        Err(error) => {
+            let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
+            return Done { rows: open().map(fail).collect(), scene: None };
+        }
+    };
+    let pixels = loaded.noisy.pixels();
+    let mut rows: Vec<Option<Row>> = Vec::new();
+    let mut images = Vec::new();
+    for (method, &finished) in methods.iter().zip(finished) {
+        if finished && !shown {
+            rows.push(None);
+            continue;
+        }
+        let mut row = new_row(method);
+        (row.width, row.height) = (Some(loaded.noisy.width), Some(loaded.noisy.height));
+        let image = first_run(method, &loaded, &mut row);
+        if shown && let Some(image) = &image {
+            images.push(Shown::new(&method.name, image, &loaded.reference));
+        }
+        rows.push((!finished).then_some(row));
+    }
+    let mut times: Vec<Vec<f64>> = vec![Vec::new(); methods.len()];
+    for _ in 0..options.repeats {
+        for (i, method) in methods.iter().enumerate() {
+            let Some(row) = rows[i].as_mut().filter(|row| row.is_valid() && method.name != NOISY) else {
+                continue;
+            };
+            match method.denoiser.denoise_timed(&loaded.passes) {
+                Ok(run) => times[i].push(run.seconds),
+                Err(error) => row.reason = error.to_string(),
+            }
+        }
+    }
+    for (row, times) in rows.iter_mut().zip(&mut times) {
+        if let Some(row) = row {
+            row.repeats = times.len();
+            row.set_time(times, pixels);
+        }
+    }
+    Done {
+        rows: rows.into_iter().flatten().collect(),
+        scene: shown.then_some(Scene { reference: loaded.reference, images }),
+    }
+}
+
+/// The run that warms up and is scored. None, with a reason in the row, where it fails.
+fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
+    let image = if method.name == NOISY {
+        loaded.noisy.clone()
+    } else {
+        let (run, grown) = memory::peak_mib(|| method.denoiser.denoise_timed(&loaded.passes));
+        match run {
+            Ok(run) => {
+                row.peak_mib = run.peak_mib.or(grown);
+                run.image
+            }
+            Err(error) => {
+                row.reason = error.to_string();
+                return None;
+            }
+        }
+    };
+    row.non_finite = Some(image.non_finite());
+    match metrics::score(&image, &loaded.reference) {
+        Ok(scores) => {
+            row.set_scores(&scores);
+            Some(image)
+        }
+        Err(why) => {
+            row.reason = why.to_string();
+            None
+        }
+    }
+}

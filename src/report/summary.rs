@@ -1,0 +1,265 @@
+//! `summary.csv`: each method over the same scenes, so that no method profits from scenes it missed.
+//!
+//! Means of RelMSE are ruled by the noisiest scene; the geometric mean of the ratio to a baseline,
+//! scene by scene, weighs every scene alike (Fleming and Wallace, "How Not to Lie with Statistics",
+//! 1986).
+
+use std::{
+    collections::{BTreeSet, HashMap},
+    path::Path,
+};
+
+use super::{
+    number,
+    rows::{Row, to_csv},
+};
+
+/// Metrics that are summarised, each with how a row gives it.
+const METRICS: [(&str, fn(&Row) -> Option<f64>); 9] = [
+    ("relmse", |r| r.relmse),
+    ("ssim", |r| r.ssim),
+    ("rmse", |r| r.rmse),
+    ("max_error", |r| r.max_error),
+    ("seconds", |r| r.seconds),
+    ("ms_per_mpx", |r| r.ms_per_mpx),
+    ("relmse_trimmed", |r| r.relmse_trimmed),
+    ("smape", |r| r.smape),
+    ("flip", |r| r.flip),
+];
+
+/// One metric of one method over the common scenes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Statistics {
+    /// Arithmetic mean.
+    pub mean: Option<f64>,
+    /// Median.
+    pub median: Option<f64>,
+    /// Geometric mean; none where a value is negative.
+    pub geomean: Option<f64>,
+    /// Geometric mean of the ratio to the baseline method on the same scene.
+    pub ratio: Option<f64>,
+}
+
+/// One method over the common scenes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Method {
+    /// Its name.
+    pub model: String,
+    /// Samples per pixel of the rows summarised; none for all of them.
+    pub spp: Option<u32>,
+    /// Pairs that every method scored, over which the statistics run.
+    pub scenes: usize,
+    /// Pairs on which this method failed.
+    pub failed: usize,
+    /// Largest memory peak of any row.
+    pub peak_mib: Option<f64>,
+    statistics: [Statistics; METRICS.len()],
+}
+
+impl Method {
+    /// The statistics of a metric, named as its column.
+    ///
+    /// # Panics
+    /// If no summarised metric has that name.
+    pub fn of(&self, metric: &str) -> Statistics {
+        let at = METRICS.iter().position(|(name, _)| *name == metric).expect("a summarised metric");
+        self.statistics[at]
+    }
+}
+
+/// Every method in `models` over the pairs that all of them scored: first over all sample counts,
+/// then, where there are several, for each. A method that scored nowhere does not limit the others.
+pub fn summarise(rows: &[Row], models: &[String], baseline: &str) -> Vec<Method> {
+    let counts: BTreeSet<u32> = rows.iter().map(|r| r.spp).collect();
+    let mut summaries = over(rows.iter().collect(), models, baseline, None);
+    if counts.len() > 1 {
+        for spp in counts {
+            let rows = rows.iter().filter(|r| r.spp == spp).collect();
+            summaries.extend(over(rows, models, baseline, Some(spp)));
+        }
+    }
+    summaries
+}
+
+/// The noisy and the reference file.
+type Files<'a> = (&'a Path, &'a Path);
+type RowsOfMethod<'a> = HashMap<Files<'a>, &'a Row>;
+
+fn valid<'a>(of: &RowsOfMethod<'a>, pair: Files<'a>) -> bool {
+    of.get(&pair).is_some_and(|r| r.is_valid())
+}
+
+fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) -> Vec<Method> {
+    let mut by_model: HashMap<&str, RowsOfMethod> = HashMap::new();
+    for &row in &rows {
+        by_model.entry(&row.model).or_default().insert((&row.noisy, &row.reference), row);
+    }
+    let scoring: Vec<&RowsOfMethod> =
+        by_model.values().filter(|of| of.values().any(|r| r.is_valid())).collect();
+    let mut common: Vec<Files> = scoring.first().map(|of| of.keys().copied().collect()).unwrap_or_default();
+    common.retain(|&pair| scoring.iter().all(|of| valid(of, pair)));
+    common.sort_unstable();
+    let nothing = RowsOfMethod::new();
+    let base = by_model.get(baseline).unwrap_or(&nothing);
+    models
+        .iter()
+        .map(|model| {
+            let of = by_model.get(model.as_str()).unwrap_or(&nothing);
+            let common: Vec<_> = common.iter().filter(|&&pair| valid(of, pair)).collect();
+            let statistics = METRICS.map(|(_, metric)| {
+                let values: Vec<f64> = common.iter().filter_map(|pair| metric(of[*pair])).collect();
+                let ratios: Vec<f64> = common
+                    .iter()
+                    .filter_map(|pair| Some(metric(of[*pair])? / metric(base.get(*pair)?)?))
+                    .collect();
+                Statistics {
+                    mean: mean(&values),
+                    median: median(&values),
+                    geomean: geometric_mean(&values),
+                    ratio: geometric_mean(&ratios),
+                }
+            });
+            Method {
+                model: model.clone(),
+                spp,
+                scenes: common.len(),
+                failed: of.values().filter(|r| !r.is_valid()).count(),
+                peak_mib: of.values().filter_map(|r| r.peak_mib).reduce(f64::max),
+                statistics,
+            }
+        })
+        .collect()
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+fn median(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    Some(f64::midpoint(sorted[last / 2], sorted[sorted.len() / 2]))
+}
+
+/// None for no values, a negative one, or a ratio to zero.
+fn geometric_mean(values: &[f64]) -> Option<f64> {
+    if values.iter().any(|v| *v < 0.0 || !v.is_finite()) {
+        return None;
+    }
+    mean(&values.iter().map(|v| v.ln()).collect::<Vec<_>>()).map(f64::exp)
+}
+
+/// The table as CSV.
+pub fn to_text(summaries: &[Method], baseline: &str) -> String {
+    let mut columns: Vec<String> = ["model", "spp", "scenes", "failed", "baseline"].map(String::from).into();
+    for (metric, _) in METRICS {
+        columns.extend(["mean", "median", "geomean", "ratio"].map(|s| format!("{metric}_{s}")));
+    }
+    columns.push("peak_mib_max".into());
+    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
+    let value = |v: Option<f64>| v.map(number).unwrap_or_default();
+    let rows = summaries.iter().map(|s| {
+        let mut cells = vec![
+            s.model.clone(),
+            s.spp.map_or("all".into(), |n| n.to_string()),
+            s.scenes.to_string(),
+            s.failed.to_string(),
+            baseline.into(),
+        ];
+        for s in s.statistics {
+            cells.extend([s.mean, s.median, s.geomean, s.ratio].map(value));
+        }
+        cells.push(value(s.peak_mib));
+        cells
+    });
+    to_csv(&columns, rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(scene: &str, model: &str, spp: u32, relmse: Option<f64>) -> Row {
+        Row {
+            scene: scene.into(),
+            model: model.into(),
+            spp,
+            relmse,
+            noisy: format!("{scene}_{spp}").into(),
+            reference: scene.into(),
+            ..Row::default()
+        }
+    }
+
+    fn models(names: &[&str]) -> Vec<String> {
+        names.iter().map(ToString::to_string).collect()
+    }
+
+    fn close(found: Option<f64>, expected: f64) {
+        assert!((found.unwrap() - expected).abs() < 1e-12, "{found:?} for {expected}");
+    }
+
+    #[test]
+    fn statistics_by_hand() {
+        let rows = [
+            row("a", "x", 4, Some(1.0)),
+            row("b", "x", 4, Some(4.0)),
+            row("c", "x", 4, Some(16.0)),
+            row("a", "base", 4, Some(2.0)),
+            row("b", "base", 4, Some(2.0)),
+            row("c", "base", 4, Some(2.0)),
+        ];
+        let found = summarise(&rows, &models(&["x", "base"]), "base");
+        assert_eq!(found.len(), 2);
+        let x = found[0].of("relmse");
+        close(x.mean, 7.0);
+        close(x.median, 4.0);
+        close(x.geomean, 4.0);
+        close(x.ratio, 2.0);
+        close(found[1].of("relmse").ratio, 1.0);
+        assert_eq!(found[0].of("ssim"), Statistics::default(), "never measured");
+    }
+
+    #[test]
+    fn only_scenes_that_every_method_scored_count() {
+        let rows = [
+            row("a", "x", 4, Some(1.0)),
+            row("b", "x", 4, Some(100.0)),
+            row("a", "y", 4, Some(3.0)),
+            row("b", "y", 4, None),
+            row("a", "absent", 4, None),
+            row("b", "absent", 4, None),
+        ];
+        let found = summarise(&rows, &models(&["x", "y", "absent"]), "x");
+        close(found[0].of("relmse").mean, 1.0);
+        close(found[1].of("relmse").ratio, 3.0);
+        let counts: Vec<_> = found.iter().map(|m| (m.scenes, m.failed)).collect();
+        assert_eq!(counts, [(1, 0), (1, 1), (0, 2)]);
+        assert_eq!(found[2].of("relmse").mean, None);
+    }
+
+    #[test]
+    fn several_sample_counts_are_also_summarised_apart() {
+        let rows = [row("a", "x", 4, Some(8.0)), row("a", "x", 16, Some(2.0))];
+        let found = summarise(&rows, &models(&["x"]), "x");
+        let means: Vec<_> = found.iter().map(|m| (m.spp, m.of("relmse").mean)).collect();
+        assert_eq!(means, [(None, Some(5.0)), (Some(4), Some(8.0)), (Some(16), Some(2.0))]);
+    }
+
+    #[test]
+    fn zero_and_negative_values_make_no_false_numbers() {
+        close(geometric_mean(&[0.0, 4.0]), 0.0);
+        assert_eq!(geometric_mean(&[-1.0, 4.0]), None);
+        assert_eq!(geometric_mean(&[f64::INFINITY]), None, "a ratio to zero");
+        assert_eq!(geometric_mean(&[]), None);
+    }
+
+    #[test]
+    fn text_has_a_cell_for_every_column() {
+        let text = to_text(&summarise(&[row("a", "x", 4, Some(8.0))], &models(&["x"]), "x"), "x");
+        let lines: Vec<usize> = text.lines().map(|l| l.split(',').count()).collect();
+        assert_eq!(lines, [5 + 4 * METRICS.len() + 1; 2]);
+        assert!(text.lines().nth(1).unwrap().starts_with("x,all,1,0,x,8,8,8,1,"));
+    }
+}
