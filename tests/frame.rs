@@ -182,7 +182,7 @@ fn add_to_every_kind(make: fn(&Path, Encoding, bool), multi: bool, blocks: Block
         assert_eq!(frame.is_multi_part(), multi);
         let planes = ramp();
         let recoded = frame
-            .set_layer(0, "ViewLayer.Denoised", &rgba(&planes, SampleKind::Half))
+            .set_layer(0, "ViewLayer.Denoised", None, &rgba(&planes, SampleKind::Half))
             .unwrap_or_else(|e| panic!("{kind}: {e}"));
         frame.write(&output).unwrap();
 
@@ -276,7 +276,7 @@ fn adding_a_layer_twice_replaces_it() {
             let mut frame = Frame::read(&path).unwrap();
             let planes: Vec<Vec<f32>> =
                 ramp().into_iter().map(|p| p.into_iter().map(|v| v * scale).collect()).collect();
-            frame.set_layer(0, "ViewLayer.Denoised", &rgba(&planes, SampleKind::Float)).unwrap();
+            frame.set_layer(0, "ViewLayer.Denoised", None, &rgba(&planes, SampleKind::Float)).unwrap();
             frame.write(&path).unwrap();
             let after = read(&path);
             assert_eq!(after.layer_data.len(), parts);
@@ -303,7 +303,7 @@ fn resolution_levels_are_kept_and_given_to_new_channels() {
     let mut frame = Frame::read(&input).unwrap();
     let values: Vec<f32> = (0..64).map(|i| i as f32).collect();
     let new = NewChannel { component: "R", kind: SampleKind::Float, values: &values };
-    frame.set_layer(0, "V.Denoised", &[new]).unwrap();
+    frame.set_layer(0, "V.Denoised", None, &[new]).unwrap();
     frame.write(&output).unwrap();
 
     let image = exr::prelude::read()
@@ -334,7 +334,7 @@ fn half_channels_never_overflow() {
     single_part(&path, encoding(Compression::ZIP16, Blocks::ScanLines, LineOrder::Increasing), true);
     let mut frame = Frame::read(&path).unwrap();
     let planes = vec![vec![1e6; WIDTH * HEIGHT], vec![-1e6; WIDTH * HEIGHT]];
-    frame.set_layer(0, "ViewLayer.Denoised", &rgba(&planes, SampleKind::Half)).unwrap();
+    frame.set_layer(0, "ViewLayer.Denoised", None, &rgba(&planes, SampleKind::Half)).unwrap();
     frame.write(&path).unwrap();
     let after = read(&path);
     assert_close(channel(&after, "ViewLayer.Denoised.R").unwrap(), &vec![65504.0; WIDTH * HEIGHT], 0.0);

@@ -1,10 +1,14 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
 mod compare;
+mod denoise;
 mod eval;
+mod inputs;
+mod inspect;
+mod stop;
 mod train;
 
-use std::process::ExitCode;
+use std::{io::Write, process::ExitCode};
 
 use clap::{Parser, Subcommand};
 
@@ -23,11 +27,15 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
-    Compare(compare::Args),
+    /// Remove the noise from renders: keeps every layer, adds the layer 'Denoised'
+    Denoise(denoise::Args),
     Train(train::Args),
     /// Score and time methods over a test set: tables, charts, comparison sheets
     Eval(eval::Args),
+    /// What a file holds, which passes are recognised, what is missing or suspicious
+    Inspect(inspect::Args),
+    /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
+    Compare(compare::Args),
     /// List the built-in models
     Models,
 }
@@ -40,13 +48,20 @@ pub const USAGE: u8 = 2;
 /// Parses the process arguments and runs the subcommand.
 pub fn main() -> ExitCode {
     let done = match Cli::parse().command {
-        Command::Compare(args) => compare::run(&args),
+        Command::Denoise(args) => denoise::run(args),
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Compare(args) => compare::run(&args),
         Command::Models => Ok(ExitCode::SUCCESS),
     };
     done.unwrap_or_else(|error| {
         eprintln!("demc: {error}");
         ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
     })
+}
+
+/// One line on stdout. A reader that has gone away (`demc ... | head`) is no reason to stop.
+fn print_line(line: &str) {
+    let _ = writeln!(std::io::stdout(), "{line}");
 }

@@ -57,7 +57,8 @@ type Named<'a> = Vec<(String, NewChannel<'a>)>;
 impl Frame {
     /// Adds the layer `name` (such as `ViewLayer.Denoised`) with the data window of the part `beside`,
     /// or replaces the channels of that name. A multi-part file gets a new part after the others, a
-    /// single-part file new channels.
+    /// single-part file new channels. A stereo `view` is named as Blender does: in the part's name
+    /// (`ViewLayer.Denoised-left`), or in the channels' (`ViewLayer.Denoised.left.R`).
     ///
     /// # Errors
     /// The part cannot be decoded or encoded.
@@ -68,20 +69,28 @@ impl Frame {
         &mut self,
         beside: usize,
         name: &str,
+        view: Option<&str>,
         channels: &[NewChannel<'_>],
     ) -> Result<Option<Recoded>> {
         let header = self.header(beside)?.clone();
         for channel in channels {
             assert_eq!(channel.values.len(), header.layer_size.area(), "one value for each pixel");
         }
-        let named: Named<'_> = channels.iter().map(|c| (format!("{name}.{}", c.component), *c)).collect();
-        let holder = self.parts.iter().position(|p| p.channels.iter().any(|c| c.name == named[0].0));
+        let own_part = self.is_part_per_pass(beside);
+        let (part_name, prefix) = match view {
+            None => (name.to_owned(), name.to_owned()),
+            Some(view) if own_part => (format!("{name}-{view}"), name.to_owned()),
+            Some(view) => (name.to_owned(), format!("{name}.{view}")),
+        };
+        let named: Named<'_> = channels.iter().map(|c| (format!("{prefix}.{}", c.component), *c)).collect();
+        let beside_view = &self.parts[beside].view;
+        let holder = self
+            .parts
+            .iter()
+            .position(|p| p.view == *beside_view && p.channels.iter().any(|c| c.name == named[0].0));
         match holder {
             Some(part) => self.set_channels(part, &named),
-            None if self.is_part_per_pass(beside) => {
-                self.add_part(&header, name, &named)?;
-                Ok(None)
-            }
+            None if own_part => self.add_part(&header, &part_name, &named).map(|()| None),
             None => self.set_channels(beside, &named),
         }
     }

@@ -107,6 +107,11 @@ impl Pass {
         }
     }
 
+    /// Names under which Blender has written the pass, the current one first.
+    pub fn blender_names(self) -> &'static [&'static str] {
+        names::row(self).names
+    }
+
     /// Where Blender turns the pass on, as a sentence part.
     pub fn blender_setting(self) -> &'static str {
         names::row(self).setting

@@ -95,6 +95,8 @@ impl ChannelName {
             Some((prefix, component)) => (prefix, component),
             None => (part.unwrap_or(""), channel),
         };
+        // Blender names the parts of stereo files `ViewLayer.Combined-left`.
+        let prefix = part_view.and_then(|v| prefix.strip_suffix(v)?.strip_suffix('-')).unwrap_or(prefix);
         let mut view = part_view.map(str::to_owned);
         let mut prefix = prefix;
         let (head, last) = prefix.rsplit_once('.').unwrap_or(("", prefix));

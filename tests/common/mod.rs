@@ -1,4 +1,5 @@
 //! What several test binaries share. Each uses its own part of it.
 #![allow(dead_code)]
 
+pub mod files;
 pub mod python;

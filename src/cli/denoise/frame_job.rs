@@ -1,0 +1,183 @@
+//! One frame in three steps that the pipeline overlaps: load, denoise, store.
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use super::preview;
+use crate::{
+    Error, Result,
+    frame::{Frame, NewChannel},
+    models::Denoiser,
+    passes::{self, Layer, Pass, PassSet},
+    planes::Planes,
+};
+
+/// What the user chose for every frame of the batch.
+pub struct Options {
+    /// `--view-layer`.
+    pub view_layer: Option<String>,
+    /// The layer to add; none where the beauty is replaced.
+    pub layer: Option<String>,
+    /// `--preview`.
+    pub preview: bool,
+}
+
+/// What became of a frame, for the user.
+#[derive(Default)]
+pub struct Report {
+    /// The view layer denoised.
+    pub view_layer: String,
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Seconds in the model alone.
+    pub seconds: f64,
+    /// NaN and infinite input values repaired, by pass.
+    pub repaired: BTreeMap<String, usize>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// A frame and, for each stereo view, where its beauty is and what to compute with.
+pub struct Frames<T> {
+    frame: Frame,
+    views: Vec<(Layer, T)>,
+    report: Report,
+}
+
+/// Reads a frame and decodes the passes the model needs.
+pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Frames<PassSet>> {
+    let frame = Frame::read(input)?;
+    let layers = passes::layers(&frame);
+    let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
+    let mut report = Report { view_layer: chosen.name.clone(), ..Report::default() };
+    if options.view_layer.is_none() {
+        report.notes.extend(note_other_layers(&layers, chosen));
+    }
+    let mut wanted = vec![Pass::Combined, Pass::Alpha, Pass::NoisyImage];
+    wanted.extend(model.passes());
+    let mut views = Vec::new();
+    for layer in layers.iter().filter(|l| l.name == chosen.name) {
+        let mut set = passes::read_layer(&frame, layer, &wanted)?;
+        if set.use_noisy_image() {
+            report.notes.push(
+                "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
+            );
+        }
+        // Before any work: a missing pass is the user's commonest mistake.
+        for &pass in std::iter::once(&Pass::Combined).chain(model.passes()) {
+            set.require(pass, model.name())?;
+        }
+        for (pass, count) in set.sanitize() {
+            *report.repaired.entry(pass.to_string()).or_default() += count;
+        }
+        (report.width, report.height) = (set.width, set.height);
+        views.push((layer.clone(), set));
+    }
+    report.notes.dedup(); // stereo views repeat them
+    Ok(Frames { frame, views, report })
+}
+
+fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
+    let mut others: Vec<String> = layers
+        .iter()
+        .filter(|l| l.name != chosen.name && l.passes.contains_key(&Pass::Combined))
+        .map(|l| format!("'{}'", l.name))
+        .collect();
+    others.dedup();
+    (!others.is_empty()).then(|| {
+        format!("denoised view layer '{}'; --view-layer chooses another: {}", chosen.name, others.join(", "))
+    })
+}
+
+/// Denoised radiance and the alpha it came with.
+pub struct Denoised {
+    radiance: Planes,
+    alpha: Option<Planes>,
+}
+
+/// Runs the model over each view.
+pub fn denoise(loaded: Frames<PassSet>, model: &dyn Denoiser) -> Result<Frames<Denoised>> {
+    let Frames { frame, views, mut report } = loaded;
+    let mut done = Vec::with_capacity(views.len());
+    for (layer, mut set) in views {
+        let start = Instant::now();
+        let radiance = model.denoise(&set)?;
+        report.seconds += start.elapsed().as_secs_f64();
+        if (radiance.channels, radiance.width, radiance.height) != (3, set.width, set.height) {
+            return Err(Error::invalid(
+                &set.path,
+                format!("model {} returned an image of the wrong size; choose another model", model.name()),
+            ));
+        }
+        let alpha = set.remove(Pass::Alpha);
+        let radiance = finite(radiance, &mut report);
+        done.push((layer, Denoised { radiance, alpha }));
+    }
+    Ok(Frames { frame, views: done, report })
+}
+
+/// Whatever a model returns, what is written is finite.
+fn finite(radiance: Planes, report: &mut Report) -> Planes {
+    let mut set = PassSet::new(PathBuf::new(), "", radiance.width, radiance.height);
+    set.insert(Pass::Combined, radiance);
+    if let Some(count) = set.sanitize().get(&Pass::Combined) {
+        report
+            .notes
+            .push(format!("the model returned {count} non-finite values; they were filled from around them"));
+    }
+    set.remove(Pass::Combined).expect("inserted above")
+}
+
+/// Adds the layers, or replaces the beauty, and writes the file.
+pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Result<Report> {
+    let Frames { mut frame, views, mut report } = denoised;
+    let several = views.len() > 1;
+    for (layer, Denoised { radiance, alpha }) in &views {
+        let at = &layer.passes[&Pass::Combined];
+        let recoded = match &options.layer {
+            Some(name) => {
+                let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
+                let name = match layer.name.is_empty() {
+                    true => name.clone(),
+                    false => format!("{}.{name}", layer.name),
+                };
+                let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
+                    .iter()
+                    .enumerate()
+                    .map(|(c, component)| NewChannel { component, kind, values: radiance.channel(c) })
+                    .collect();
+                if let Some(alpha) = alpha {
+                    channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
+                }
+                frame.set_layer(at.part, &name, layer.view.as_deref(), &channels)?
+            }
+            None => {
+                let mut channels: Vec<(usize, &[f32])> =
+                    at.channels.iter().enumerate().map(|(c, &i)| (i, radiance.channel(c))).collect();
+                if let (Some(alpha), Some(at)) = (alpha, layer.passes.get(&Pass::Alpha)) {
+                    channels.push((at.channels[0], alpha.channel(0)));
+                }
+                frame.replace(at.part, &channels)?
+            }
+        };
+        if let Some(recoded) = recoded {
+            let part = frame.parts()[at.part].name.clone();
+            let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
+            report.notes.push(format!("{what}: {recoded}"));
+        }
+    }
+    if options.preview {
+        for (layer, Denoised { radiance, .. }) in &views {
+            let view = layer.view.as_deref().filter(|_| several);
+            preview::write(&preview::path(output, view), radiance)?;
+        }
+    }
+    // Last: an EXR that exists is a frame that is finished.
+    frame.write(output)?;
+    Ok(report)
+}

@@ -1,0 +1,43 @@
+//! A PNG of the denoised frame, exposed and encoded like the display image on which SSIM is measured.
+
+use std::{
+    io::{BufWriter, Write},
+    path::{Path, PathBuf},
+};
+
+use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+
+use crate::{
+    Error, Result, frame,
+    metrics::display::{display, exposure},
+    planes::Planes,
+};
+
+/// The preview's path: the result's, with the view where there are several, as `.png`.
+pub fn path(output: &Path, view: Option<&str>) -> PathBuf {
+    match view {
+        None => output.with_extension("png"),
+        Some(view) => output.with_extension(format!("{view}.png")),
+    }
+}
+
+/// Writes radiance (3, H, W) as an 8-bit PNG.
+pub fn write(path: &Path, radiance: &Planes) -> Result<()> {
+    // A black frame has no exposure: any shows it black.
+    let image = display(radiance, exposure(radiance).unwrap_or(1.0));
+    let (r, g, b) = (image.channel(0), image.channel(1), image.channel(2));
+    let to_byte = |v: f32| (v * 255.0).round() as u8;
+    let pixels: Vec<u8> = (0..image.pixels()).flat_map(|i| [r[i], g[i], b[i]].map(to_byte)).collect();
+    frame::atomically(path, |file| {
+        let mut buffered = BufWriter::new(file);
+        PngEncoder::new(&mut buffered)
+            .write_image(&pixels, radiance.width as u32, radiance.height as u32, ExtendedColorType::Rgb8)
+            .map_err(|e| match e {
+                image::ImageError::IoError(source) => {
+                    Error::Io { path: path.into(), action: "write", source }
+                }
+                other => Error::invalid(path, other),
+            })?;
+        buffered.flush().map_err(Error::io("write", path))
+    })
+}

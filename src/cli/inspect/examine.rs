@@ -1,0 +1,240 @@
+//! A file's layers, passes, missing passes and oddities, as data that prints and serialises.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::{
+    Result, features,
+    frame::{Frame, Window},
+    models,
+    passes::{self, Layer, POSITION_AOV, Pass},
+    planes::Planes,
+};
+
+/// What `inspect` says about one file.
+#[derive(Serialize)]
+pub struct FileReport {
+    pub path: String,
+    pub bytes: u64,
+    /// `multi-part` (Blender 5: one part per pass) or `single-part`.
+    pub layout: &'static str,
+    pub parts: Vec<PartReport>,
+    pub layers: Vec<LayerReport>,
+    pub warnings: Vec<String>,
+}
+
+#[derive(Serialize)]
+pub struct PartReport {
+    pub name: Option<String>,
+    pub width: usize,
+    pub height: usize,
+    pub compression: &'static str,
+    pub tiles: Option<(usize, usize)>,
+    pub bytes: usize,
+    pub channels: usize,
+}
+
+#[derive(Serialize)]
+pub struct LayerReport {
+    pub name: String,
+    pub view: Option<String>,
+    pub passes: Vec<PassReport>,
+    /// Channels that demc has no use for.
+    pub unrecognised: Vec<String>,
+    pub models: Vec<ModelReport>,
+    pub warnings: Vec<String>,
+}
+
+#[derive(Serialize)]
+pub struct PassReport {
+    pub pass: String,
+    /// As the file names it.
+    pub stored_as: String,
+    /// `half`, `float` or `uint`.
+    pub kind: String,
+    pub compression: &'static str,
+    /// Values that are NaN or infinite.
+    pub non_finite: usize,
+    pub all_zero: bool,
+}
+
+#[derive(Serialize)]
+pub struct ModelReport {
+    pub model: String,
+    pub missing: Vec<Missing>,
+}
+
+#[derive(Serialize, Clone)]
+pub struct Missing {
+    pub pass: String,
+    pub remedy: &'static str,
+}
+
+/// A method and the passes it needs.
+pub struct Method {
+    name: String,
+    passes: Vec<Pass>,
+}
+
+/// Methods that the user may choose.
+const NAMES: [&str; 13] = [
+    "demc-s",
+    "demc-m",
+    "demc-l",
+    "demc",
+    "demc-nofusion",
+    "semc",
+    "kpcn",
+    "nfor",
+    "lbf",
+    "oidn-fast",
+    "oidn-balanced",
+    "oidn-high",
+    "oidn-high-prefilter",
+];
+
+/// The methods that run here, with the passes they need.
+pub fn methods() -> Vec<Method> {
+    let open = |name: &&str| {
+        let model = models::open(name).ok()?;
+        Some(Method { name: (*name).into(), passes: model.passes().to_vec() })
+    };
+    let mut methods: Vec<Method> = NAMES.iter().filter_map(open).collect();
+    if !methods.iter().any(|m| m.name == "demc") {
+        methods.insert(0, Method { name: "demc".into(), passes: features::PAPER_PASSES.to_vec() });
+    }
+    methods
+}
+
+/// Reads and decodes a whole file.
+pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
+    let frame = Frame::read(path)?;
+    let parts = frame.parts().iter().map(|p| PartReport {
+        name: p.name.clone(),
+        width: p.data_window.width,
+        height: p.data_window.height,
+        compression: p.compression,
+        tiles: p.tiles,
+        bytes: p.stored_bytes,
+        channels: p.channels.len(),
+    });
+    let layers = passes::layers(&frame);
+    let mut report = FileReport {
+        path: path.display().to_string(),
+        bytes: frame.byte_len(),
+        layout: if frame.is_multi_part() { "multi-part" } else { "single-part" },
+        parts: parts.collect(),
+        layers: Vec::new(),
+        warnings: window_warnings(&frame),
+    };
+    if !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
+        report
+            .warnings
+            .push(format!("nothing to denoise: no Combined pass; {}", Pass::Combined.blender_setting()));
+    }
+    for layer in &layers {
+        report.layers.push(examine_layer(&frame, layer, methods)?);
+    }
+    Ok(report)
+}
+
+fn window_warnings(frame: &Frame) -> Vec<String> {
+    let display = frame.display_window();
+    let mut differing: Vec<Window> =
+        frame.parts().iter().map(|p| p.data_window).filter(|w| *w != display).collect();
+    differing.dedup();
+    let at = |w: Window| format!("{}x{} at {},{}", w.width, w.height, w.x, w.y);
+    let warn = |w: Window| {
+        format!(
+            "data window {} is not the display window {}: a cropped or overscanned render; what is stored \
+             is what is denoised",
+            at(w),
+            at(display)
+        )
+    };
+    differing.into_iter().map(warn).collect()
+}
+
+fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<LayerReport> {
+    let mut passes = Vec::new();
+    let mut warnings = Vec::new();
+    if !layer.passes.is_empty() {
+        let set = passes::read_layer(frame, layer, &Pass::ALL)?;
+        for (pass, planes) in set.iter() {
+            let at = &layer.passes[&pass];
+            let part = &frame.parts()[at.part];
+            let report = PassReport {
+                pass: pass.to_string(),
+                stored_as: at.name.clone(),
+                kind: part.channels[at.channels[0]].kind.to_string(),
+                compression: part.compression,
+                non_finite: planes.non_finite(),
+                all_zero: planes.data.iter().all(|v| *v == 0.0),
+            };
+            warnings.extend(pass_warnings(pass, &report, planes));
+            passes.push(report);
+        }
+    }
+    if layer.passes.contains_key(&Pass::Position) && !layer.position_averaged {
+        warnings.push(format!(
+            "Position is Cycles' own pass, one sample a pixel: aliased, and wrong under depth of field and \
+             motion blur; a shader AOV named '{POSITION_AOV}' (blender_scripts/export_passes.py sets it up) \
+             is averaged over samples"
+        ));
+    }
+    if layer.passes.contains_key(&Pass::NoisyImage) {
+        warnings.push(
+            "Combined was already denoised by Blender; demc uses the Noisy Image pass instead (turn off \
+             Render Properties > Sampling > Render > Denoise to save the time)"
+                .into(),
+        );
+    }
+    let has_beauty = layer.passes.contains_key(&Pass::Combined);
+    let models = methods.iter().filter(|_| has_beauty).map(|m| ModelReport {
+        model: m.name.clone(),
+        missing: m
+            .passes
+            .iter()
+            .filter(|p| !layer.passes.contains_key(p))
+            .map(|p| Missing { pass: p.to_string(), remedy: p.blender_setting() })
+            .collect(),
+    });
+    Ok(LayerReport {
+        name: layer.name.clone(),
+        view: layer.view.clone(),
+        models: models.collect(),
+        passes,
+        unrecognised: layer.unrecognised.clone(),
+        warnings,
+    })
+}
+
+fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if report.non_finite > 0 {
+        warnings.push(format!(
+            "{pass}: {} of {} values are NaN or infinite; `demc denoise` fills them from around them",
+            report.non_finite,
+            planes.data.len()
+        ));
+    }
+    // Other passes are rightly zero where a scene has no glass, no volume, no lamp in view.
+    let never_zero = [
+        Pass::Combined,
+        Pass::Normal,
+        Pass::Position,
+        Pass::DenoisingNormal,
+        Pass::DenoisingAlbedo,
+        Pass::NoisyImage,
+    ];
+    if report.all_zero && never_zero.contains(&pass) {
+        warnings.push(format!("{pass} is zero everywhere: an empty render, or a pass that was not written"));
+    }
+    let negative = planes.data.iter().filter(|v| **v < 0.0).count();
+    if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) {
+        warnings
+            .push(format!("{pass}: {negative} negative values, which no light makes; models read them as 0"));
+    }
+    warnings
+}

@@ -1,0 +1,46 @@
+//! `demc inspect FILE...`: what a file holds, which passes are recognised, what each model misses and
+//! how Blender turns it on, and what looks suspicious.
+
+mod examine;
+mod print;
+
+use std::{path::PathBuf, process::ExitCode};
+
+use clap::Args as ClapArgs;
+
+use super::{SOME_FAILED, inputs};
+use crate::Result;
+
+/// Arguments of `demc inspect`.
+#[derive(Debug, ClapArgs)]
+pub struct Args {
+    /// EXR files, directories of them, or quoted globs
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Print one JSON object per file, one a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Prints what each file holds; files that cannot be read are named on stderr.
+///
+/// # Errors
+/// The inputs name nothing.
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let methods = examine::methods();
+    let mut failed = false;
+    for path in inputs::expand(&args.files)? {
+        match examine::examine(&path, &methods) {
+            Ok(report) if args.json => {
+                let line = serde_json::to_string(&report).expect("strings and numbers serialise");
+                super::print_line(&line);
+            }
+            Ok(report) => super::print_line(&print::text(&report)),
+            Err(error) => {
+                eprintln!("demc: {error}");
+                failed = true;
+            }
+        }
+    }
+    Ok(if failed { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
+}

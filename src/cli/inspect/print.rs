@@ -1,0 +1,107 @@
+//! The report of `demc inspect` as text for a terminal.
+
+use std::fmt::Write;
+
+use super::examine::{FileReport, LayerReport, Missing};
+
+/// The whole report; the caller ends the last line.
+pub fn text(report: &FileReport) -> String {
+    let mut out = String::new();
+    write_file(&mut out, report).expect("writing to a string cannot fail");
+    out.truncate(out.trim_end().len());
+    out
+}
+
+fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
+    let (width, height) = report.parts.first().map_or((0, 0), |p| (p.width, p.height));
+    let mut kinds: Vec<String> = report
+        .parts
+        .iter()
+        .map(|p| match p.tiles {
+            Some((w, h)) => format!("{} tiles {w}x{h}", p.compression),
+            None => p.compression.into(),
+        })
+        .collect();
+    kinds.sort();
+    kinds.dedup();
+    let parts = match report.parts.len() {
+        1 => String::new(),
+        n => format!(", {n} parts"),
+    };
+    writeln!(
+        out,
+        "{}\n  {width}x{height}, {}, {}{parts}, compression {}",
+        report.path,
+        size(report.bytes),
+        report.layout,
+        kinds.join(" and ")
+    )?;
+    write_warnings(out, "  ", &report.warnings)?;
+    report.layers.iter().try_for_each(|layer| write_layer(out, layer))
+}
+
+fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
+    let view = layer.view.as_ref().map(|v| format!(", view '{v}'")).unwrap_or_default();
+    match layer.name.is_empty() {
+        true => writeln!(out, "  without a view layer{view}")?,
+        false => writeln!(out, "  view layer '{}'{view}", layer.name)?,
+    }
+    for pass in &layer.passes {
+        let alias = match pass.stored_as == pass.pass || pass.pass == "Alpha" {
+            true => String::new(),
+            false => format!("  stored as '{}'", pass.stored_as),
+        };
+        let zero = if pass.all_zero { "  all zero" } else { "" };
+        writeln!(out, "    {:<22}{:<7}{}{alias}{zero}", pass.pass, pass.kind, pass.compression)?;
+    }
+    // By layer, not by channel: `ViewLayer.Mist`, not `ViewLayer.Mist.Z`.
+    let mut others: Vec<&str> = layer
+        .unrecognised
+        .iter()
+        .map(|c| c.rsplit_once('.').map_or(c.as_str(), |(layer, _)| layer))
+        .collect();
+    others.dedup();
+    if !others.is_empty() {
+        writeln!(out, "    kept, not read: {}", others.join(", "))?;
+    }
+    write_models(out, layer)?;
+    write_warnings(out, "    ", &layer.warnings)
+}
+
+/// Models that are ready in one line, then what each of the others misses, those alike together.
+fn write_models(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
+    let mut groups: Vec<(Vec<&str>, &[Missing])> = Vec::new();
+    for model in &layer.models {
+        let alike = |(_, m): &&mut (Vec<&str>, &[Missing])| {
+            m.iter().map(|m| &m.pass).eq(model.missing.iter().map(|m| &m.pass))
+        };
+        match groups.iter_mut().find(alike) {
+            Some((names, _)) => names.push(&model.model),
+            None => groups.push((vec![&model.model], &model.missing)),
+        }
+    }
+    groups.sort_by_key(|(_, missing)| missing.len());
+    for (names, missing) in groups {
+        if missing.is_empty() {
+            writeln!(out, "    ready for {}", names.join(", "))?;
+            continue;
+        }
+        writeln!(out, "    not ready for {}:", names.join(", "))?;
+        for m in missing {
+            writeln!(out, "      no {}: {}", m.pass, m.remedy)?;
+        }
+    }
+    Ok(())
+}
+
+fn write_warnings(out: &mut String, indent: &str, warnings: &[String]) -> std::fmt::Result {
+    warnings.iter().try_for_each(|w| writeln!(out, "{indent}warning: {w}"))
+}
+
+fn size(bytes: u64) -> String {
+    match bytes {
+        0..1_000 => format!("{bytes} bytes"),
+        1_000..1_000_000 => format!("{:.0} kB", bytes as f64 / 1e3),
+        _ => format!("{:.1} MB", bytes as f64 / 1e6),
+    }
+}

@@ -1,0 +1,63 @@
+//! Small EXR files in the layouts that renderers write, made by the `exr` crate itself.
+
+use std::path::{Path, PathBuf};
+
+use exr::prelude::*;
+use half::f16;
+
+/// A file of `tests/data`.
+pub fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+/// Every channel of every part, by part name and channel name.
+pub type Flat = Image<Layers<AnyChannels<FlatSamples>>>;
+
+/// Reads a file with the `exr` crate.
+pub fn read_exr(path: impl AsRef<Path>) -> Flat {
+    read_all_flat_layers_from_file(path).unwrap()
+}
+
+/// The values of a channel of a single-part file or of the first part that has it.
+pub fn values(image: &Flat, channel: &str) -> Vec<f32> {
+    samples(image, channel).unwrap_or_else(|| panic!("no channel {channel}")).values_as_f32().collect()
+}
+
+/// The samples of a channel, if the file has it.
+pub fn samples<'a>(image: &'a Flat, channel: &str) -> Option<&'a FlatSamples> {
+    let mut all = image.layer_data.iter().flat_map(|l| &l.channel_data.list);
+    all.find(|c| c.name.eq(channel)).map(|c| &c.sample_data)
+}
+
+/// Bit patterns, so that NaN equals itself.
+pub fn bits(samples: &FlatSamples) -> Vec<u32> {
+    match samples {
+        FlatSamples::F16(v) => v.iter().map(|v| u32::from(v.to_bits())).collect(),
+        FlatSamples::F32(v) => v.iter().map(|v| v.to_bits()).collect(),
+        FlatSamples::U32(v) => v.clone(),
+    }
+}
+
+/// A render in one part: half Combined RGBA and float Normal XYZ of the view layer `ViewLayer`;
+/// `value` gives each channel its pixels by name (`Combined.R`) and index.
+pub fn write_render(path: &Path, width: usize, height: usize, value: impl Fn(&str, usize) -> f32) {
+    let plane = |name: &str| (0..width * height).map(|i| value(name, i)).collect::<Vec<f32>>();
+    let half = ["R", "G", "B", "A"].map(|c| {
+        let name = format!("Combined.{c}");
+        (name.clone(), FlatSamples::F16(plane(&name).into_iter().map(f16::from_f32).collect()))
+    });
+    let float = ["X", "Y", "Z"].map(|c| {
+        let name = format!("Normal.{c}");
+        (name.clone(), FlatSamples::F32(plane(&name)))
+    });
+    let list = half.into_iter().chain(float);
+    let list = list.map(|(name, samples)| AnyChannel::new(format!("ViewLayer.{name}").as_str(), samples));
+    let encoding = Encoding {
+        compression: Compression::ZIP16,
+        blocks: Blocks::ScanLines,
+        line_order: LineOrder::Increasing,
+    };
+    let channels = AnyChannels::sort(list.collect());
+    let layer = Layer::new((width, height), LayerAttributes::default(), encoding, channels);
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}

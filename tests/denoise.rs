@@ -1,0 +1,368 @@
+//! `demc denoise` as its users run it: what is kept, what is added, what a batch survives.
+//!
+//! The method is `noisy`, which returns its input: what is tested is everything around the model.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use assert_cmd::Command;
+use common::files::{bits, data, read_exr, samples, values, write_render};
+use predicates::{prelude::*, str::contains};
+use tempfile::TempDir;
+
+fn demc(out: &Path) -> Command {
+    let mut command = Command::cargo_bin("demc").unwrap();
+    command.args(["denoise", "--model", "noisy", "--out"]).arg(out);
+    command
+}
+
+fn out() -> (TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("out");
+    (dir, path)
+}
+
+/// All that `before` holds, `after` holds, bit for bit.
+#[track_caller]
+fn assert_kept(before: &Path, after: &Path) {
+    let (before, after) = (read_exr(before), read_exr(after));
+    assert_eq!(before.attributes, after.attributes);
+    assert!(!before.layer_data.is_empty());
+    for (old, new) in before.layer_data.iter().zip(&after.layer_data) {
+        assert_eq!((old.size, &old.attributes, &old.encoding), (new.size, &new.attributes, &new.encoding));
+        for channel in &old.channel_data.list {
+            let now = new.channel_data.list.iter().find(|c| c.name == channel.name).expect("channel kept");
+            assert_eq!(bits(&channel.sample_data), bits(&now.sample_data), "{}", channel.name);
+        }
+    }
+}
+
+#[track_caller]
+fn assert_same_values(path: &Path, a: &str, b: &str) {
+    let image = read_exr(path);
+    let (a, b) = (samples(&image, a).expect(a), samples(&image, b).expect(b));
+    assert_eq!(bits(a), bits(b));
+    assert_eq!(std::mem::discriminant(a), std::mem::discriminant(b), "number type");
+}
+
+#[test]
+fn adds_the_layer_to_renders_of_both_blender_layouts() {
+    for (file, parts_added) in [("blender5.exr", 1), ("blender4.exr", 0)] {
+        let (_dir, out) = out();
+        demc(&out).arg(data(file)).assert().success().stdout(contains("40x24")).stderr("");
+        let result = out.join(file);
+        assert_kept(&data(file), &result);
+        for c in ["R", "G", "B", "A"] {
+            assert_same_values(
+                &result,
+                &format!("ViewLayer.Combined.{c}"),
+                &format!("ViewLayer.Denoised.{c}"),
+            );
+        }
+        let (before, after) = (read_exr(data(file)), read_exr(&result));
+        assert_eq!(after.layer_data.len(), before.layer_data.len() + parts_added);
+        if parts_added > 0 {
+            let name = &after.layer_data.last().unwrap().attributes.layer_name;
+            assert_eq!(name.as_ref().unwrap().to_string(), "ViewLayer.Denoised");
+        }
+    }
+}
+
+#[test]
+fn denoises_both_eyes_of_stereo_renders() {
+    for file in ["blender5_stereo.exr", "blender4_stereo.exr"] {
+        let (_dir, out) = out();
+        demc(&out).arg(data(file)).arg("--preview").assert().success();
+        assert_kept(&data(file), &out.join(file));
+        let stem = file.strip_suffix(".exr").unwrap();
+        assert!(
+            out.join(format!("{stem}.left.png")).exists() && out.join(format!("{stem}.right.png")).exists()
+        );
+    }
+    // Blender 4 names the view in the channel, Blender 5 in the part.
+    let (_dir, out) = out();
+    demc(&out).args([data("blender4_stereo.exr"), data("blender5_stereo.exr")]).assert().success();
+    let four = out.join("blender4_stereo.exr");
+    for view in ["left", "right"] {
+        let name = |pass| format!("ViewLayer.{pass}.{view}.G");
+        assert_same_values(&four, &name("Combined"), &name("Denoised"));
+    }
+    let five = read_exr(out.join("blender5_stereo.exr"));
+    let part = |name: &str| {
+        let named =
+            |l: &&exr::prelude::Layer<_>| l.attributes.layer_name.as_ref().is_some_and(|n| n.eq(name));
+        five.layer_data.iter().find(named).unwrap_or_else(|| panic!("no part {name}"))
+    };
+    for view in ["left", "right"] {
+        let beauty = part(&format!("ViewLayer.Combined-{view}"));
+        let denoised = part(&format!("ViewLayer.Denoised-{view}"));
+        assert_eq!(denoised.attributes.view_name.as_ref().unwrap().to_string(), view);
+        let green = |l: &exr::prelude::Layer<exr::prelude::AnyChannels<exr::prelude::FlatSamples>>| {
+            bits(&l.channel_data.list[2].sample_data)
+        };
+        assert_eq!(green(beauty), green(denoised));
+    }
+}
+
+#[test]
+fn chooses_among_view_layers() {
+    let file = "blender4_two_layers.exr";
+    let (_dir, out) = out();
+    demc(&out)
+        .arg(data(file))
+        .assert()
+        .success()
+        .stderr(contains("denoised view layer 'Second.Layer'; --view-layer chooses another: 'ViewLayer'"));
+    assert!(samples(&read_exr(out.join(file)), "Second.Layer.Denoised.R").is_some());
+
+    let overwrite = ["--overwrite", "--view-layer", "ViewLayer"];
+    demc(&out).arg(data(file)).args(overwrite).assert().success().stderr("");
+    let image = read_exr(out.join(file));
+    assert!(samples(&image, "Second.Layer.Denoised.R").is_none());
+    assert!(samples(&image, "ViewLayer.Denoised.R").is_some());
+}
+
+#[test]
+fn repairs_reports_and_never_writes_non_finite_values() {
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    write_render(&input, 9, 5, |name, i| match (name, i) {
+        ("Combined.R", 3) => f32::NAN,
+        ("Combined.G", 44) => f32::INFINITY,
+        ("Combined.B", _) => f32::NEG_INFINITY,
+        ("Combined.A", 7) => f32::NAN,
+        ("Combined.A", _) => 1.0,
+        (_, i) => i as f32,
+    });
+    demc(&out).arg(&input).assert().success().stderr(contains("repaired: 1 in Alpha, 47 in Combined"));
+    assert_kept(&input, &out.join("in.exr"));
+    let image = read_exr(out.join("in.exr"));
+    for c in ["R", "G", "B", "A"] {
+        assert!(values(&image, &format!("ViewLayer.Denoised.{c}")).iter().all(|v| v.is_finite()), "{c}");
+    }
+    // The mean of pixels 2, 4, 11, 12 and 13.
+    assert_eq!(values(&image, "ViewLayer.Denoised.R")[3], 8.4f32.round_to_half());
+    assert_eq!(values(&image, "ViewLayer.Denoised.B"), [0.0; 45]);
+}
+
+trait RoundToHalf {
+    fn round_to_half(self) -> f32;
+}
+
+impl RoundToHalf for f32 {
+    fn round_to_half(self) -> f32 {
+        half::f16::from_f32(self).to_f32()
+    }
+}
+
+#[test]
+fn replace_overwrites_the_beauty_and_nothing_else() {
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    write_render(&input, 4, 4, |name, i| if name == "Combined.R" && i == 5 { f32::NAN } else { 2.0 });
+    demc(&out).arg(&input).arg("--replace").assert().success();
+    let image = read_exr(out.join("in.exr"));
+    assert_eq!(values(&image, "ViewLayer.Combined.R"), [2.0; 16]);
+    let mut names: Vec<String> =
+        image.layer_data[0].channel_data.list.iter().map(|c| c.name.to_string()).collect();
+    names.sort();
+    let expected: Vec<String> =
+        read_exr(&input).layer_data[0].channel_data.list.iter().map(|c| c.name.to_string()).collect();
+    assert_eq!(names, expected);
+}
+
+#[test]
+fn every_size_from_one_pixel_up() {
+    let (dir, out) = out();
+    for (width, height) in [(1, 1), (1, 17), (33, 1), (2, 3), (17, 31)] {
+        let input = dir.path().join(format!("{width}x{height}.exr"));
+        write_render(&input, width, height, |_, i| i as f32);
+        demc(&out).arg(&input).arg("--preview").assert().success();
+        let result = out.join(input.file_name().unwrap());
+        assert_same_values(&result, "ViewLayer.Combined.G", "ViewLayer.Denoised.G");
+        let png = image::open(result.with_extension("png")).unwrap();
+        assert_eq!((png.width() as usize, png.height() as usize), (width, height));
+    }
+}
+
+#[test]
+fn plain_rgb_images_gain_a_layer_too() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("plain.exr");
+    write_rgb_file(&input, 5, 4, |x, y| (x as f32, y as f32, 0.5f32)).unwrap();
+    demc(&out).arg(&input).assert().success();
+    assert_kept(&input, &out.join("plain.exr"));
+    assert_same_values(&out.join("plain.exr"), "G", "Denoised.G");
+}
+
+#[test]
+fn skips_finished_results_unless_told_otherwise() {
+    let (_dir, out) = out();
+    demc(&out).arg(data("blender4.exr")).assert().success();
+    let result = out.join("blender4.exr");
+    fs::write(&result, "finished earlier").unwrap();
+    demc(&out).arg(data("blender4.exr")).assert().success().stdout(contains("is there already"));
+    assert_eq!(fs::read(&result).unwrap(), b"finished earlier");
+    demc(&out).arg(data("blender4.exr")).arg("--overwrite").assert().success();
+    assert_kept(&data("blender4.exr"), &result);
+}
+
+#[test]
+fn takes_files_directories_and_globs_and_does_each_file_once() {
+    let (dir, out) = out();
+    for name in ["a.0001.exr", "a.0002.exr", "b.EXR", ".hidden.exr", "note.txt"] {
+        fs::copy(data("blender4.exr"), dir.path().join(name)).unwrap();
+    }
+    let glob = dir.path().join("a.*.exr");
+    demc(&out)
+        .args([&glob, dir.path(), &dir.path().join("b.EXR")])
+        .assert()
+        .success()
+        .stdout(contains("3 denoised"));
+    let mut names: Vec<String> =
+        fs::read_dir(&out).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    assert_eq!(names, ["a.0001.exr", "a.0002.exr", "b.EXR"]);
+}
+
+#[test]
+fn one_bad_file_does_not_stop_the_batch() {
+    let (dir, out) = out();
+    let bad = dir.path().join("bad.exr");
+    fs::write(&bad, "not an image").unwrap();
+    let missing = dir.path().join("missing.exr");
+    demc(&out)
+        .args([&bad, &data("blender4.exr"), &missing, &data("blender5.exr")])
+        .assert()
+        .code(1)
+        .stdout(contains("2 denoised, 2 failed"))
+        .stderr(contains("bad.exr: is not an EXR").and(contains("missing.exr: cannot read")));
+    assert_eq!(fs::read_dir(&out).unwrap().count(), 2);
+}
+
+#[test]
+fn refuses_two_inputs_of_one_name_and_its_own_input_before_any_work() {
+    let (dir, out) = out();
+    let copy = dir.path().join("blender4.exr");
+    fs::copy(data("blender4.exr"), &copy).unwrap();
+    let both = [data("blender4.exr"), copy.clone()];
+    demc(&out).args(both).assert().code(2).stderr(contains("would both be written to"));
+    assert!(!out.exists());
+    demc(dir.path()).arg(&copy).assert().code(2).stderr(contains("would overwrite its input"));
+    assert_eq!(fs::read(&copy).unwrap(), fs::read(data("blender4.exr")).unwrap());
+}
+
+#[test]
+fn layer_names() {
+    let (_dir, out) = out();
+    demc(&out).arg(data("blender5.exr")).args(["--layer", "Clean beauty"]).assert().success();
+    let image = read_exr(out.join("blender5.exr"));
+    assert!(samples(&image, "ViewLayer.Clean beauty.R").is_some());
+    assert!(samples(&image, "ViewLayer.Denoised.R").is_none());
+    for bad in ["", "a.b", "Normal", "DiffCol", "Combined"] {
+        demc(&out)
+            .arg(data("blender5.exr"))
+            .args(["--layer", bad])
+            .assert()
+            .code(2)
+            .stderr(contains("--layer"));
+    }
+}
+
+#[test]
+fn json_is_one_object_a_file() {
+    let (dir, out) = out();
+    let bad = dir.path().join("bad.exr");
+    fs::write(&bad, "").unwrap();
+    let run =
+        demc(&out).args([data("blender5.exr"), bad]).args(["--json", "--threads", "1"]).assert().code(1);
+    let lines: Vec<serde_json::Value> = String::from_utf8(run.get_output().stdout.clone())
+        .unwrap()
+        .lines()
+        .map(|l| serde_json::from_str(l).unwrap())
+        .collect();
+    assert_eq!(lines.len(), 2);
+    let of = |status: &str| lines.iter().find(|l| l["status"] == status).unwrap();
+    assert_eq!(of("done")["view_layer"], "ViewLayer");
+    assert_eq!((of("done")["width"].as_u64(), of("done")["height"].as_u64()), (Some(40), Some(24)));
+    assert!(of("failed")["error"].as_str().unwrap().contains("is empty"));
+}
+
+#[test]
+fn uses_the_render_and_not_what_blender_denoised() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let channel = |pass: &str, c: &str, v: f32| {
+        AnyChannel::new(format!("V.{pass}.{c}").as_str(), FlatSamples::F32(vec![v; 6]))
+    };
+    let both = ["R", "G", "B"]
+        .into_iter()
+        .flat_map(|c| [channel("Combined", c, 1.0), channel("Noisy Image", c, 3.0)]);
+    let layer = Layer::new(
+        (3, 2),
+        LayerAttributes::default(),
+        Encoding::SMALL_LOSSLESS,
+        AnyChannels::sort(both.collect()),
+    );
+    Image::from_layer(layer).write().to_file(&input).unwrap();
+    demc(&out).arg(&input).assert().success().stderr(contains("Noisy Image"));
+    assert_eq!(values(&read_exr(out.join("in.exr")), "V.Denoised.G"), [3.0; 6]);
+}
+
+#[test]
+fn says_when_lossy_channels_are_stored_as_zip() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("dwaa.exr");
+    let mut image = read_exr(data("blender4.exr"));
+    image.layer_data[0].encoding.compression = Compression::DWAA(None);
+    image.write().to_file(&input).unwrap();
+    demc(&out).arg(&input).assert().success().stderr(contains("stored as ZIP instead of DWAA"));
+    let (before, after) = (read_exr(&input), read_exr(out.join("dwaa.exr")));
+    for channel in &before.layer_data[0].channel_data.list {
+        let now = samples(&after, &channel.name.to_string()).unwrap();
+        assert_eq!(bits(&channel.sample_data), bits(now), "{}", channel.name);
+    }
+}
+
+/// Ctrl-C in the middle of a batch: the shell's exit status, whole files only, nothing temporary.
+#[cfg(unix)]
+#[test]
+fn ctrl_c_stops_cleanly_and_the_next_run_goes_on() {
+    use std::{
+        io::{BufRead, BufReader},
+        process::{Command, Stdio},
+    };
+    const FILES: usize = 400;
+    let (dir, out) = out();
+    for i in 0..FILES {
+        fs::copy(data("blender5_stereo.exr"), dir.path().join(format!("f{i:04}.exr"))).unwrap();
+    }
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin("demc"))
+        .args(["denoise", "--model", "noisy", "--out"])
+        .args([&out, dir.path()])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    lines.next().expect("a first result").unwrap();
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    let rest: Vec<String> = lines.map(std::result::Result::unwrap).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(rest.last().unwrap().contains("left: run the same command to go on"), "{rest:?}");
+
+    let files: Vec<PathBuf> = fs::read_dir(&out).unwrap().map(|e| e.unwrap().path()).collect();
+    assert!(!files.is_empty() && files.len() < FILES, "{} files", files.len());
+    for file in &files {
+        assert!(file.file_name().unwrap().to_str().unwrap().starts_with('f'), "{file:?}");
+        assert_kept(&data("blender5_stereo.exr"), file);
+    }
+    demc(&out).arg(dir.path()).assert().success();
+    assert_eq!(fs::read_dir(&out).unwrap().count(), FILES);
+}
