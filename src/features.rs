@@ -81,6 +81,92 @@ fn z_score(channel: &mut [f32]) {
     channel.iter_mut().for_each(|v| *v = ((f64::from(*v) - mean) * scale) as f32);
 }
 
+/// The passes of the built-in models' inputs: what Blender's "Denoising Data" switch stores.
+pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo];
+
+/// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
+const ALBEDO_FLOOR: f32 = 0.05;
+
+/// The log-average luminance that exposure-normalised radiance has: photography's middle grey.
+const MIDDLE_GREY: f64 = 0.18;
+
+/// Rows and columns of the squares over which luminance is averaged before its logarithm, so that
+/// the noise of single pixels does not bias the exposure.
+const EXPOSURE_SQUARE: usize = 16;
+
+/// The built-in models' inputs, in this order:
+/// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
+/// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
+/// camera-space normal (6, H, W). The scale is the inverse of the exposure.
+///
+/// # Errors
+/// A pass is missing.
+pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
+    let radiance = passes.require(Pass::Combined, needed_by)?;
+    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+    let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
+    // Emitters write their radiance here; brighter than white says nothing about texture.
+    albedo.data.iter_mut().for_each(|a| *a = a.clamp(0.0, 1.0));
+    let guide = Planes::from_vec(
+        6,
+        passes.width,
+        passes.height,
+        albedo.data.iter().chain(&normal.data).map(|v| v.clamp(-1.0, 1.0)).collect(),
+    );
+    let exposure = exposure(radiance);
+    albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
+    let mut irradiance = radiance.clone();
+    for (v, a) in irradiance.data.iter_mut().zip(&albedo.data) {
+        *v = v.max(0.0) * exposure / a;
+    }
+    let mut encoded = irradiance.clone();
+    encoded.data.iter_mut().for_each(|v| *v = log_transfer(*v));
+    Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
+}
+
+/// Logarithm of exposed radiance for a network to read: 0 for black, about 1 for white. Nothing is
+/// ever transferred back, because kernels act on radiance itself.
+fn log_transfer(exposed: f32) -> f32 {
+    /// Radiance below `1 / STEEPNESS` is nearly linear.
+    const STEEPNESS: f32 = 16.0;
+    (1.0 + STEEPNESS * exposed).ln() / (1.0 + STEEPNESS).ln()
+}
+
+/// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
+/// a black frame. Scaling radiance scales it inversely.
+fn exposure(radiance: &Planes) -> f32 {
+    let (w, h) = (radiance.width, radiance.height);
+    let (mut sum, mut count) = (0.0, 0usize);
+    for y0 in (0..h).step_by(EXPOSURE_SQUARE) {
+        for x0 in (0..w).step_by(EXPOSURE_SQUARE) {
+            let (mut luminance, mut pixels) = (0.0f64, 0usize);
+            for y in y0..h.min(y0 + EXPOSURE_SQUARE) {
+                for x in x0..w.min(x0 + EXPOSURE_SQUARE) {
+                    for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
+                        luminance += weight * f64::from(radiance.channel(c)[y * w + x].max(0.0));
+                    }
+                    pixels += 1;
+                }
+            }
+            // A black square has no logarithm and says nothing about exposure.
+            if luminance > 0.0 {
+                sum += (luminance / pixels as f64).ln();
+                count += 1;
+            }
+        }
+    }
+    if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
+}
+
+/// A frame as a network wants it.
+#[derive(Clone, Debug)]
+pub struct Inputs {
+    /// The network's inputs, all of the frame's size.
+    pub planes: Vec<Planes>,
+    /// Scene radiance divided by the network's: what its output is multiplied by.
+    pub scale: f32,
+}
+
 /// Grows planes to a multiple of `multiple` in both directions by repeating the last row and column:
 /// what a network that halves its input `log2(multiple)` times needs.
 pub fn pad_to_multiple(planes: &Planes, multiple: usize) -> Planes {

@@ -225,9 +225,26 @@ fn check_network(name: &str, network: &mut dyn Network, batch: &Batch) {
     });
 }
 
+fn trainable(name: &str) -> models::network::Config {
+    models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1
+}
+
+#[test]
+fn the_kernel_predicting_network() {
+    let mut config = trainable("demc-s");
+    config.widths = vec![4, 6, 8, 8];
+    let mut network = models::build(&config, 3);
+    let mut rng = Rng::new(17, 0);
+    let batch: Batch = [3, 3, 3, 6]
+        .map(|c| (Shape::new(2, c, 32, 48), (0..2 * c * 32 * 48).map(|_| 0.1 + rng.uniform()).collect()))
+        .into();
+    check_network("pyramid", &mut *network, &batch);
+}
+
 #[test]
 fn the_networks_of_the_paper() {
-    for (name, mut config) in models::trainable().into_iter().filter(|(n, _)| n.contains("emc")) {
+    for name in ["demc", "demc-nofusion", "semc"] {
+        let mut config = trainable(name);
         config.widths = vec![4, 6, 8, 8, 8];
         let mut network = models::build(&config, 3);
         let mut rng = Rng::new(17, 0);

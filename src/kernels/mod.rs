@@ -10,6 +10,7 @@
 #![allow(unsafe_code)]
 
 pub mod conv;
+pub mod filter;
 pub mod peak;
 pub mod pool;
 pub mod simd;

@@ -186,3 +186,67 @@ pub fn scale_shift(input: View, scale: &[f32], shift: &[f32], relu: bool, output
         }
     });
 }
+
+/// Splits channel `i`, sub-pixel `s` of a 2x2 square (or one pixel, for factor 1) into the layer channel
+/// that holds it and the offsets inside the square.
+fn shuffled(channel: usize, factor: usize) -> (usize, usize, usize) {
+    let area = factor * factor;
+    (channel / area, channel % area / factor, channel % factor)
+}
+
+/// Channels `first..` of `input` as planes: `factor`^2 consecutive channels are the pixels of a square
+/// (space to depth, inverted). `output` is (N, C / factor^2, factor H, factor W).
+///
+/// # Panics
+/// If `output` does not hold whole channels of the input.
+pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &mut [f32]) {
+    let s = input.shape;
+    let channels = output.len() / (s.n * s.h * s.w);
+    let planes = channels / (factor * factor);
+    assert_eq!(output.len(), s.n * planes * factor * factor * s.h * s.w);
+    assert!(first + channels <= s.c);
+    let (h, w) = (factor * s.h, factor * s.w);
+    output.par_chunks_mut(h * w).enumerate().for_each(|(i, plane)| {
+        let (n, p) = (i / planes, i % planes);
+        for c in p * factor * factor..(p + 1) * factor * factor {
+            let (_, sy, sx) = shuffled(c, factor);
+            let lane = (first + c) % LANES;
+            for y in 0..s.h {
+                let row = &input.data[s.row(n, (first + c) / LANES, y)..][..s.w];
+                let out = &mut plane[(factor * y + sy) * w..][..w];
+                for (out, block) in out[sx..].iter_mut().step_by(factor).zip(row) {
+                    *out = block.0[lane];
+                }
+            }
+        }
+    });
+}
+
+/// The inverse of [`from_blocked_shuffled`], which leaves every other channel as it is: also how a
+/// half-resolution network reads a full-resolution image.
+///
+/// # Panics
+/// As [`from_blocked_shuffled`].
+pub fn to_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: ViewMut) {
+    let s = output.shape;
+    let channels = input.len() / (s.n * s.h * s.w);
+    let area = factor * factor;
+    assert_eq!(input.len(), s.n * (channels / area) * area * s.h * s.w);
+    assert!(first + channels <= s.c);
+    let (h, w) = (factor * s.h, factor * s.w);
+    planes(s, output.data, |n, plane, out| {
+        let lanes = (plane * LANES).max(first)..((plane + 1) * LANES).min(first + channels);
+        for layer_channel in lanes {
+            let c = layer_channel - first;
+            let (p, sy, sx) = shuffled(c, factor);
+            let source = &input[(n * (channels / area) + p) * h * w..][..h * w];
+            for y in 0..s.h {
+                let row = &source[(factor * y + sy) * w..][..w];
+                let out = &mut out[row_in_plane(s, y)..][..s.w];
+                for (out, v) in out.iter_mut().zip(row[sx..].iter().step_by(factor)) {
+                    out.0[layer_channel % LANES] = *v;
+                }
+            }
+        }
+    });
+}

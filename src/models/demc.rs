@@ -10,10 +10,10 @@ use dfdx::{
     tensor_ops::powf,
 };
 
-use super::network::{Architecture, Batch, Config, Inputs, Network, Taped};
+use super::network::{Architecture, Batch, Config, Network, Taped};
 use crate::{
     Result,
-    features::{GAMMA, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
+    features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
     nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
 };

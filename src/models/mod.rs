@@ -4,6 +4,7 @@ pub mod demc;
 pub mod learned;
 pub mod network;
 pub mod oidn;
+pub mod pyramid;
 pub mod weights_file;
 
 use std::{path::Path, time::Instant};
@@ -94,7 +95,14 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
 /// Names of the networks that can be trained, and the configuration each begins with.
 pub fn trainable() -> Vec<(&'static str, Config)> {
     let paper = |architecture| Config { architecture, widths: vec![16, 32, 64, 96, 96] };
+    let pyramid = |widths: [usize; pyramid::LEVELS]| Config {
+        architecture: Architecture::Pyramid,
+        widths: widths.into(),
+    };
     vec![
+        ("demc-s", pyramid([16, 32, 48, 64])),
+        ("demc-m", pyramid([32, 48, 64, 80])),
+        ("demc-l", pyramid([64, 80, 96, 112])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),
@@ -106,7 +114,10 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
 /// # Errors
 /// Says what is wrong with it.
 pub fn check(config: &Config) -> Result<(), String> {
-    let levels = demc::PAPER_WIDTHS.len();
+    let levels = match config.architecture {
+        Architecture::Pyramid => pyramid::LEVELS,
+        _ => demc::PAPER_WIDTHS.len(),
+    };
     if config.widths.len() != levels {
         return Err(format!("{} widths, but the network has {levels} levels", config.widths.len()));
     }
@@ -125,5 +136,6 @@ pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
         Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => {
             Box::new(demc::Demc::new(config.architecture, &config.widths, seed))
         }
+        Architecture::Pyramid => Box::new(pyramid::Pyramid::new(config, seed)),
     }
 }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Result,
-    features::{crop, pad_to_multiple},
+    features::{Inputs, crop, pad_to_multiple},
     kernels::Shape,
     nn::{BatchNorm, Images, Param, Stats},
     passes::{Pass, PassSet},
@@ -34,15 +34,8 @@ pub enum Architecture {
     DemcNofusion,
     /// The paper's single encoder over detail map and colour.
     Semc,
-}
-
-/// A frame as a network wants it.
-#[derive(Clone, Debug)]
-pub struct Inputs {
-    /// The network's inputs, all of the frame's size.
-    pub planes: Vec<Planes>,
-    /// Scene radiance divided by the network's: what its output is multiplied by.
-    pub scale: f32,
+    /// The built-in kernel-predicting dual encoder.
+    Pyramid,
 }
 
 /// Inputs of several samples of one size: each network input as one (N, C, H, W) array.

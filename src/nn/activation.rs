@@ -6,8 +6,8 @@ use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 
 use super::{Images, pool::Buffer};
 use crate::kernels::{
-    Shape,
-    pool::{from_blocked, to_blocked},
+    Block, Shape,
+    pool::{from_blocked, to_blocked, to_blocked_shuffled},
 };
 
 /// The gradient of one activation while the tape runs backward; `None` until something flows in.
@@ -39,6 +39,19 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     pub fn input(shape: Shape, values: &[f32]) -> Self {
         let mut data = Buffer::new(shape);
         to_blocked(values, data.view_mut());
+        Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
+    }
+
+    /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each 2x2 square
+    /// become channels (space to depth). (N, C, H, W) -> (N, 4C, H/2, W/2)
+    ///
+    /// # Panics
+    /// If rows or columns are odd, or the length of `values` is not what `shape` demands.
+    pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
+        assert!(shape.h % 2 == 0 && shape.w % 2 == 0, "only even sizes halve");
+        let mut data = Buffer::new(shape.with_channels(4 * shape.c).with_size(shape.h / 2, shape.w / 2));
+        data.fill(Block::default());
+        to_blocked_shuffled(values, 0, 2, data.view_mut());
         Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
     }
 

@@ -5,12 +5,14 @@
 //! and carries a dfdx tape; parameters, losses and the optimiser are ordinary dfdx tensors.
 
 mod activation;
+mod field;
 mod layers;
 mod param;
 mod pool;
 pub mod weights;
 
 pub use activation::Activation;
+pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use param::{Init, Param, Rng};
 pub use pool::clear as clear_buffers;

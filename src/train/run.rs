@@ -16,10 +16,12 @@ use super::{
     log,
 };
 use crate::{
-    Error, Result, metrics,
+    Error, Result,
+    features::Inputs,
+    metrics,
     models::{
         self,
-        network::{Config, Inputs, Network, stack},
+        network::{Config, Network, stack},
         weights_file::{self, Facts},
     },
     nn::{Rng, Stats},

@@ -1,0 +1,423 @@
+//! Applying predicted kernels to an image, and building and blending its pyramid: planar f32, one
+//! image at a time.
+//!
+//! A pixel's filtered value is `sum_k w_k x_k / sum_k w_k` over its k x k neighbourhood with
+//! `w_k = exp(logit_k + confidence_k)`: the pixel says how much it wants each neighbour, the neighbour
+//! says how far it can be trusted (a firefly marks itself once, instead of in 25 kernels). Neighbours
+//! outside the image have no weight.
+
+use rayon::prelude::*;
+
+use super::simd::{Kernel, Simd, Tier};
+
+/// Exponents are kept within this of zero, so that no sum overflows and none vanishes.
+const LIMIT: f32 = 40.0;
+
+/// Rows and columns of an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Size {
+    /// Rows.
+    pub h: usize,
+    /// Pixels in a row.
+    pub w: usize,
+}
+
+impl Size {
+    /// Pixels of one plane.
+    pub fn pixels(self) -> usize {
+        self.h * self.w
+    }
+}
+
+/// One image to be filtered: everything the forward pass reads.
+#[derive(Clone, Copy)]
+pub struct Filter<'a> {
+    /// Rows and columns.
+    pub size: Size,
+    /// Kernel size, odd.
+    pub k: usize,
+    /// The image, (3, H, W).
+    pub image: &'a [f32],
+    /// Kernel logits, (k*k, H, W).
+    pub logits: &'a [f32],
+    /// Confidence of each pixel, (1, H, W), or nothing for equal trust.
+    pub confidence: Option<&'a [f32]>,
+}
+
+/// What flows back through a filter, each added to.
+pub struct FilterGradient<'a> {
+    /// To the image, (3, H, W), where it is wanted.
+    pub image: Option<&'a mut [f32]>,
+    /// To the logits, (k*k, H, W).
+    pub logits: &'a mut [f32],
+    /// To the confidence, (1, H, W), where there is one.
+    pub confidence: Option<&'a mut [f32]>,
+}
+
+/// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2 (the minimax
+/// coefficients of Cephes' expf, Moshier).
+#[inline(always)]
+fn exp(x: f32) -> f32 {
+    let x = x.clamp(-LIMIT, LIMIT);
+    // Adding 1.5 * 2^23 rounds to an integer, whose low bits then stand in the mantissa.
+    const ROUND: f32 = 12_582_912.0;
+    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    let r = x - n * 0.693_359_4 + n * 2.121_944_4e-4;
+    let p = 1.987_569_1e-4;
+    let p = p * r + 1.398_199_9e-3;
+    let p = p * r + 8.333_452e-3;
+    let p = p * r + 4.166_579_6e-2;
+    let p = p * r + 1.666_666_5e-1;
+    let p = p * r + 0.5;
+    let e = (p * r * r + r) + 1.0;
+    let bits = (shifted.to_bits() << 23).wrapping_add(127 << 23);
+    e * f32::from_bits(bits)
+}
+
+/// The columns of a row whose neighbour `dx` away lies inside the row.
+#[inline(always)]
+fn columns(w: usize, dx: isize) -> (usize, usize) {
+    ((-dx).max(0) as usize, (w as isize - dx.max(0)).max(0) as usize)
+}
+
+impl<'a> Filter<'a> {
+    fn check(&self) {
+        let n = self.size.pixels();
+        assert!(self.k % 2 == 1, "kernels have a centre");
+        assert_eq!((self.image.len(), self.logits.len()), (3 * n, self.k * self.k * n));
+        assert!(self.confidence.is_none_or(|c| c.len() == n));
+    }
+
+    /// Calls `visit(tap, neighbour row, dx)` for every tap whose row lies inside the image.
+    #[inline(always)]
+    fn taps(&self, y: usize, mut visit: impl FnMut(usize, usize, isize)) {
+        let r = (self.k / 2) as isize;
+        for ky in 0..self.k {
+            let row = y as isize + ky as isize - r;
+            if row < 0 || row >= self.size.h as isize {
+                continue;
+            }
+            for kx in 0..self.k {
+                visit(ky * self.k + kx, row as usize, kx as isize - r);
+            }
+        }
+    }
+
+    /// The unnormalised weights of one tap along row `y`, columns `x0..x1`.
+    #[inline(always)]
+    fn weights(&self, y: usize, tap: usize, row: usize, dx: isize, out: &mut [f32]) -> (usize, usize) {
+        let Size { w, .. } = self.size;
+        let (x0, x1) = columns(w, dx);
+        if x0 >= x1 {
+            return (0, 0);
+        }
+        let logits = &self.logits[tap * self.size.pixels() + y * w..][x0..x1];
+        let out = &mut out[x0..x1];
+        match self.confidence {
+            Some(confidence) => {
+                let confidence = &confidence[row * w..][(x0 as isize + dx) as usize..][..x1 - x0];
+                for ((out, l), c) in out.iter_mut().zip(logits).zip(confidence) {
+                    *out = exp(l + c);
+                }
+            }
+            None => out.iter_mut().zip(logits).for_each(|(out, l)| *out = exp(*l)),
+        }
+        (x0, x1)
+    }
+
+    /// Filters the image: `output` (3, H, W), `total` (1, H, W) the sum of each pixel's weights.
+    ///
+    /// # Panics
+    /// If lengths do not fit the size.
+    pub fn apply(self, tier: Tier, output: &mut [f32], total: &mut [f32]) {
+        self.check();
+        let (n, w) = (self.size.pixels(), self.size.w);
+        assert_eq!((output.len(), total.len()), (3 * n, n));
+        let (r, rest) = output.split_at_mut(n);
+        let (g, b) = rest.split_at_mut(n);
+        r.par_chunks_mut(w)
+            .zip(g.par_chunks_mut(w))
+            .zip(b.par_chunks_mut(w))
+            .zip(total.par_chunks_mut(w))
+            .enumerate()
+            .for_each(|(y, (((r, g), b), total))| {
+                tier.run(Forward { filter: &self, y, output: [r, g, b], total });
+            });
+    }
+
+    /// Adds what the output's gradient (3, H, W) sends back; `output` and `total` are those of
+    /// [`Filter::apply`].
+    ///
+    /// # Panics
+    /// If lengths do not fit the size.
+    pub fn gradient(
+        self,
+        tier: Tier,
+        (output, total): (&[f32], &[f32]),
+        output_gradient: &[f32],
+        into: FilterGradient,
+    ) {
+        self.check();
+        let n = self.size.pixels();
+        assert_eq!((output.len(), total.len(), output_gradient.len()), (3 * n, n, 3 * n));
+        assert_eq!(into.logits.len(), self.logits.len());
+        assert!(into.image.as_ref().is_none_or(|i| i.len() == 3 * n));
+        assert_eq!(into.confidence.as_ref().map(|c| c.len()), self.confidence.map(|_| n));
+        tier.run(Backward { filter: &self, output, total, output_gradient, into });
+    }
+}
+
+struct Forward<'a, 'f> {
+    filter: &'a Filter<'f>,
+    y: usize,
+    output: [&'a mut [f32]; 3],
+    total: &'a mut [f32],
+}
+
+impl Kernel for Forward<'_, '_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let Size { w, .. } = self.filter.size;
+        let n = self.filter.size.pixels();
+        let [r, g, b] = self.output;
+        let total = self.total;
+        for out in [&mut *r, &mut *g, &mut *b, &mut *total] {
+            out.fill(0.0);
+        }
+        let mut weights = vec![0.0; w];
+        self.filter.taps(self.y, |tap, row, dx| {
+            let (x0, x1) = self.filter.weights(self.y, tap, row, dx, &mut weights);
+            let len = x1 - x0;
+            let weights = &weights[x0..x1];
+            let from = row * w + (x0 as isize + dx) as usize;
+            for (out, c) in [(&mut *r, 0), (&mut *g, 1), (&mut *b, 2)] {
+                let image = &self.filter.image[c * n + from..][..len];
+                for ((out, v), w) in out[x0..x1].iter_mut().zip(image).zip(weights) {
+                    *out += v * w;
+                }
+            }
+            total[x0..x1].iter_mut().zip(weights).for_each(|(t, w)| *t += w);
+        });
+        for out in [r, g, b] {
+            out.iter_mut().zip(&*total).for_each(|(v, t)| *v /= t);
+        }
+    }
+}
+
+struct Backward<'a, 'f> {
+    filter: &'a Filter<'f>,
+    output: &'a [f32],
+    total: &'a [f32],
+    output_gradient: &'a [f32],
+    into: FilterGradient<'a>,
+}
+
+impl Kernel for Backward<'_, '_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let Size { h, w } = self.filter.size;
+        let n = h * w;
+        let FilterGradient { mut image, logits, mut confidence } = self.into;
+        let (mut weights, mut slope) = (vec![0.0; w], vec![0.0; w]);
+        for y in 0..h {
+            let total = &self.total[y * w..][..w];
+            self.filter.taps(y, |tap, row, dx| {
+                let (x0, x1) = self.filter.weights(y, tap, row, dx, &mut weights);
+                let len = x1 - x0;
+                let weights = &mut weights[x0..x1];
+                weights.iter_mut().zip(&total[x0..x1]).for_each(|(w, t)| *w /= t);
+                let slope = &mut slope[x0..x1];
+                slope.fill(0.0);
+                let (at, from) = (y * w + x0, row * w + (x0 as isize + dx) as usize);
+                for c in 0..3 {
+                    let x = &self.filter.image[c * n + from..][..len];
+                    let out = &self.output[c * n + at..][..len];
+                    let g = &self.output_gradient[c * n + at..][..len];
+                    for (((s, x), out), g) in slope.iter_mut().zip(x).zip(out).zip(g) {
+                        *s += g * (x - out);
+                    }
+                    if let Some(image) = &mut image {
+                        let image = &mut image[c * n + from..][..len];
+                        for ((i, w), g) in image.iter_mut().zip(&*weights).zip(g) {
+                            *i += w * g;
+                        }
+                    }
+                }
+                slope.iter_mut().zip(&*weights).for_each(|(s, w)| *s *= w);
+                let logits = &mut logits[tap * n + at..][..len];
+                logits.iter_mut().zip(&*slope).for_each(|(l, s)| *l += s);
+                if let Some(confidence) = &mut confidence {
+                    let confidence = &mut confidence[from..][..len];
+                    confidence.iter_mut().zip(&*slope).for_each(|(c, s)| *c += s);
+                }
+            });
+        }
+    }
+}
+
+/// Halves (3, H, W): each 2x2 square weighted by `exp(confidence)`. `total` (1, H/2, W/2) gets the sums
+/// of weights.
+///
+/// # Panics
+/// If lengths do not fit, or rows or columns are odd.
+pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32], total: &mut [f32]) {
+    let (h, w) = (size.h / 2, size.w / 2);
+    assert_eq!((2 * h, 2 * w, image.len(), confidence.len()), (size.h, size.w, 3 * size.pixels(), size.pixels()));
+    assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
+    let weights: Vec<f32> = confidence.iter().map(|c| exp(*c)).collect();
+    let squares = |v: &[f32], y: usize, x: usize| {
+        let at = 2 * y * size.w + 2 * x;
+        [v[at], v[at + 1], v[at + size.w], v[at + size.w + 1]]
+    };
+    for y in 0..h {
+        for x in 0..w {
+            let weight = squares(&weights, y, x);
+            let sum: f32 = weight.iter().sum();
+            total[y * w + x] = sum;
+            for c in 0..3 {
+                let v = squares(&image[c * size.pixels()..], y, x);
+                let product: f32 = v.iter().zip(weight).map(|(v, w)| v * w).sum();
+                output[c * h * w + y * w + x] = product / sum;
+            }
+        }
+    }
+}
+
+/// Adds what [`reduce`]'s output gradient sends back to image and confidence.
+///
+/// # Panics
+/// As [`reduce`].
+#[allow(clippy::too_many_arguments)]
+pub fn reduce_gradient(
+    size: Size,
+    image: &[f32],
+    confidence: &[f32],
+    (output, total): (&[f32], &[f32]),
+    output_gradient: &[f32],
+    mut into_image: Option<&mut [f32]>,
+    into_confidence: &mut [f32],
+) {
+    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
+    assert_eq!((output.len(), total.len(), output_gradient.len()), (3 * h * w, h * w, 3 * h * w));
+    for y in 0..size.h {
+        for x in 0..size.w {
+            let (at, to) = (y * size.w + x, (y / 2) * w + x / 2);
+            let weight = exp(confidence[at]) / total[to];
+            for c in 0..3 {
+                let g = output_gradient[c * h * w + to];
+                into_confidence[at] += g * weight * (image[c * n + at] - output[c * h * w + to]);
+                if let Some(into) = &mut into_image {
+                    into[c * n + at] += g * weight;
+                }
+            }
+        }
+    }
+}
+
+/// The logistic function, which keeps a blend between its two images.
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+/// Weights of the four coarse pixels around a fine one, bilinear: `(row, column)` pairs with the edge
+/// repeated.
+#[inline(always)]
+fn corners(size: Size, y: usize, x: usize) -> [(usize, f32); 4] {
+    let (h, w) = (size.h / 2, size.w / 2);
+    let near = |i: usize, n: usize| {
+        let own = i / 2;
+        let other = if i % 2 == 0 { own.saturating_sub(1) } else { (own + 1).min(n - 1) };
+        (own, other)
+    };
+    let ((y0, y1), (x0, x1)) = (near(y, h), near(x, w));
+    [
+        (y0 * w + x0, 0.5625),
+        (y0 * w + x1, 0.1875),
+        (y1 * w + x0, 0.1875),
+        (y1 * w + x1, 0.0625),
+    ]
+}
+
+/// Blends a coarse level into a fine one, (3, H, W): `fine + sigmoid(alpha) * up(coarse - down(fine))`,
+/// with `down` the mean of 2x2 and `up` bilinear: the coarse level replaces the low frequencies of the
+/// fine one and leaves its detail (Vogels et al. 2018, Section 4.3, with a mask for each pixel).
+///
+/// `difference` (3, H/2, W/2) gets `coarse - down(fine)`.
+///
+/// # Panics
+/// If lengths do not fit.
+pub fn blend(
+    size: Size,
+    fine: &[f32],
+    coarse: &[f32],
+    alpha: &[f32],
+    difference: &mut [f32],
+    output: &mut [f32],
+) {
+    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
+    assert_eq!((fine.len(), coarse.len(), alpha.len()), (3 * n, 3 * h * w, n));
+    assert_eq!((difference.len(), output.len()), (coarse.len(), fine.len()));
+    let weights: Vec<f32> = alpha.par_iter().map(|a| sigmoid(*a)).collect();
+    let planes = output.par_chunks_mut(n).zip(difference.par_chunks_mut(h * w)).enumerate();
+    planes.for_each(|(c, (output, difference))| {
+        let fine = &fine[c * n..][..n];
+        for y in 0..h {
+            for x in 0..w {
+                let at = 2 * y * size.w + 2 * x;
+                let mean = 0.25 * (fine[at] + fine[at + 1] + fine[at + size.w] + fine[at + size.w + 1]);
+                difference[y * w + x] = coarse[c * h * w + y * w + x] - mean;
+            }
+        }
+        for y in 0..size.h {
+            for x in 0..size.w {
+                let up: f32 = corners(size, y, x).iter().map(|&(i, k)| k * difference[i]).sum();
+                let at = y * size.w + x;
+                output[at] = fine[at] + weights[at] * up;
+            }
+        }
+    });
+}
+
+/// Adds what [`blend`]'s output gradient sends back to fine, coarse and alpha.
+///
+/// # Panics
+/// As [`blend`].
+pub fn blend_gradient(
+    size: Size,
+    alpha: &[f32],
+    difference: &[f32],
+    output_gradient: &[f32],
+    into_fine: &mut [f32],
+    into_coarse: &mut [f32],
+    into_alpha: &mut [f32],
+) {
+    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
+    assert_eq!((alpha.len(), difference.len(), output_gradient.len()), (n, 3 * h * w, 3 * n));
+    for c in 0..3 {
+        let mut sent = vec![0.0; h * w];
+        for y in 0..size.h {
+            for x in 0..size.w {
+                let at = y * size.w + x;
+                let (g, weight) = (output_gradient[c * n + at], sigmoid(alpha[at]));
+                into_fine[c * n + at] += g;
+                let mut up = 0.0;
+                for (i, k) in corners(size, y, x) {
+                    up += k * difference[c * h * w + i];
+                    sent[i] += k * g * weight;
+                }
+                into_alpha[at] += g * up * weight * (1.0 - weight);
+            }
+        }
+        for y in 0..h {
+            for x in 0..w {
+                let g = sent[y * w + x];
+                into_coarse[c * h * w + y * w + x] += g;
+                let at = c * n + 2 * y * size.w + 2 * x;
+                for i in [at, at + 1, at + size.w, at + size.w + 1] {
+                    into_fine[i] -= 0.25 * g;
+                }
+            }
+        }
+    }
+}

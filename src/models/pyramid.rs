@@ -1,0 +1,275 @@
+//! The built-in network: a dual encoder at half resolution that predicts kernels instead of colours.
+//!
+//! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
+//! follows what measurement favoured: the trunk works on 2x2 squares (space to depth), and each level
+//! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
+//! al. 2018). Radiance is divided by albedo first and multiplied by a filtered albedo last, so texture
+//! is never blurred with the noise, and noise in the albedo (depth of field, 4 spp edges) is removed.
+//! A confidence for every pixel and level lets a firefly take itself out of all kernels at once.
+//!
+//! A network that outputs kernels cannot invent a colour, and scales with its input exactly.
+
+use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
+
+use super::network::{Batch, Config, Network, Taped};
+use crate::{
+    Result,
+    features::{GUIDE_PASSES, Inputs, guides},
+    nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
+    passes::{Pass, PassSet},
+};
+
+/// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
+pub const LEVELS: usize = 4;
+
+/// Rows and columns of the radiance kernels.
+const KERNEL: usize = 5;
+
+/// Rows and columns of the albedo kernels.
+const ALBEDO_KERNEL: usize = 3;
+
+/// Channels of a radiance level's head: kernel, confidence, and the mask that blends the level below.
+const HEAD: usize = KERNEL * KERNEL + 2;
+
+/// A decoder level is this much wider than the encoders beside it.
+const DECODER_EXTRA: usize = 16;
+
+/// Heads begin this much smaller than Xavier: kernels start nearly flat.
+const HEAD_GAIN: f32 = 0.3;
+
+/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth.
+const RADIANCE_CHANNELS: usize = 3;
+const GUIDE_CHANNELS: usize = 6;
+
+/// The kernel-predicting dual encoder.
+#[derive(Clone)]
+pub struct Pyramid {
+    config: Config,
+    encoders: [Encoder; 2],
+    /// Coarsest level first.
+    decoder: Vec<Level>,
+    /// Full resolution: radiance kernels, confidence, mask and albedo kernels of four pixels.
+    full: Conv,
+    /// One head a trunk level, finest first.
+    heads: Vec<Conv>,
+}
+
+/// Two convolutions a level, with a pool between levels.
+#[derive(Clone)]
+struct Encoder {
+    levels: Vec<[Conv; 2]>,
+}
+
+/// One level of the decoder.
+#[derive(Clone)]
+struct Level {
+    /// From the level below; the coarsest has none.
+    up: Option<Conv>,
+    fuse: Conv,
+    refine: Conv,
+}
+
+impl Encoder {
+    fn new(rng: &mut Rng, name: &str, channels: usize, widths: &[usize]) -> Self {
+        let mut from = 4 * channels;
+        let levels = widths.iter().enumerate().map(|(level, &width)| {
+            let first = Conv::new(rng, &format!("{name}.{level}.0"), &[from], width, 3, Init::Xavier);
+            from = width;
+            [first, Conv::new(rng, &format!("{name}.{level}.1"), &[width], width, 3, Init::Xavier)]
+        });
+        Self { levels: levels.collect() }
+    }
+
+    /// The output of every level, finest first.
+    fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, input: Activation<T>) -> Vec<Activation<T>> {
+        let mut skips: Vec<Activation<T>> = Vec::with_capacity(self.levels.len());
+        let mut x = input;
+        for (level, [first, second]) in self.levels.iter().enumerate() {
+            if level > 0 {
+                x = MaxPool.forward(x); // (N, K, H, W) -> (N, K, H/2, W/2)
+            }
+            x = second.forward(vec![first.forward(vec![x])]);
+            skips.push(x.fork());
+        }
+        // The tape so far travels with the coarsest output.
+        skips.pop();
+        skips.push(x);
+        skips
+    }
+}
+
+impl Pyramid {
+    /// A network with fresh weights drawn from `seed`; `widths` are the encoders', finest first.
+    ///
+    /// # Panics
+    /// If `widths` does not hold one width a level.
+    pub fn new(config: &Config, seed: u64) -> Self {
+        let widths = &config.widths;
+        assert_eq!(widths.len(), LEVELS, "one width a level");
+        let rng = &mut Rng::new(seed, 0);
+        let encoders = [
+            Encoder::new(rng, "encoder.radiance", RADIANCE_CHANNELS, widths),
+            Encoder::new(rng, "encoder.guide", GUIDE_CHANNELS, widths),
+        ];
+        let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
+        let decoder = (0..LEVELS).rev().map(|level| {
+            let (width, skip) = (decoder_width(level), widths[level]);
+            let up = (level + 1 < LEVELS).then(|| {
+                Conv::transposed(rng, &format!("decoder.{level}.up"), decoder_width(level + 1), width)
+            });
+            let mut sources = vec![skip, skip];
+            sources.extend(up.iter().map(|_| width));
+            let name = format!("decoder.{level}");
+            Level {
+                up,
+                fuse: Conv::new(rng, &format!("{name}.fuse"), &sources, width, 1, Init::Xavier),
+                refine: Conv::new(rng, &format!("{name}.refine"), &[width], width, 3, Init::Xavier),
+            }
+        });
+        let decoder = decoder.collect();
+        let mut head = |name: String, width: usize, channels: usize| {
+            Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).linear()
+        };
+        let full = 4 * (HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL);
+        Self {
+            full: head("head.full".into(), decoder_width(0), full),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), HEAD)).collect(),
+            config: config.clone(),
+            encoders,
+            decoder,
+        }
+    }
+
+    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
+        let [irradiance, albedo, radiance_input, guide_input] = &batch[..] else {
+            unreachable!("`inputs` makes four planes")
+        };
+        let field = |(shape, values): &(crate::kernels::Shape, Vec<f32>)| {
+            Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values.clone())
+        };
+        let mut skips = [(radiance_input, 0), (guide_input, 1)]
+            .map(|(input, e)| self.encoders[e].forward(Activation::<T>::input_halved(input.0, &input.1)));
+
+        // The decoder, coarsest level first; every level feeds its head.
+        let mut heads: Vec<Activation<T>> = Vec::with_capacity(LEVELS + 1);
+        let mut x: Option<Activation<T>> = None;
+        for (level, head) in self.decoder.iter().zip(self.heads.iter().rev()) {
+            let mut sources: Vec<_> =
+                skips.iter_mut().map(|s| s.pop().expect("one skip a level")).collect();
+            if let (Some(up), Some(below)) = (&level.up, x) {
+                sources.push(up.forward(vec![below])); // (N, K', H, W) -> (N, K, 2H, 2W)
+            }
+            let fused = level.refine.forward(vec![level.fuse.forward(sources)]);
+            heads.push(head.forward(vec![fused.fork()])); // (N, K, H, W) -> (N, 27, H, W)
+            x = Some(fused);
+        }
+        let full = self.full.forward(vec![x.expect("there are levels")]);
+
+        // Kernel, confidence and mask of every pyramid level, full resolution first.
+        let split = |head: Activation<T>, factor: usize| {
+            let area = factor * factor;
+            let taps = KERNEL * KERNEL * area;
+            let kernel = Field::from_activation(head.fork(), 0, taps, factor);
+            let confidence = Field::from_activation(head.fork(), taps, area, factor);
+            let mask = Field::from_activation(head, taps + area, area, factor);
+            (kernel, confidence, mask)
+        };
+        let albedo_kernel = Field::from_activation(full.fork(), 4 * HEAD, 36, 2);
+        let mut levels = vec![split(full, 2)];
+        levels.extend(heads.into_iter().rev().map(|head| split(head, 1)));
+
+        // Radiance pyramid: each level filtered, then blended from the coarsest up.
+        let mut image = field(irradiance);
+        let mut filtered: Vec<(Field<T>, Field<T>)> = Vec::with_capacity(levels.len());
+        let last = levels.len() - 1;
+        for (level, (kernel, confidence, mask)) in levels.into_iter().enumerate() {
+            let below = (level < last).then(|| image.fork().reduce(confidence.fork()));
+            filtered.push((image.filter(KERNEL, kernel, Some(confidence)), mask));
+            match below {
+                Some(below) => image = below,
+                None => break,
+            }
+        }
+        let (mut out, _) = filtered.pop().expect("there are levels");
+        while let Some((fine, mask)) = filtered.pop() {
+            out = fine.blend(out, mask); // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+        }
+        out.into_images() * field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None).into_images()
+    }
+
+    /// Every convolution and the level of the frame's pyramid at which it writes.
+    fn convolutions(&self) -> impl Iterator<Item = (&Conv, usize)> {
+        let encoders = self.encoders.iter().flat_map(|e| {
+            e.levels.iter().enumerate().flat_map(|(level, convs)| convs.iter().map(move |c| (c, level + 1)))
+        });
+        let decoder = self.decoder.iter().rev().enumerate().flat_map(|(level, l)| {
+            l.up.iter().chain([&l.fuse, &l.refine]).map(move |c| (c, level + 1))
+        });
+        let heads = self.heads.iter().enumerate().map(|(level, c)| (c, level + 1));
+        encoders.chain(decoder).chain(heads).chain([(&self.full, 1)])
+    }
+}
+
+impl Network for Pyramid {
+    fn config(&self) -> Config {
+        self.config.clone()
+    }
+
+    fn passes(&self) -> &'static [Pass] {
+        &GUIDE_PASSES
+    }
+
+    fn multiple(&self) -> usize {
+        1 << LEVELS
+    }
+
+    fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
+        guides(passes, "this model")
+    }
+
+    fn params(&mut self) -> Vec<&mut Param> {
+        let encoders = self.encoders.iter_mut().flat_map(|e| e.levels.iter_mut().flatten());
+        let decoder =
+            self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
+        encoders
+            .chain(decoder)
+            .chain([&mut self.full])
+            .chain(&mut self.heads)
+            .flat_map(|conv| conv.params())
+            .collect()
+    }
+
+    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
+        Vec::new()
+    }
+
+    fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
+        self.run::<NoneTape>(batch)
+    }
+
+    fn forward_taped(&self, batch: &Batch, _: &mut Stats) -> Images<Taped> {
+        self.run::<Taped>(batch)
+    }
+
+    fn macs_per_pixel(&self) -> f64 {
+        let convolutions: f64 =
+            self.convolutions().map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32)).sum();
+        // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
+        let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
+        convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64
+    }
+
+    fn reach(&self) -> usize {
+        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
+        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
+        trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>()
+    }
+
+    fn duplicate(&self) -> Box<dyn Network> {
+        let mut copy = self.clone();
+        for param in copy.params() {
+            *param = param.duplicate();
+        }
+        Box::new(copy)
+    }
+}

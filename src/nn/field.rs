@@ -1,0 +1,298 @@
+//! Planar images on the tape: where predicted kernels meet the radiance they filter.
+
+use std::{cell::RefCell, rc::Rc, sync::Arc};
+
+use dfdx::tensor::{Cpu, Merge, PutTape, Tape, TensorFromVec};
+use rayon::prelude::*;
+
+use super::{Activation, Images};
+use crate::kernels::{
+    filter::{Filter, FilterGradient, Size, blend, blend_gradient, reduce, reduce_gradient},
+    pool::{from_blocked_shuffled, to_blocked_shuffled},
+    simd::Tier,
+};
+
+/// Images, channels, rows, columns.
+pub type Extent = (usize, usize, usize, usize);
+
+/// Values that threads may share.
+#[derive(Clone, Debug)]
+struct Values {
+    extent: Extent,
+    data: Arc<Vec<f32>>,
+}
+
+impl Values {
+    fn size(&self) -> Size {
+        Size { h: self.extent.2, w: self.extent.3 }
+    }
+
+    /// The values of image `n`, (C, H, W).
+    fn image(&self, n: usize) -> &[f32] {
+        let len = self.extent.1 * self.size().pixels();
+        &self.data[n * len..][..len]
+    }
+}
+
+/// What an operation remembers of a field: its values, and where its gradient goes.
+#[derive(Clone, Debug)]
+struct Saved {
+    values: Values,
+    /// `None` for inputs, whose gradient nobody asks for.
+    gradient: Option<Rc<RefCell<Option<Vec<f32>>>>>,
+}
+
+impl Saved {
+    /// The gradient that has flowed in, if any.
+    fn take(&self) -> Option<Vec<f32>> {
+        self.gradient.as_ref().and_then(|g| g.take())
+    }
+
+    /// Lets `add` add to the gradient, zeros at first; hands it nothing for an input.
+    fn accumulate(&self, add: impl FnOnce(Option<&mut [f32]>)) {
+        match &self.gradient {
+            Some(slot) => {
+                let mut slot = slot.borrow_mut();
+                add(Some(slot.get_or_insert_with(|| vec![0.0; self.values.data.len()])));
+            }
+            None => add(None),
+        }
+    }
+}
+
+/// An optional batch buffer as one optional slice an image.
+fn by_image(buffer: Option<&mut [f32]>, images: usize) -> Vec<Option<&mut [f32]>> {
+    match buffer {
+        Some(buffer) => buffer.chunks_mut(buffer.len() / images).map(Some).collect(),
+        None => (0..images).map(|_| None).collect(),
+    }
+}
+
+/// Planar images (N, C, H, W) with a dfdx tape.
+#[derive(Debug)]
+pub struct Field<T> {
+    saved: Saved,
+    tape: T,
+}
+
+impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
+    /// A network input, with an empty tape. No gradient flows into it.
+    ///
+    /// # Panics
+    /// If the length of `values` is not what `extent` demands.
+    pub fn input(extent: Extent, values: Vec<f32>) -> Self {
+        assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
+        let values = Values { extent, data: Arc::new(values) };
+        Self { saved: Saved { values, gradient: None }, tape: T::default() }
+    }
+
+    fn output(extent: Extent, data: Vec<f32>, tape: T) -> (Self, Saved) {
+        let values = Values { extent, data: Arc::new(data) };
+        let saved = Saved { values, gradient: Some(Rc::default()) };
+        (Self { saved: saved.clone(), tape }, saved)
+    }
+
+    /// A second handle on the same field, with an empty tape.
+    pub fn fork(&self) -> Self {
+        Self { saved: self.saved.clone(), tape: T::default() }
+    }
+
+    /// Images, channels, rows, columns.
+    pub fn extent(&self) -> Extent {
+        self.saved.values.extent
+    }
+
+    /// Channels `first..first + channels` of a layer's output as planes, each value at its own pixel for
+    /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a 2x2 square.
+    /// (N, K, H, W) -> (N, channels / factor^2, factor * H, factor * W)
+    pub fn from_activation(activation: Activation<T>, first: usize, channels: usize, factor: usize) -> Self {
+        let shape = activation.shape();
+        let planes = channels / (factor * factor);
+        let extent = (shape.n, planes, factor * shape.h, factor * shape.w);
+        let mut data = vec![0.0; shape.n * channels * shape.h * shape.w];
+        from_blocked_shuffled(activation.saved.data.view(), first, factor, &mut data);
+        let (mut field, out) = Self::output(extent, data, activation.tape);
+        if T::OWNS_TAPE {
+            let source = activation.saved;
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                source.accumulate(|into, fresh| {
+                    if fresh {
+                        into.fill(Default::default());
+                    }
+                    to_blocked_shuffled(&gradient, first, factor, into.view_mut());
+                });
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// Filters the field, (N, 3, H, W), by k x k kernels: `logits` (N, k*k, H, W) and, where neighbours
+    /// are not all to be trusted alike, `confidence` (N, 1, H, W). See [`Filter`].
+    pub fn filter(self, k: usize, logits: Self, confidence: Option<Self>) -> Self {
+        let (images, _, h, w) = self.extent();
+        let tier = Tier::detect();
+        let mut tape = self.tape.merge(logits.tape);
+        let (image, logits) = (self.saved, logits.saved);
+        let mut trust = None;
+        if let Some(confidence) = confidence {
+            tape = tape.merge(confidence.tape);
+            trust = Some(confidence.saved);
+        }
+        let values = (image.values.clone(), logits.values.clone(), trust.as_ref().map(|t| t.values.clone()));
+        let mut output = vec![0.0; images * 3 * h * w];
+        let mut total = vec![0.0; images * h * w];
+        for (n, (output, total)) in output.chunks_mut(3 * h * w).zip(total.chunks_mut(h * w)).enumerate() {
+            filter_of(&values, n, k).apply(tier, output, total);
+        }
+        let (mut field, out) = Self::output((images, 3, h, w), output, tape);
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                let output = &out.values;
+                let run = |image: Option<&mut [f32]>, logits: &mut [f32], trust: Option<&mut [f32]>| {
+                    by_image(image, images)
+                        .into_par_iter()
+                        .zip(logits.par_chunks_mut(k * k * h * w))
+                        .zip(by_image(trust, images))
+                        .enumerate()
+                        .for_each(|(n, ((image, logits), confidence))| {
+                            let forward = (output.image(n), &total[n * h * w..][..h * w]);
+                            let gradient = &gradient[n * 3 * h * w..][..3 * h * w];
+                            let into = FilterGradient { image, logits, confidence };
+                            filter_of(&values, n, k).gradient(tier, forward, gradient, into);
+                        });
+                };
+                image.accumulate(|into_image| {
+                    logits.accumulate(|into_logits| {
+                        let into_logits = into_logits.expect("logits come from a layer");
+                        match &trust {
+                            Some(trust) => trust.accumulate(|into| run(into_image, into_logits, into)),
+                            None => run(into_image, into_logits, None),
+                        }
+                    });
+                });
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each 2x2 square weighted by
+    /// `exp(confidence)`, (N, 1, H, W). See [`reduce`].
+    pub fn reduce(self, confidence: Self) -> Self {
+        let (images, _, h, w) = self.extent();
+        let quarter = h * w / 4;
+        let (mut output, mut total) = (vec![0.0; images * 3 * quarter], vec![0.0; images * quarter]);
+        let (image, trust) = (self.saved, confidence.saved);
+        let (values, weights) = (image.values.clone(), trust.values.clone());
+        output.par_chunks_mut(3 * quarter).zip(total.par_chunks_mut(quarter)).enumerate().for_each(
+            |(n, (output, total))| reduce(values.size(), values.image(n), weights.image(n), output, total),
+        );
+        let extent = (images, 3, h / 2, w / 2);
+        let (mut field, out) = Self::output(extent, output, self.tape.merge(confidence.tape));
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                let output = &out.values;
+                image.accumulate(|into_image| {
+                    trust.accumulate(|into_trust| {
+                        let into_trust = into_trust.expect("confidence comes from a layer");
+                        by_image(into_image, images)
+                            .into_par_iter()
+                            .zip(into_trust.par_chunks_mut(h * w))
+                            .enumerate()
+                            .for_each(|(n, (into_image, into_trust))| {
+                                let forward = (output.image(n), &total[n * quarter..][..quarter]);
+                                let gradient = &gradient[n * 3 * quarter..][..3 * quarter];
+                                let (image, trust) = (values.image(n), weights.image(n));
+                                let size = values.size();
+                                reduce_gradient(size, image, trust, forward, gradient, into_image, into_trust);
+                            });
+                    });
+                });
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// Blends a coarse level, (N, 3, H/2, W/2), into this one by the mask `sigmoid(alpha)`,
+    /// (N, 1, H, W). See [`blend`].
+    pub fn blend(self, coarse: Self, alpha: Self) -> Self {
+        let (images, _, h, w) = self.extent();
+        let (pixels, quarter) = (h * w, h * w / 4);
+        let size = Size { h, w };
+        let mut output = vec![0.0; images * 3 * pixels];
+        let mut difference = vec![0.0; images * 3 * quarter];
+        let (fine, below, mask) = (self.saved, coarse.saved, alpha.saved);
+        let chunks = output.chunks_mut(3 * pixels).zip(difference.chunks_mut(3 * quarter));
+        for (n, (output, difference)) in chunks.enumerate() {
+            let (fine, below, mask) = (fine.values.image(n), below.values.image(n), mask.values.image(n));
+            blend(size, fine, below, mask, difference, output);
+        }
+        let tape = self.tape.merge(coarse.tape).merge(alpha.tape);
+        let (mut field, out) = Self::output((images, 3, h, w), output, tape);
+        if T::OWNS_TAPE {
+            let weights = mask.values.clone();
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                const FILTERED: &str = "what is blended was filtered";
+                fine.accumulate(|into_fine| {
+                    below.accumulate(|into_below| {
+                        mask.accumulate(|into_mask| {
+                            let into_below = into_below.expect(FILTERED);
+                            into_fine
+                                .expect(FILTERED)
+                                .par_chunks_mut(3 * pixels)
+                                .zip(into_below.par_chunks_mut(3 * quarter))
+                                .zip(into_mask.expect(FILTERED).par_chunks_mut(pixels))
+                                .enumerate()
+                                .for_each(|(n, ((into_fine, into_below), into_mask))| {
+                                    let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
+                                    let difference = &difference[n * 3 * quarter..][..3 * quarter];
+                                    let weights = weights.image(n);
+                                    blend_gradient(
+                                        size, weights, difference, gradient, into_fine, into_below, into_mask,
+                                    );
+                                });
+                        });
+                    });
+                });
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// The values as a dfdx tensor, (N, C, H, W), with the tape.
+    pub fn into_images(self) -> Images<T> {
+        let images: Images =
+            Cpu::default().tensor_from_vec(self.saved.values.data.to_vec(), self.saved.values.extent);
+        let mut tape = self.tape;
+        if T::OWNS_TAPE {
+            let (of_tensor, saved) = (images.clone(), self.saved);
+            tape.add_backward_op(move |gradients| {
+                let values = std::mem::take(&mut **gradients.get_or_alloc_mut(&of_tensor)?);
+                saved.accumulate(|into| {
+                    let into = into.into_iter().flatten();
+                    into.zip(&values).for_each(|(a, b)| *a += b);
+                });
+                Ok(())
+            });
+        }
+        images.put_tape(tape)
+    }
+}
+
+/// The forward problem of image `n`.
+fn filter_of((image, logits, confidence): &(Values, Values, Option<Values>), n: usize, k: usize) -> Filter<'_> {
+    Filter {
+        size: image.size(),
+        k,
+        image: image.image(n),
+        logits: logits.image(n),
+        confidence: confidence.as_ref().map(|c| c.image(n)),
+    }
+}
