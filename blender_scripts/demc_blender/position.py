@@ -72,9 +72,13 @@ def _default_material(edits):
     return material
 
 
+def _has_nodes(material):
+    # From Blender 5 on every material has nodes, and asking for use_nodes only warns.
+    return material.node_tree is not None and (bpy.app.version >= (5, 0, 0) or material.use_nodes)
+
+
 def _use_nodes(material):
-    # From Blender 5 on every material has nodes and the property only warns.
-    if material.node_tree is None or bpy.app.version < (5, 0, 0):
+    if not _has_nodes(material):
         material.use_nodes = True
 
 
@@ -87,10 +91,9 @@ def _plain_diffuse(tree, color):
 
 
 def _add_to_material(edits, material, threshold, groups):
-    if not material.use_nodes or material.node_tree is None:
+    if not _has_nodes(material):
         # Cycles renders a material without nodes as plain diffuse of its viewport colour.
-        had_tree = material.node_tree is not None
-        if had_tree:  # nodes that the user keeps switched off: leave them as they are
+        if material.node_tree is not None:  # nodes switched off by the user: leave them alone
             return
         color = tuple(material.diffuse_color)
         material.use_nodes = True

@@ -1,0 +1,147 @@
+"""Reads the multilayer EXR that Blender writes, and writes a compact one; numpy and zlib alone.
+
+Blender stores data passes as 32-bit floats even in a half file, and offers scripts no way to read
+the passes of a render. Training crops are read back here, judged, and stored as half in one part.
+Scan lines with no, ZIPS or ZIP compression are understood: what these scripts make Blender write.
+"""
+
+import struct
+import zlib
+
+import numpy as np
+
+_MAGIC = 20000630
+_TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+_LINES = {0: 1, 2: 1, 3: 16}
+_ZIP = 3
+
+
+def read(path):
+    """Channel name -> (height, width) array, over all parts."""
+    with open(path, "rb") as file:
+        data = file.read()
+    magic, flags = struct.unpack_from("<II", data)
+    if magic != _MAGIC or flags & 0x200:
+        raise ValueError(f"{path}: not a scan-line EXR")
+    multipart = bool(flags & 0x1000)
+    at, headers = 8, []
+    while True:
+        header, at = _header(data, at)
+        if header:
+            headers.append(header)
+        if not header or not multipart:
+            break
+    channels = {}
+    for header in headers:
+        at = _read_part(data, at, header, multipart, channels)
+    return channels
+
+
+def write_half(path, channels):
+    """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines."""
+    names = sorted(channels)
+    height, width = channels[names[0]].shape
+    limit = float(np.finfo(np.float16).max)
+    planes = [np.clip(channels[n], -limit, limit).astype("<f2") for n in names]
+    header = struct.pack("<II", _MAGIC, 2 | (0x400 if max(map(len, names)) > 31 else 0))
+    listed = b"".join(n.encode() + b"\0" + struct.pack("<iiii", 1, 0, 1, 1) for n in names) + b"\0"
+    box = struct.pack("<iiii", 0, 0, width - 1, height - 1)
+    for name, kind, value in (
+        ("channels", "chlist", listed), ("compression", "compression", bytes([_ZIP])),
+        ("dataWindow", "box2i", box), ("displayWindow", "box2i", box),
+        ("lineOrder", "lineOrder", b"\0"), ("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
+        ("screenWindowCenter", "v2f", struct.pack("<ff", 0.0, 0.0)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+    ):
+        header += name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+    header += b"\0"
+    chunks = []
+    for top in range(0, height, _LINES[_ZIP]):
+        rows = range(top, min(top + _LINES[_ZIP], height))
+        raw = b"".join(plane[y].tobytes() for y in rows for plane in planes)
+        packed = _compress(raw)
+        chunks.append(struct.pack("<ii", top, len(packed)) + packed)
+    offset = len(header) + 8 * len(chunks)
+    table = b""
+    for chunk in chunks:
+        table += struct.pack("<Q", offset)
+        offset += len(chunk)
+    with open(path, "wb") as file:
+        file.write(header + table + b"".join(chunks))
+
+
+def _text(data, at):
+    end = data.index(b"\0", at)
+    return data[at:end].decode(), end + 1
+
+
+def _header(data, at):
+    """One header as name -> raw value; empty at the end of a list of headers."""
+    header = {}
+    while data[at]:
+        name, at = _text(data, at)
+        _, at = _text(data, at)
+        (size,) = struct.unpack_from("<i", data, at)
+        header[name] = data[at + 4:at + 4 + size]
+        at += 4 + size
+    return header, at + 1
+
+
+def _channel_list(raw):
+    at, found = 0, []
+    while raw[at]:
+        name, at = _text(raw, at)
+        (kind,) = struct.unpack_from("<i", raw, at)
+        found.append((name, _TYPES[kind]))
+        at += 16
+    return found
+
+
+def _read_part(data, table, header, multipart, channels):
+    """Decodes a part whose chunk offsets stand at `table`; returns where the next table stands."""
+    listed = _channel_list(header["channels"])
+    left, top, right, bottom = struct.unpack("<iiii", header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    compression = header["compression"][0]
+    if compression not in _LINES:
+        raise ValueError("only uncompressed and ZIP scan lines are read here")
+    lines = _LINES[compression]
+    count = -(-height // lines)
+    out = {name: np.empty((height, width), kind) for name, kind in listed}
+    row_bytes = sum(kind.itemsize for _, kind in listed) * width
+    for offset in struct.unpack_from(f"<{count}Q", data, table):
+        offset += 4 if multipart else 0
+        y, size = struct.unpack_from("<ii", data, offset)
+        y -= top
+        rows = min(lines, height - y)
+        block = data[offset + 8:offset + 8 + size]
+        if len(block) < rows * row_bytes:
+            block = _decompress(block)
+        at = 0
+        for row in range(y, y + rows):
+            for name, kind in listed:
+                out[name][row] = np.frombuffer(block, kind, width, at)
+                at += kind.itemsize * width
+    part = header.get("name", b"").decode()
+    for name, plane in out.items():
+        # Blender's parts repeat the part name in the channel names; other writers' may not.
+        channels[name if "." in name or not part else f"{part}.{name}"] = plane
+    return table + 8 * count
+
+
+def _decompress(block):
+    delta = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
+    delta[1:] -= 128
+    flat = np.cumsum(delta).astype(np.uint8)
+    half = (len(flat) + 1) // 2
+    out = np.empty_like(flat)
+    out[0::2], out[1::2] = flat[:half], flat[half:]
+    return out.tobytes()
+
+
+def _compress(raw):
+    bytes_ = np.frombuffer(raw, np.uint8)
+    split = np.concatenate([bytes_[0::2], bytes_[1::2]]).astype(np.int64)
+    split[1:] = split[1:] - split[:-1] + 128
+    packed = zlib.compress((split & 255).astype(np.uint8).tobytes(), 6)
+    return packed if len(packed) < len(raw) else raw

@@ -1,0 +1,1 @@
+"""Seeded random scenes for training: assets, materials, shapes, kinds of scenes, crops."""

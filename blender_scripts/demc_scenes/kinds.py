@@ -1,0 +1,83 @@
+"""The kinds of scenes by name: what builds each, and the cameras that suit it."""
+
+from . import outside, rooms, studio, views
+
+
+def _room(stage, mood=None):
+    shell = rooms.room(stage, mood)
+    return lambda: views.room_camera(stage, shell)
+
+
+def _table(build):
+    def kind(stage):
+        build(stage)
+
+        def camera():
+            target = stage.rng.choice(stage.interest) if stage.interest else (0, 0, 0.1)
+            return views.around_camera(stage, target, (0.6, 1.5), (0.08, 0.8), (32, 70), 0.05)
+        return camera
+    return kind
+
+
+def _street(stage):
+    half = outside.street(stage)
+
+    def camera():
+        rng = stage.rng
+        target = rng.choice(stage.interest) if stage.interest else (0, 0, 1.5)
+        if rng.random() < 0.4:
+            return views.around_camera(stage, target, (3, 8), (0.3, 2.0), (24, 50), 0.3)
+        center = (rng.uniform(-8, 8), rng.uniform(-half, half), 1.5)
+        return views.around_camera(stage, center, (4, 14), (0.0, 2.0), (20, 45), 1.0)
+    return camera
+
+
+def _outdoor(stage):
+    outside.outdoor(stage)
+
+    def camera():
+        target = stage.rng.choice(stage.interest) if stage.interest else (0, 0, 1.0)
+        return views.around_camera(stage, target, (1.5, 8.0), (0.2, 1.8), (24, 50), 0.2)
+    return camera
+
+
+def _many_lights(stage):
+    outside.many_lights(stage)
+
+    def camera():
+        target = stage.rng.choice(stage.interest)
+        return views.around_camera(stage, target, (0.8, 2.4), (0.1, 0.9), (24, 50), 0.1)
+    return camera
+
+
+def _fog(stage):
+    """Haze in a room, a street or a garden."""
+    rng = stage.rng
+    place = rng.choice(("room", "street", "outdoor"))
+    if place == "room":
+        camera = _room(stage, rng.choice(("day", "dim", "night")))
+        outside.add_fog(stage, (8, 9, 3.2), (3, 3.5, 1.65), rng.uniform(0.02, 0.15))
+        outside.spots_in_fog(stage, rng.randint(0, 2), 2, 2.3)
+    elif place == "street":
+        camera = _street(stage)
+        outside.add_fog(stage, (60, 24, 14), (0, 0, 7.01), rng.uniform(0.005, 0.05))
+    else:
+        camera = _outdoor(stage)
+        outside.add_fog(stage, (30, 30, 6), (0, 0, 2.5), rng.uniform(0.01, 0.08))
+        outside.spots_in_fog(stage, rng.randint(0, 2), 4, 5)
+    return camera
+
+
+# Name -> (builder, weight). A builder fills the stage and returns a function that places a camera.
+KINDS = {
+    "room": (_room, 7),
+    "street": (_street, 2),
+    "outdoor": (_outdoor, 3),
+    "studio": (_table(studio.studio), 2),
+    "materials": (_table(studio.shaderballs), 1),
+    "glass": (_table(studio.glass), 2),
+    "manylights": (_many_lights, 1),
+    "fog": (_fog, 1),
+    "hair": (_table(studio.hair), 1),
+    "skin": (_table(studio.skin), 1),
+}
