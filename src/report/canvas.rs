@@ -1,8 +1,8 @@
 //! Drawing text and shapes into bitmaps and SVG alike, with a font that comes with the program.
 
-use std::{path::Path, sync::Once};
+use std::{cell::RefCell, path::Path, sync::Once};
 
-use image::{ImageEncoder, RgbImage, codecs::png::PngEncoder};
+use image::{ImageEncoder, RgbImage, codecs::png::PngEncoder, imageops::FilterType};
 use plotters::{
     coord::Shift,
     prelude::*,
@@ -72,30 +72,46 @@ impl Style {
 /// A surface to draw on, in pixels from the top left.
 pub struct Canvas<'a, B: DrawingBackend> {
     area: &'a DrawingArea<B, Shift>,
+    /// Text of a bitmap, which is drawn last and finer than plotters would; none where it goes to
+    /// the backend (SVG).
+    deferred: Option<RefCell<Vec<Text>>>,
 }
 
-impl<'a, B: DrawingBackend> Canvas<'a, B> {
-    /// Draws on `area`.
-    pub fn new(area: &'a DrawingArea<B, Shift>) -> Self {
-        Self { area }
-    }
+/// A text to be drawn.
+struct Text {
+    text: String,
+    at: (i32, i32),
+    anchor: Anchor,
+    is_vertical: bool,
+    style: Style,
+}
 
+impl<B: DrawingBackend> Canvas<'_, B> {
     /// Text whose vertical centre is at `y`.
-    pub fn text(&self, text: &str, (x, y): (i32, i32), anchor: Anchor, style: Style) -> Result<()> {
-        let horizontal = match anchor {
-            Anchor::Left => HPos::Left,
-            Anchor::Centre => HPos::Center,
-            Anchor::Right => HPos::Right,
-        };
-        let style = style.plotters().pos(Pos::new(horizontal, VPos::Center));
-        self.area.draw_text(text, &style, (x, y)).map_err(failed)
+    pub fn text(&self, text: &str, at: (i32, i32), anchor: Anchor, style: Style) -> Result<()> {
+        self.draw_text(Text { text: text.into(), at, anchor, is_vertical: false, style })
     }
 
     /// Text that reads from bottom to top, centred on the point.
     pub fn vertical_text(&self, text: &str, at: (i32, i32), style: Style) -> Result<()> {
-        let mut style = style.plotters().pos(Pos::new(HPos::Center, VPos::Center));
-        style.font = style.font.transform(FontTransform::Rotate270);
-        self.area.draw_text(text, &style, at).map_err(failed)
+        self.draw_text(Text { text: text.into(), at, anchor: Anchor::Centre, is_vertical: true, style })
+    }
+
+    fn draw_text(&self, text: Text) -> Result<()> {
+        if let Some(deferred) = &self.deferred {
+            deferred.borrow_mut().push(text);
+            return Ok(());
+        }
+        let horizontal = match text.anchor {
+            Anchor::Left => HPos::Left,
+            Anchor::Centre => HPos::Center,
+            Anchor::Right => HPos::Right,
+        };
+        let mut style = text.style.plotters().pos(Pos::new(horizontal, VPos::Center));
+        if text.is_vertical {
+            style.font = style.font.transform(FontTransform::Rotate270);
+        }
+        self.area.draw_text(&text.text, &style, text.at).map_err(failed)
     }
 
     /// A line through `points`.
@@ -136,12 +152,58 @@ fn failed(error: impl std::fmt::Display) -> Error {
     Error::Usage(format!("cannot draw the report: {error}"))
 }
 
-/// Draws on an RGB image.
+/// Draws on an RGB image, texts above everything else.
 pub fn draw_on(image: &mut RgbImage, draw: impl FnOnce(&Canvas<BitMapBackend>) -> Result<()>) -> Result<()> {
     let size = image.dimensions();
-    let area = BitMapBackend::with_buffer(image.as_mut(), size).into_drawing_area();
-    draw(&Canvas::new(&area))?;
-    area.present().map_err(failed)
+    let texts = {
+        let area = BitMapBackend::with_buffer(image.as_mut(), size).into_drawing_area();
+        let canvas = Canvas { area: &area, deferred: Some(RefCell::default()) };
+        draw(&canvas)?;
+        area.present().map_err(failed)?;
+        canvas.deferred.map(RefCell::into_inner).unwrap_or_default()
+    };
+    texts.iter().try_for_each(|text| blend_text(image, text))
+}
+
+/// Draws a text at several times its size and averages: plotters puts glyphs on whole pixels, which
+/// tears small words apart.
+fn blend_text(image: &mut RgbImage, text: &Text) -> Result<()> {
+    const FINE: u32 = 4;
+    let fine = Style { size: text.style.size * FINE, colour: WHITE, ..text.style };
+    let (width, height) = fine.measure(&text.text);
+    // Room for what leans over the measured box, capitals above all.
+    let (width, height) = (width as u32 / FINE + 3, (height as u32 / FINE).max(text.style.size) * 3 / 2);
+    let mut scratch = RgbImage::new(width * FINE, height * FINE);
+    let size = scratch.dimensions();
+    {
+        let area = BitMapBackend::with_buffer(scratch.as_mut(), size).into_drawing_area();
+        let style = fine.plotters().pos(Pos::new(HPos::Center, VPos::Center));
+        area.draw_text(&text.text, &style, ((size.0 / 2) as i32, (size.1 / 2) as i32)).map_err(failed)?;
+        area.present().map_err(failed)?;
+    }
+    let mut coverage = image::imageops::resize(&scratch, width, height, FilterType::Triangle);
+    if text.is_vertical {
+        coverage = image::imageops::rotate270(&coverage);
+    }
+    let (width, height) = (coverage.width() as i32, coverage.height() as i32);
+    let left = match text.anchor {
+        Anchor::Left => text.at.0 - 1,
+        Anchor::Centre => text.at.0 - width / 2,
+        Anchor::Right => text.at.0 - width + 1,
+    };
+    let top = text.at.1 - height / 2;
+    let colour = [text.style.colour.0, text.style.colour.1, text.style.colour.2];
+    for (x, y, covered) in coverage.enumerate_pixels() {
+        let (Ok(x), Ok(y)) = (u32::try_from(left + x as i32), u32::try_from(top + y as i32)) else {
+            continue;
+        };
+        let Some(pixel) = image.get_pixel_mut_checked(x, y) else { continue };
+        let share = f32::from(covered[0]) / 255.0;
+        for (below, above) in pixel.0.iter_mut().zip(colour) {
+            *below = (f32::from(*below) * (1.0 - share) + f32::from(above) * share).round() as u8;
+        }
+    }
+    Ok(())
 }
 
 /// An SVG document.
@@ -149,7 +211,7 @@ pub fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<SVGBackend>) -> Resu
     let mut text = String::new();
     {
         let area = SVGBackend::with_string(&mut text, size).into_drawing_area();
-        draw(&Canvas::new(&area))?;
+        draw(&Canvas { area: &area, deferred: None })?;
         area.present().map_err(failed)?;
     }
     Ok(text)

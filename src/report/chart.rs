@@ -130,10 +130,12 @@ impl Scale {
 
     /// Round values within the scale, some four to nine of them.
     fn ticks(&self) -> Vec<f64> {
+        let even = |low: f64, high: f64| -> Vec<f64> {
+            let step = round_step((high - low) / 6.0);
+            ((low / step).ceil() as i64..=(high / step).floor() as i64).map(|i| i as f64 * step).collect()
+        };
         if !self.logarithmic {
-            let step = round_step((self.high - self.low) / 6.0);
-            let (first, last) = ((self.low / step).ceil() as i64, (self.high / step).floor() as i64);
-            return (first..=last).map(|i| i as f64 * step).collect();
+            return even(self.low, self.high);
         }
         let within = |factors: &[f64]| -> Vec<f64> {
             (self.low.floor() as i32..=self.high.ceil() as i32)
@@ -141,9 +143,9 @@ impl Scale {
                 .filter(|v| (self.low..=self.high).contains(&v.log10()))
                 .collect()
         };
-        let choices: [&[f64]; 4] =
-            [&[1.0], &[1.0, 3.0], &[1.0, 2.0, 5.0], &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0]];
-        choices.into_iter().map(within).find(|ticks| ticks.len() >= 4).unwrap_or_else(|| within(choices[3]))
+        let choices: [&[f64]; 3] = [&[1.0], &[1.0, 3.0], &[1.0, 2.0, 5.0]];
+        let enough = choices.into_iter().map(within).find(|ticks| ticks.len() >= 4);
+        enough.unwrap_or_else(|| even(10f64.powf(self.low), 10f64.powf(self.high)))
     }
 }
 
@@ -151,6 +153,12 @@ impl Scale {
 fn round_step(step: f64) -> f64 {
     let decade = 10f64.powf(step.log10().floor());
     [1.0, 2.0, 5.0, 10.0].into_iter().map(|f| f * decade).find(|s| *s >= step).unwrap_or(10.0 * decade)
+}
+
+/// A score to three significant digits.
+fn number_label(value: f64) -> String {
+    let decimals = (2 - value.abs().max(1e-9).log10().floor() as i32).clamp(0, 8) as usize;
+    format!("{value:.decimals$}")
 }
 
 /// A tick's value without a tail of zeros or rounding noise.
@@ -206,8 +214,11 @@ impl Panel {
             );
         }
         let x = Scale::new(self.points.iter().map(|p| p.time), true, (left, right));
-        let scores = self.points.iter().map(|p| p.score).chain(self.noisy);
-        let y = Scale::new(scores, self.is_error, (bottom, top));
+        let scores = self.points.iter().map(|p| p.score);
+        let y = Scale::new(scores.clone(), self.is_error, (bottom, top));
+        // The noisy input sets the scale only where that leaves the methods their room.
+        let with_noisy = Scale::new(scores.chain(self.noisy), self.is_error, (bottom, top));
+        let y = if with_noisy.high - with_noisy.low < 2.0 * (y.high - y.low) { with_noisy } else { y };
         let small = Style::new(14);
         for tick in x.ticks() {
             canvas.line(&[(x.at(tick), top), (x.at(tick), bottom)], GRID, 1)?;
@@ -229,14 +240,17 @@ impl Panel {
 
         let mut taken = Vec::new();
         if let Some(noisy) = self.noisy {
-            let at = y.at(noisy);
+            let inside = top + 3 < y.at(noisy) && y.at(noisy) < bottom - 3;
+            // Off the scale, the line stands at the edge beyond which it lies.
+            let at = y.at(noisy).clamp(top + 3, bottom - 3);
             canvas.dashes((left, right), at, NOISY_LINE, 2)?;
+            let text =
+                format!("noisy input {}{}", number_label(noisy), if inside { "" } else { ", off the scale" });
             let style = Style { colour: NOISY_LINE, ..Style::new(14) };
-            // On the side of the line where the plot is.
-            let text_at = (right - 6, if self.is_error { at + 12 } else { at - 12 });
-            canvas.text("noisy input", text_at, Anchor::Right, style)?;
-            let (w, h) = style.measure("noisy input");
-            taken.push(Rect::around((text_at.0 - w / 2, text_at.1), w, h));
+            let (w, h) = style.measure(&text);
+            let text_at = (right - 6, if at < (top + bottom) / 2 { at + 14 } else { at - 14 });
+            canvas.text(&text, text_at, Anchor::Right, style)?;
+            taken.push(Rect::around((text_at.0 - w / 2, text_at.1), w + 8, h + 6));
             taken.push(Rect { left, right, top: at - 2, bottom: at + 2 });
         }
         // Between two points of the front, the faster one is the best to be had for the time.

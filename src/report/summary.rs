@@ -14,8 +14,11 @@ use super::{
     rows::{Row, to_csv},
 };
 
-/// Metrics that are summarised, each with how a row gives it.
-const METRICS: [(&str, fn(&Row) -> Option<f64>); 9] = [
+/// How a row gives a metric.
+type Metric = fn(&Row) -> Option<f64>;
+
+/// Metrics that are summarised.
+const METRICS: [(&str, Metric); 9] = [
     ("relmse", |r| r.relmse),
     ("ssim", |r| r.ssim),
     ("rmse", |r| r.rmse),

@@ -1,0 +1,240 @@
+//! `demc eval` from the command line: tables, charts, sheets, failures and resumption.
+
+mod common;
+
+use std::{
+    collections::HashMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use assert_cmd::{Command as Demc, assert::Assert};
+use common::python;
+use predicates::prelude::*;
+
+const CONTRACT: &str = "scene,model,spp,width,height,relmse,ssim,rmse,max_error,seconds,ms_per_mpx,exposure";
+
+fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+fn demc() -> Demc {
+    Demc::cargo_bin("demc").unwrap()
+}
+
+/// Runs `demc eval` with one timed run, plus `more` arguments.
+fn eval(set: &Path, out: &Path, more: &[&str]) -> Assert {
+    demc().args(["eval", "--repeats", "1", "--test-set"]).arg(set).arg("--out").arg(out).args(more).assert()
+}
+
+type Row = HashMap<String, String>;
+
+fn table(path: &Path) -> Vec<Row> {
+    let mut reader = csv::Reader::from_path(path).unwrap();
+    reader.deserialize().map(Result::unwrap).collect()
+}
+
+fn row<'a>(rows: &'a [Row], scene: &str, model: &str) -> &'a Row {
+    rows.iter().find(|r| r["scene"] == scene && r["model"] == model).expect("the row is there")
+}
+
+/// Options that name Open Image Denoise's program, which the tests' environment carries.
+fn oidn() -> String {
+    python::environment().oidn_program("oidnDenoise").to_str().unwrap().to_string()
+}
+
+#[test]
+fn writes_tables_charts_and_sheets_for_methods_and_the_noisy_input() {
+    let out = tempfile::tempdir().unwrap();
+    eval(&data(""), out.path(), &["--models", "oidn-fast,oidn-high-prefilter", "--oidn", &oidn()])
+        .success()
+        .stdout(predicate::str::contains("summary.csv"));
+
+    let header = fs::read_to_string(out.path().join("scores.csv")).unwrap();
+    assert!(header.starts_with(&format!("{CONTRACT},")), "{header}");
+    let rows = table(&out.path().join("scores.csv"));
+    let order: Vec<_> = rows.iter().map(|r| (r["scene"].as_str(), r["model"].as_str())).collect();
+    let models = ["noisy", "oidn-fast", "oidn-high-prefilter"];
+    let scenes = ["s0000_room", "s0010_outdoor"];
+    assert_eq!(order, scenes.iter().flat_map(|s| models.map(|m| (*s, m))).collect::<Vec<_>>());
+    for scene in scenes {
+        let noisy = row(&rows, scene, "noisy");
+        assert_eq!(
+            (noisy["seconds"].as_str(), noisy["reason"].as_str()),
+            ("", ""),
+            "the input takes no time"
+        );
+        // What `demc compare` says of the same two files, digit by digit.
+        let [image, reference] = ["0004spp", "ref"].map(|kind| data(&format!("{scene}_{kind}.exr")));
+        let compared = demc().arg("compare").args([image, reference]).assert().success();
+        for line in String::from_utf8(compared.get_output().stdout.clone()).unwrap().lines() {
+            let (name, value) = line.split_once(' ').unwrap();
+            assert_eq!(noisy[name], value, "{scene} {name}");
+        }
+        let relmse = |model: &str| row(&rows, scene, model)["relmse"].parse::<f64>().unwrap();
+        assert!(relmse("oidn-fast") < 0.5 * relmse("noisy"));
+        let best = row(&rows, scene, "oidn-high-prefilter");
+        let number = |name: &str| best[name].parse::<f64>().unwrap();
+        assert!(
+            (number("ms_per_mpx") / (number("seconds") * 1e3 / (128.0 * 128.0 / 1e6)) - 1.0).abs() < 1e-5
+        );
+        assert_eq!(
+            (best["width"].as_str(), best["height"].as_str(), best["spp"].as_str()),
+            ("128", "128", "4")
+        );
+    }
+
+    let summary = table(&out.path().join("summary.csv"));
+    assert_eq!(summary.len(), 3);
+    assert!(summary.iter().all(|s| s["scenes"] == "2" && s["baseline"] == "oidn-fast"));
+    let fast: Vec<f64> =
+        rows.iter().filter(|r| r["model"] == "oidn-fast").map(|r| r["relmse"].parse().unwrap()).collect();
+    let geomean = (fast[0] * fast[1]).sqrt();
+    assert!((summary[1]["relmse_geomean"].parse::<f64>().unwrap() / geomean - 1.0).abs() < 1e-5);
+    assert_eq!(summary[1]["relmse_ratio"], "1");
+
+    let chart = image::open(out.path().join("speed_vs_accuracy.png")).unwrap();
+    assert_eq!((chart.width(), chart.height()), (1600, 760));
+    let svg = fs::read_to_string(out.path().join("speed_vs_accuracy.svg")).unwrap();
+    for text in ["oidn-fast", "oidn-high-prefilter", "noisy input", "Pareto front"] {
+        assert!(svg.contains(text), "the chart names {text}");
+    }
+    for scene in scenes {
+        // Three methods and the reference, each 300 wide with 6 between.
+        let sheet = image::open(out.path().join(format!("sheets/{scene}_0004spp.png"))).unwrap().to_rgb8();
+        assert_eq!(sheet.width(), 4 * 306 + 6);
+        assert!(sheet.pixels().collect::<std::collections::HashSet<_>>().len() > 1000, "it shows images");
+    }
+}
+
+/// A folder with one good pair and pairs that cannot be scored.
+fn broken_set() -> tempfile::TempDir {
+    let set = tempfile::tempdir().unwrap();
+    let copy = |from: &str, to: &str| fs::copy(data(from), set.path().join(to)).unwrap();
+    copy("s0000_room_0004spp.exr", "good_0004spp.exr");
+    copy("s0000_room_ref.exr", "good_ref.exr");
+    copy("s0000_room_0004spp.exr", "cut_0004spp.exr");
+    copy("s0000_room_ref.exr", "cut_ref.exr");
+    let whole = fs::read(set.path().join("cut_0004spp.exr")).unwrap();
+    fs::write(set.path().join("cut_0004spp.exr"), &whole[..whole.len() / 2]).unwrap();
+    copy("s0000_room_0004spp.exr", "small_0004spp.exr");
+    python::run(
+        std::process::Command::new(python::program("oiiotool"))
+            .args(["--pattern", "constant:color=0.5,0.5,0.5", "64x64", "3", "-d", "half", "-o"])
+            .arg(set.path().join("small_ref.exr")),
+    );
+    copy("s0000_room_0004spp.exr", "lonely_0004spp.exr");
+    set
+}
+
+#[test]
+fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
+    let (set, out) = (broken_set(), tempfile::tempdir().unwrap());
+    eval(set.path(), out.path(), &["--models", "noisy"]).code(1).stderr(
+        predicate::str::contains("lonely_ref.exr is missing")
+            .and(predicate::str::contains("cut_0004spp.exr")),
+    );
+    let rows = table(&out.path().join("scores.csv"));
+    assert_eq!(rows.len(), 3);
+    for (scene, reason) in [("cut", "cut_0004spp.exr"), ("small", "image 128x128, reference 64x64")] {
+        let row = row(&rows, scene, "noisy");
+        assert!(row["reason"].contains(reason), "{}", row["reason"]);
+        for metric in ["relmse", "ssim", "rmse", "max_error", "seconds", "exposure"] {
+            assert_eq!(row[metric], "", "{scene} {metric}");
+        }
+    }
+    assert_ne!(row(&rows, "good", "noisy")["relmse"], "");
+    let summary = table(&out.path().join("summary.csv"));
+    assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "2"));
+    assert!(!out.path().join("sheets/cut_0004spp.png").exists());
+}
+
+#[test]
+fn an_absent_peer_says_so_and_the_others_are_scored() {
+    let out = tempfile::tempdir().unwrap();
+    eval(&data(""), out.path(), &["--models", "oidn-high", "--oidn", "/no/such/oidnDenoise"]).code(1);
+    let rows = table(&out.path().join("scores.csv"));
+    for scene in ["s0000_room", "s0010_outdoor"] {
+        let peer = row(&rows, scene, "oidn-high");
+        assert!(peer["reason"].contains("/no/such/oidnDenoise"), "{}", peer["reason"]);
+        assert_eq!((peer["relmse"].as_str(), peer["seconds"].as_str()), ("", ""));
+        assert_ne!(row(&rows, scene, "noisy")["relmse"], "");
+    }
+    let summary = table(&out.path().join("summary.csv"));
+    assert_eq!(summary[0]["scenes"], "2", "a method that scored nowhere does not limit the others");
+}
+
+#[test]
+fn finished_rows_are_kept_and_missing_ones_run() {
+    let out = tempfile::tempdir().unwrap();
+    let (scores, program) = (out.path().join("scores.csv"), oidn());
+    let more = ["--models", "oidn-fast", "--oidn", &program];
+    let run = || eval(&data(""), out.path(), &more).success();
+    run();
+    let first = fs::read_to_string(&scores).unwrap();
+    run().stderr(predicate::str::contains("4 of 4 rows are there already"));
+    assert_eq!(fs::read_to_string(&scores).unwrap(), first, "times included: nothing ran");
+
+    // A run killed in the middle of a line: the whole rows stay, the rest runs.
+    let kept: Vec<&str> = first.lines().take(3).collect();
+    fs::write(&scores, format!("{}\ns0010_outdoor,noi", kept.join("\n"))).unwrap();
+    run().stderr(predicate::str::contains("2 of 4 rows are there already"));
+    let again = fs::read_to_string(&scores).unwrap();
+    assert_eq!(again.lines().take(3).collect::<Vec<_>>(), kept);
+    assert_eq!(again.lines().count(), 5);
+
+    // Other settings make other rows.
+    eval(&data(""), out.path(), &["--models", "oidn-fast", "--oidn", &program, "--threads", "1"])
+        .success()
+        .stderr(predicate::str::contains("already").not());
+    let rows = table(&scores);
+    assert!(rows.iter().all(|r| r["threads"] == "1"));
+    eval(&data(""), out.path(), &["--models", "noisy", "--threads", "1", "--overwrite"])
+        .success()
+        .stderr(predicate::str::contains("already").not());
+    assert_eq!(table(&scores).len(), 2);
+}
+
+#[test]
+fn test_set_may_be_a_manifest_or_a_glob() {
+    let dir = tempfile::tempdir().unwrap();
+    let manifest = dir.path().join("set.csv");
+    let (noisy, reference) = (data("s0010_outdoor_0004spp.exr"), data("s0010_outdoor_ref.exr"));
+    let text = format!("scene,noisy,reference,spp\nmeadow,{},{},4\n", noisy.display(), reference.display());
+    fs::write(&manifest, text).unwrap();
+    let out = dir.path().join("a/b");
+    eval(&manifest, &out, &["--models", "noisy", "--no-sheets"]).success();
+    let rows = table(&out.join("scores.csv"));
+    assert_eq!((rows.len(), rows[0]["scene"].as_str()), (1, "meadow"));
+    assert!(!out.join("sheets").exists());
+
+    let out = dir.path().join("c");
+    eval(&data("*room_0004spp.exr"), &out, &["--models", "noisy", "--no-sheets"]).success();
+    assert_eq!(table(&out.join("scores.csv"))[0]["relmse"].get(..5), Some("0.920"));
+}
+
+#[test]
+fn wrong_command_lines_exit_with_2_and_write_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    for (set, more, expected) in [
+        (data("nothing-here"), vec!["--models", "noisy"], "nothing there by that name"),
+        (data("*.tif"), vec!["--models", "noisy"], "no file matches"),
+        (data(""), vec!["--models", "no-such-model"], "no-such-model"),
+        (data(""), vec!["--models", "noisy", "--baseline", "kpcn"], "--baseline kpcn"),
+        (data(""), vec!["--models", "noisy", "--repeats", "0"], "--repeats"),
+    ] {
+        eval(&set, &out, &more).code(predicate::in_iter([2])).stderr(predicate::str::contains(expected));
+        assert!(!out.exists(), "{expected}");
+    }
+}
+
+#[test]
+fn an_unwritable_output_is_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("file");
+    fs::write(&file, "").unwrap();
+    eval(&data(""), &file.join("out"), &["--models", "noisy"]).code(1).stderr(
+        predicate::str::contains("cannot create").and(predicate::function(|t: &str| t.lines().count() == 1)),
+    );
+}
