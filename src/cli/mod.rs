@@ -5,6 +5,7 @@ mod denoise;
 mod eval;
 mod inputs;
 mod inspect;
+mod models;
 mod stop;
 mod train;
 
@@ -36,8 +37,7 @@ enum Command {
     Inspect(inspect::Args),
     /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
     Compare(compare::Args),
-    /// List the built-in models
-    Models,
+    Models(models::Args),
 }
 
 /// Exit status when some input failed, each named on stderr.
@@ -53,7 +53,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Compare(args) => compare::run(&args),
-        Command::Models => Ok(ExitCode::SUCCESS),
+        Command::Models(args) => models::run(&args),
     };
     done.unwrap_or_else(|error| {
         eprintln!("demc: {error}");

@@ -14,7 +14,7 @@ use std::{
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{
-    Error, Result, models,
+    Error, Result, models, report,
     testset::{self, Pair},
     train::{self, Event, Loss, Options},
 };
@@ -46,7 +46,7 @@ pub struct Args {
     /// Learning rate of the first and last step
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
-    /// What is minimised: relmse or smape
+    /// What is minimised: relmse, smape, or both summed
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
     /// Weight of the past in the average of the weights that is kept
@@ -61,6 +61,9 @@ pub struct Args {
     /// Seed of initial weights, crops and augmentation
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Weights file to begin with, of the same model and widths
+    #[arg(long)]
+    init: Option<PathBuf>,
     /// Go on from the run folder's checkpoint, with its config.json
     #[arg(long)]
     resume: bool,
@@ -162,6 +165,7 @@ impl Args {
             average: self.average,
             every: self.every,
             seed: self.seed,
+            init: self.init.clone(),
         })
     }
 }
@@ -201,8 +205,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    // A second handler (in a process that embeds demc) is not ours to replace.
-    let _ = ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed));
+    super::stop::on_request(move || flag.store(true, Ordering::Relaxed))?;
     let bar = ProgressBar::new(options.steps as u64);
     if !std::io::stderr().is_terminal() {
         bar.set_draw_target(indicatif::ProgressDrawTarget::hidden());
@@ -214,7 +217,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             bar.set_position(step as u64);
             bar.set_message(format!("{loss:.4}"));
         }
-        Event::Row(row) => {
+        Event::Logged(rows) => {
+            let Some(row) = rows.last() else { return };
+            // A chart that cannot be drawn is no reason to lose a run.
+            if let Err(e) = report::loss_chart(&args.out.join("loss.png"), &rows) {
+                bar.suspend(|| eprintln!("demc: {e}"));
+            }
             let optional = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
             let (relmse, ssim) = (optional(row.val_relmse), optional(row.val_ssim));
             let line = format!(
@@ -228,7 +236,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         Err(Error::Interrupted) => {
             let out = args.out.display();
             eprintln!("stopped; go on with: demc train --out {out} --resume");
-            Ok(ExitCode::from(super::SOME_FAILED))
+            Ok(ExitCode::from(super::stop::INTERRUPTED))
         }
         other => other.map(|()| ExitCode::SUCCESS),
     }

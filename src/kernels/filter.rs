@@ -263,7 +263,10 @@ impl Kernel for Backward<'_, '_> {
 /// If lengths do not fit, or rows or columns are odd.
 pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32], total: &mut [f32]) {
     let (h, w) = (size.h / 2, size.w / 2);
-    assert_eq!((2 * h, 2 * w, image.len(), confidence.len()), (size.h, size.w, 3 * size.pixels(), size.pixels()));
+    assert_eq!(
+        (2 * h, 2 * w, image.len(), confidence.len()),
+        (size.h, size.w, 3 * size.pixels(), size.pixels())
+    );
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
     let weights: Vec<f32> = confidence.iter().map(|c| exp(*c)).collect();
     let squares = |v: &[f32], y: usize, x: usize| {
@@ -331,12 +334,7 @@ fn corners(size: Size, y: usize, x: usize) -> [(usize, f32); 4] {
         (own, other)
     };
     let ((y0, y1), (x0, x1)) = (near(y, h), near(x, w));
-    [
-        (y0 * w + x0, 0.5625),
-        (y0 * w + x1, 0.1875),
-        (y1 * w + x0, 0.1875),
-        (y1 * w + x1, 0.0625),
-    ]
+    [(y0 * w + x0, 0.5625), (y0 * w + x1, 0.1875), (y1 * w + x0, 0.1875), (y1 * w + x1, 0.0625)]
 }
 
 /// Blends a coarse level into a fine one, (3, H, W): `fine + sigmoid(alpha) * up(coarse - down(fine))`,

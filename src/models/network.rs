@@ -24,6 +24,13 @@ pub struct Config {
     pub widths: Vec<usize>,
 }
 
+impl std::fmt::Display for Config {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let widths: Vec<String> = self.widths.iter().map(usize::to_string).collect();
+        write!(f, "{:?} of widths {}", self.architecture, widths.join(","))
+    }
+}
+
 /// The designs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -154,8 +154,7 @@ impl Pyramid {
         let mut heads: Vec<Activation<T>> = Vec::with_capacity(LEVELS + 1);
         let mut x: Option<Activation<T>> = None;
         for (level, head) in self.decoder.iter().zip(self.heads.iter().rev()) {
-            let mut sources: Vec<_> =
-                skips.iter_mut().map(|s| s.pop().expect("one skip a level")).collect();
+            let mut sources: Vec<_> = skips.iter_mut().map(|s| s.pop().expect("one skip a level")).collect();
             if let (Some(up), Some(below)) = (&level.up, x) {
                 sources.push(up.forward(vec![below])); // (N, K', H, W) -> (N, K, 2H, 2W)
             }
@@ -202,9 +201,12 @@ impl Pyramid {
         let encoders = self.encoders.iter().flat_map(|e| {
             e.levels.iter().enumerate().flat_map(|(level, convs)| convs.iter().map(move |c| (c, level + 1)))
         });
-        let decoder = self.decoder.iter().rev().enumerate().flat_map(|(level, l)| {
-            l.up.iter().chain([&l.fuse, &l.refine]).map(move |c| (c, level + 1))
-        });
+        let decoder = self
+            .decoder
+            .iter()
+            .rev()
+            .enumerate()
+            .flat_map(|(level, l)| l.up.iter().chain([&l.fuse, &l.refine]).map(move |c| (c, level + 1)));
         let heads = self.heads.iter().enumerate().map(|(level, c)| (c, level + 1));
         encoders.chain(decoder).chain(heads).chain([(&self.full, 1)])
     }
@@ -252,8 +254,10 @@ impl Network for Pyramid {
     }
 
     fn macs_per_pixel(&self) -> f64 {
-        let convolutions: f64 =
-            self.convolutions().map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32)).sum();
+        let convolutions: f64 = self
+            .convolutions()
+            .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
+            .sum();
         // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
         let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
         convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64

@@ -27,6 +27,9 @@ pub struct Facts {
     pub loss: String,
     /// The seed of weights, crops and augmentation.
     pub seed: u64,
+    /// The weights file it began with, if any.
+    #[serde(default)]
+    pub init: Option<String>,
     /// Seconds of training.
     pub seconds: f64,
     /// Pairs validated on.
@@ -67,6 +70,22 @@ pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()
 /// The file is unreadable, or not the weights of a network that this version knows.
 pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
     parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+}
+
+/// Reads a weights file that must hold the network `config`.
+///
+/// # Errors
+/// As [`read`], or the file holds another network.
+pub fn read_as(path: &Path, config: &Config) -> Result<Box<dyn Network>> {
+    let (network, metadata) = read(path)?;
+    if metadata.network != *config {
+        let (held, wanted) = (metadata.network, config);
+        return Err(Error::invalid(
+            path,
+            format!("holds {held}, not {wanted}; choose --model and --widths alike"),
+        ));
+    }
+    Ok(network)
 }
 
 /// Parses the bytes of a weights file; `path` is for messages.

@@ -208,7 +208,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                                 let gradient = &gradient[n * 3 * quarter..][..3 * quarter];
                                 let (image, trust) = (values.image(n), weights.image(n));
                                 let size = values.size();
-                                reduce_gradient(size, image, trust, forward, gradient, into_image, into_trust);
+                                reduce_gradient(
+                                    size, image, trust, forward, gradient, into_image, into_trust,
+                                );
                             });
                     });
                 });
@@ -287,7 +289,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 }
 
 /// The forward problem of image `n`.
-fn filter_of((image, logits, confidence): &(Values, Values, Option<Values>), n: usize, k: usize) -> Filter<'_> {
+fn filter_of(
+    (image, logits, confidence): &(Values, Values, Option<Values>),
+    n: usize,
+    k: usize,
+) -> Filter<'_> {
     Filter {
         size: image.size(),
         k,

@@ -10,6 +10,7 @@ use plotters::prelude::*;
 
 use super::{
     NOISY,
+    axis::{Area, Scale, tick_label},
     canvas::{Anchor, Canvas, Style, draw_on, draw_svg, write_png},
     rows::write_file,
     summary::Method,
@@ -95,76 +96,10 @@ fn draw<B: DrawingBackend>(canvas: &Canvas<B>, title: &str, panels: &[Panel; 2])
     Ok(())
 }
 
-/// Pixels of a panel's plotting area.
-#[derive(Clone, Copy)]
-struct Area {
-    left: i32,
-    right: i32,
-    top: i32,
-    bottom: i32,
-}
-
-/// One axis: values to pixels.
-struct Scale {
-    low: f64,
-    high: f64,
-    logarithmic: bool,
-    pixels: (i32, i32),
-}
-
-impl Scale {
-    /// Covers `values` with a margin; `pixels` are where its ends lie.
-    fn new(values: impl Iterator<Item = f64>, logarithmic: bool, pixels: (i32, i32)) -> Self {
-        let place = |v: f64| if logarithmic { v.log10() } else { v };
-        let (low, high) = values.map(place).fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
-        let (low, high) = if low > high { (0.0, 1.0) } else { (low, high) };
-        let margin = (0.12 * (high - low)).max(if logarithmic { 0.15 } else { 0.01 });
-        Self { low: low - margin, high: high + margin, logarithmic, pixels }
-    }
-
-    fn at(&self, value: f64) -> i32 {
-        let value = if self.logarithmic { value.log10() } else { value };
-        let share = (value - self.low) / (self.high - self.low);
-        self.pixels.0 + (share * f64::from(self.pixels.1 - self.pixels.0)).round() as i32
-    }
-
-    /// Round values within the scale, some four to nine of them.
-    fn ticks(&self) -> Vec<f64> {
-        let even = |low: f64, high: f64| -> Vec<f64> {
-            let step = round_step((high - low) / 6.0);
-            ((low / step).ceil() as i64..=(high / step).floor() as i64).map(|i| i as f64 * step).collect()
-        };
-        if !self.logarithmic {
-            return even(self.low, self.high);
-        }
-        let within = |factors: &[f64]| -> Vec<f64> {
-            (self.low.floor() as i32..=self.high.ceil() as i32)
-                .flat_map(|decade| factors.iter().map(move |f| f * 10f64.powi(decade)))
-                .filter(|v| (self.low..=self.high).contains(&v.log10()))
-                .collect()
-        };
-        let choices: [&[f64]; 3] = [&[1.0], &[1.0, 3.0], &[1.0, 2.0, 5.0]];
-        let enough = choices.into_iter().map(within).find(|ticks| ticks.len() >= 4);
-        enough.unwrap_or_else(|| even(10f64.powf(self.low), 10f64.powf(self.high)))
-    }
-}
-
-/// 1, 2 or 5 times a power of ten, near `step`.
-fn round_step(step: f64) -> f64 {
-    let decade = 10f64.powf(step.log10().floor());
-    [1.0, 2.0, 5.0, 10.0].into_iter().map(|f| f * decade).find(|s| *s >= step).unwrap_or(10.0 * decade)
-}
-
 /// A score to three significant digits.
 fn number_label(value: f64) -> String {
     let decimals = (2 - value.abs().max(1e-9).log10().floor() as i32).clamp(0, 8) as usize;
     format!("{value:.decimals$}")
-}
-
-/// A tick's value without a tail of zeros or rounding noise.
-fn tick_label(value: f64) -> String {
-    let text = format!("{value:.6}");
-    text.trim_end_matches('0').trim_end_matches('.').into()
 }
 
 impl Panel {
@@ -218,7 +153,7 @@ impl Panel {
         let y = Scale::new(scores.clone(), self.is_error, (bottom, top));
         // The noisy input sets the scale only where that leaves the methods their room.
         let with_noisy = Scale::new(scores.chain(self.noisy), self.is_error, (bottom, top));
-        let y = if with_noisy.high - with_noisy.low < 2.0 * (y.high - y.low) { with_noisy } else { y };
+        let y = if with_noisy.span() < 2.0 * y.span() { with_noisy } else { y };
         let small = Style::new(14);
         for tick in x.ticks() {
             canvas.line(&[(x.at(tick), top), (x.at(tick), bottom)], GRID, 1)?;

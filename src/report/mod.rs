@@ -4,8 +4,10 @@
 //! `summary.csv`, `speed_vs_accuracy.png` and `.svg`, and `sheets/<pair>.png`. Rows are stored as
 //! they finish; the same command run again keeps those that still hold.
 
+mod axis;
 mod canvas;
 mod chart;
+mod loss;
 mod memory;
 mod rows;
 mod run;
@@ -15,6 +17,7 @@ mod summary;
 
 use std::path::PathBuf;
 
+pub use loss::loss_chart;
 pub use rows::{COLUMNS, Row, read_rows};
 pub use run::{Event, evaluate};
 pub use settings::file_stamp;

@@ -14,6 +14,7 @@ mod run;
 
 pub use augment::Augment;
 pub use dataset::{Dataset, Sample};
+pub use log::Row;
 pub use loss::Loss;
 pub use optimizer::Adam;
 pub use run::{Event, Options, run};

@@ -1,7 +1,7 @@
 //! The training loop.
 
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
     time::Instant,
 };
@@ -53,6 +53,8 @@ pub struct Options {
     pub every: usize,
     /// Decides initial weights, crops and augmentation.
     pub seed: u64,
+    /// A weights file to begin with, instead of weights drawn from the seed.
+    pub init: Option<PathBuf>,
 }
 
 /// What the caller hears of.
@@ -65,8 +67,8 @@ pub enum Event {
         /// Its loss.
         loss: f64,
     },
-    /// A row was added to the log.
-    Row(log::Row),
+    /// A row was added to the log, which is given whole.
+    Logged(Vec<log::Row>),
 }
 
 /// Seconds between checkpoints: what a kill costs at most.
@@ -79,14 +81,17 @@ const CHECKPOINT_SECONDS: f64 = 60.0;
 /// A pair is unusable, or the run folder cannot be read or written.
 pub fn run(
     options: &Options,
-    out: &PathBuf,
+    out: &Path,
     resume: bool,
     stop: &AtomicBool,
     on: &mut dyn FnMut(Event),
 ) -> Result<()> {
     log::create_dir(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
-    let mut network = models::build(&options.network, options.seed);
+    let mut network = match &options.init {
+        Some(path) => weights_file::read_as(path, &options.network)?,
+        None => models::build(&options.network, options.seed),
+    };
     let mut average = network.duplicate();
     let mut adam = Adam::default();
     let mut progress = Progress::default();
@@ -94,6 +99,9 @@ pub fn run(
         progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut adam)?;
     }
     let mut rows = log::read(&log_path, progress.step)?;
+    if progress.step >= options.steps {
+        return Ok(());
+    }
     let training = Dataset::load(&options.train, network.passes(), options.patch)?;
     let validation = Dataset::load(&options.validation, network.passes(), 1)?;
     let (mut since, mut saved) = (Instant::now(), Instant::now());
@@ -130,7 +138,7 @@ pub fn run(
                 progress.best = row.val_relmse;
                 weights_file::write(&out.join("best.safetensors"), &mut *average, &facts(options, &row))?;
             }
-            on(Event::Row(row));
+            on(Event::Logged(rows.clone()));
             since = Instant::now();
         }
         let stopping = stop.load(Ordering::Relaxed);
@@ -231,6 +239,7 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         lr: options.lr,
         loss: options.loss.to_string(),
         seed: options.seed,
+        init: options.init.as_ref().map(|p| p.display().to_string()),
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,

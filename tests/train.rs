@@ -1,0 +1,166 @@
+//! `demc train` through the binary: run folder, exact resumption, weights files, errors.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use assert_cmd::cargo::cargo_bin;
+use demc::nn::weights::{self, Tensor};
+use predicates::prelude::*;
+
+/// Two real pairs: one to train on, one to validate on.
+fn data(scene: &str) -> String {
+    format!("{}/tests/data/{scene}_*.exr", env!("CARGO_MANIFEST_DIR"))
+}
+
+fn train(out: &Path, steps: usize) -> Command {
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args(["train", "--data", &data("s0000_room"), "--val", &data("s0010_outdoor"), "--batch", "2"]);
+    command.args(["--patch", "64", "--every", "4", "--model", "demc-s", "--seed", "5", "--lr", "1e-3:1e-4"]);
+    command.args(["--steps", &steps.to_string()]).arg("--out").arg(out);
+    command
+}
+
+fn run(command: &mut Command) -> assert_cmd::assert::Assert {
+    assert_cmd::Command::from_std(std::mem::replace(command, Command::new("true"))).assert()
+}
+
+fn resume(out: &Path) -> Command {
+    let mut command = Command::new(cargo_bin("demc"));
+    command.arg("train").arg("--resume").arg("--out").arg(out);
+    command
+}
+
+fn tensors(out: &Path) -> Vec<Tensor> {
+    weights::read(&out.join("checkpoint.safetensors")).expect("a checkpoint").1
+}
+
+/// Steps, rates, losses and scores of the log: everything but the clock.
+fn log(out: &Path) -> Vec<String> {
+    let text = fs::read_to_string(out.join("log.csv")).expect("a log");
+    text.lines()
+        .map(|line| {
+            let cells: Vec<&str> = line.split(',').collect();
+            [&cells[..1], &cells[2..]].concat().join(",")
+        })
+        .collect()
+}
+
+#[test]
+fn a_run_leaves_its_folder_and_its_weights_denoise() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(&mut train(&out, 8)).success();
+    for name in ["config.json", "log.csv", "loss.png", "checkpoint.safetensors", "best.safetensors"] {
+        assert!(out.join(name).is_file(), "{name} is missing");
+    }
+    let rows = log(&out);
+    assert_eq!(rows[0], "step,lr,train_loss,val_relmse,val_ssim");
+    assert_eq!(rows.len(), 3, "a row every 4 of 8 steps");
+    let chart = image::open(out.join("loss.png")).expect("a chart");
+    assert_eq!((chart.width(), chart.height()), (1200, 560));
+    let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+    let images = dir.path().join("images");
+    let mut denoise = Command::new(cargo_bin("demc"));
+    denoise.args(["denoise", &input, "--out"]).arg(&images).arg("--model").arg(out.join("best.safetensors"));
+    run(&mut denoise).success();
+    assert!(images.join("s0010_outdoor_0004spp.exr").is_file());
+}
+
+#[cfg(unix)]
+#[test]
+fn a_run_stopped_by_interrupt_and_by_kill_ends_with_the_same_bits() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let (whole, cut) = (dir.path().join("whole"), dir.path().join("cut"));
+    run(&mut train(&whole, 24)).success();
+
+    // Interrupted as soon as the first row of the log is there: a checkpoint is written.
+    let mut child = train(&cut, 24).stderr(Stdio::null()).spawn().expect("demc starts");
+    wait_for(&cut.join("log.csv"));
+    let interrupt = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    assert!(interrupt.expect("kill runs").success());
+    let status = child.wait().expect("demc ends");
+    let at = log(&cut).len();
+    assert!(status.code() == Some(130) || at == log(&whole).len(), "interrupted: {status}");
+
+    // Killed without warning: what came after the last checkpoint is done again.
+    let mut child = resume(&cut).stderr(Stdio::null()).spawn().expect("demc starts");
+    std::thread::sleep(Duration::from_millis(300));
+    child.kill().expect("demc is killed");
+    child.wait().expect("demc ends");
+
+    run(&mut resume(&cut)).success();
+    assert_eq!(log(&cut), log(&whole));
+    assert_eq!(tensors(&cut), tensors(&whole));
+    let best = |out: &PathBuf| weights::read(&out.join("best.safetensors")).expect("weights").1;
+    assert_eq!(best(&cut), best(&whole));
+    // A finished run has nothing left to do.
+    run(&mut resume(&cut)).success();
+    assert_eq!(tensors(&cut), tensors(&whole));
+}
+
+fn wait_for(path: &Path) {
+    let start = Instant::now();
+    while !path.exists() {
+        assert!(start.elapsed() < Duration::from_secs(120), "{} never came", path.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn training_lowers_the_loss() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(train(&out, 60).args(["--loss", "smape"])).success();
+    let loss = |row: &String| row.split(',').nth(2).expect("a loss").parse::<f64>().expect("a number");
+    let rows = log(&out);
+    let (first, last) = (loss(&rows[1]), loss(rows.last().expect("rows")));
+    assert!(last < 0.8 * first, "the loss went from {first} to {last}");
+}
+
+#[test]
+fn a_run_begins_with_given_weights_of_the_same_network_only() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let first = dir.path().join("first");
+    run(&mut train(&first, 4)).success();
+    let best = first.join("best.safetensors");
+    run(train(&dir.path().join("second"), 4).arg("--init").arg(&best)).success();
+    let refused = dir.path().join("third");
+    run(train(&refused, 4).args(["--widths", "16,16,16,16"]).arg("--init").arg(&best))
+        .code(1)
+        .stderr(predicate::str::contains("best.safetensors").and(predicate::str::contains("--widths")));
+}
+
+#[test]
+fn refuses_what_cannot_be_trained() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    let says = |text: &'static str| predicate::str::contains(text);
+    run(train(&out, 4).args(["--model", "noisy"])).code(2).stderr(says("trainable: demc-s"));
+    run(train(&out, 4).args(["--patch", "50"])).code(2).stderr(says("multiple of 16"));
+    run(train(&out, 4).args(["--patch", "256"])).code(1).stderr(says("--patch"));
+    fs::remove_dir_all(&out).expect("the folder of the run that could not start");
+    run(train(&out, 4).args(["--val", &data("s0000_room")])).code(1).stderr(says("trained on and validated on"));
+    run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
+    run(&mut resume(&out)).code(1).stderr(says("config.json"));
+    run(&mut train(&out, 4)).success();
+    run(&mut train(&out, 4)).code(1).stderr(says("--resume"));
+}
+
+#[test]
+fn denoise_refuses_a_file_that_holds_no_network() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+    let wrong = dir.path().join("wrong.safetensors");
+    for bytes in [&b""[..], b"random bytes, no header at all", &[0xff; 64]] {
+        fs::write(&wrong, bytes).expect("a file");
+        let mut denoise = Command::new(cargo_bin("demc"));
+        denoise.args(["denoise", &input, "--model"]).arg(&wrong).arg("--out").arg(dir.path().join("out"));
+        run(&mut denoise).failure().stderr(predicate::str::contains("not a demc weights file"));
+    }
+}
