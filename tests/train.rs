@@ -145,7 +145,9 @@ fn refuses_what_cannot_be_trained() {
     run(train(&out, 4).args(["--patch", "50"])).code(2).stderr(says("multiple of 16"));
     run(train(&out, 4).args(["--patch", "256"])).code(1).stderr(says("--patch"));
     fs::remove_dir_all(&out).expect("the folder of the run that could not start");
-    run(train(&out, 4).args(["--val", &data("s0000_room")])).code(1).stderr(says("trained on and validated on"));
+    run(train(&out, 4).args(["--val", &data("s0000_room")]))
+        .code(1)
+        .stderr(says("trained on and validated on"));
     run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
     run(&mut train(&out, 4)).success();

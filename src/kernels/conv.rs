@@ -242,33 +242,27 @@ impl Kernel for Band<'_> {
         // SAFETY: `convolve` checked that every buffer has its shape's length and that the inputs'
         // borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
         unsafe {
-            match self.geometry {
-                Geometry::Same(k) => {
-                    let taps = self.taps(0..k * k, |t| {
-                        (
-                            t / k,
-                            t % k,
-                            (t / k) as isize - (k / 2) as isize,
-                            (t % k) as isize - (k / 2) as isize,
-                        )
-                    });
-                    self.rows::<S, 1>(&taps, 1, (0, 0));
-                }
-                // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
-                Geometry::Transposed => {
-                    for (py, px) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-                        let taps = self.taps(0..4, |t| {
-                            let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
-                            (ky, kx, (py as isize + 1 - ky as isize) / 2, (px as isize + 1 - kx as isize) / 2)
-                        });
-                        self.rows::<S, 1>(&taps, 2, (py, px));
+            // Every geometry goes through one of two loops: each further call site would compile all
+            // tile widths again.
+            if self.geometry == Geometry::Strided {
+                let taps = self.taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
+                self.rows::<S, 2>(&taps, 1, (0, 0));
+                return;
+            }
+            let spread = if self.geometry == Geometry::Transposed { 2 } else { 1 };
+            for (py, px) in (0..spread).flat_map(|py| (0..spread).map(move |px| (py, px))) {
+                let taps = match self.geometry {
+                    Geometry::Same(k) => {
+                        let r = (k / 2) as isize;
+                        self.taps(0..k * k, |t| (t / k, t % k, (t / k) as isize - r, (t % k) as isize - r))
                     }
-                }
-                Geometry::Strided => {
-                    let taps =
-                        self.taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
-                    self.rows::<S, 2>(&taps, 1, (0, 0));
-                }
+                    // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
+                    _ => self.taps(0..4, |t| {
+                        let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
+                        (ky, kx, (py as isize + 1 - ky as isize) / 2, (px as isize + 1 - kx as isize) / 2)
+                    }),
+                };
+                self.rows::<S, 1>(&taps, spread, (py, px));
             }
         }
     }
@@ -339,7 +333,6 @@ impl Band<'_> {
         width: usize,
         spread: usize,
     ) {
-        // A single plane leaves registers free for more pixels, which hides the latency of its FMAs.
         let tiles = width.div_ceil(S::TILE.1);
         let mut x = 0;
         for tile in 0..tiles {
@@ -347,22 +340,16 @@ impl Band<'_> {
             let args = Tile { band: self, taps, inputs, plane, output, x, spread };
             // SAFETY: `x + pixels <= width`.
             unsafe {
-                match pixels {
-                    1 => args.run::<S, STEP, 1>(),
-                    2 => args.run::<S, STEP, 2>(),
-                    3 => args.run::<S, STEP, 3>(),
-                    4 => args.run::<S, STEP, 4>(),
-                    5 => args.run::<S, STEP, 5>(),
-                    6 => args.run::<S, STEP, 6>(),
-                    7 => args.run::<S, STEP, 7>(),
-                    8 => args.run::<S, STEP, 8>(),
-                    9 => args.run::<S, STEP, 9>(),
-                    10 => args.run::<S, STEP, 10>(),
-                    11 => args.run::<S, STEP, 11>(),
-                    12 => args.run::<S, STEP, 12>(),
-                    13 => args.run::<S, STEP, 13>(),
-                    _ => args.run::<S, STEP, 14>(),
+                macro_rules! tile {
+                    ($($px:literal)*) => {
+                        match pixels {
+                            // Widths beyond the tier's tile are constant-folded away.
+                            $($px if $px <= S::TILE.1 => args.run::<S, STEP, $px>(),)*
+                            _ => unreachable!("tiles are at most TILE.1 pixels wide"),
+                        }
+                    };
                 }
+                tile!(1 2 3 4 5 6 7 8 9 10 11 12 13 14);
             }
             x += pixels;
         }

@@ -75,10 +75,10 @@ fn exp(x: f32) -> f32 {
     e * f32::from_bits(bits)
 }
 
-/// The columns of a row whose neighbour `dx` away lies inside the row.
+/// The columns of a row whose neighbour `dx` away lies inside the row; `|dx| < w`.
 #[inline(always)]
 fn columns(w: usize, dx: isize) -> (usize, usize) {
-    ((-dx).max(0) as usize, (w as isize - dx.max(0)).max(0) as usize)
+    ((-dx).max(0) as usize, (w as isize - dx.max(0)) as usize)
 }
 
 impl<'a> Filter<'a> {
@@ -99,7 +99,11 @@ impl<'a> Filter<'a> {
                 continue;
             }
             for kx in 0..self.k {
-                visit(ky * self.k + kx, row as usize, kx as isize - r);
+                let dx = kx as isize - r;
+                // A kernel wider than the image has taps that meet no pixel at all.
+                if dx.unsigned_abs() < self.size.w {
+                    visit(ky * self.k + kx, row as usize, dx);
+                }
             }
         }
     }
@@ -109,9 +113,6 @@ impl<'a> Filter<'a> {
     fn weights(&self, y: usize, tap: usize, row: usize, dx: isize, out: &mut [f32]) -> (usize, usize) {
         let Size { w, .. } = self.size;
         let (x0, x1) = columns(w, dx);
-        if x0 >= x1 {
-            return (0, 0);
-        }
         let logits = &self.logits[tap * self.size.pixels() + y * w..][x0..x1];
         let out = &mut out[x0..x1];
         match self.confidence {
