@@ -19,9 +19,13 @@ fn data(scene: &str) -> String {
 }
 
 fn train(out: &Path, steps: usize) -> Command {
+    train_with("demc-s", "64", out, steps)
+}
+
+fn train_with(model: &str, patch: &str, out: &Path, steps: usize) -> Command {
     let mut command = Command::new(cargo_bin("demc"));
     command.args(["train", "--data", &data("s0000_room"), "--val", &data("s0010_outdoor"), "--batch", "2"]);
-    command.args(["--patch", "64", "--every", "4", "--model", "demc-s", "--seed", "5", "--lr", "1e-3:1e-4"]);
+    command.args(["--patch", patch, "--every", "4", "--model", model, "--seed", "5"]);
     command.args(["--steps", &steps.to_string()]).arg("--out").arg(out);
     command
 }
@@ -116,7 +120,7 @@ fn wait_for(path: &Path) {
 fn training_lowers_the_loss() {
     let dir = tempfile::tempdir().expect("a folder");
     let out = dir.path().join("run");
-    run(train(&out, 60).args(["--loss", "smape"])).success();
+    run(train(&out, 200).args(["--loss", "smape", "--lr", "1e-3:1e-4"])).success();
     let loss = |row: &String| row.split(',').nth(2).expect("a loss").parse::<f64>().expect("a number");
     let rows = log(&out);
     let (first, last) = (loss(&rows[1]), loss(rows.last().expect("rows")));
@@ -141,9 +145,9 @@ fn refuses_what_cannot_be_trained() {
     let dir = tempfile::tempdir().expect("a folder");
     let out = dir.path().join("run");
     let says = |text: &'static str| predicate::str::contains(text);
-    run(train(&out, 4).args(["--model", "noisy"])).code(2).stderr(says("trainable: demc-s"));
-    run(train(&out, 4).args(["--patch", "50"])).code(2).stderr(says("multiple of 16"));
-    run(train(&out, 4).args(["--patch", "256"])).code(1).stderr(says("--patch"));
+    run(&mut train_with("noisy", "64", &out, 4)).code(2).stderr(says("trainable: demc-s"));
+    run(&mut train_with("demc-s", "50", &out, 4)).code(2).stderr(says("multiple of 16"));
+    run(&mut train_with("demc-s", "256", &out, 4)).code(1).stderr(says("--patch"));
     fs::remove_dir_all(&out).expect("the folder of the run that could not start");
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
         .code(1)
