@@ -26,7 +26,7 @@ impl Frame {
             return Err(Error::invalid(&self.path, format!("part {part} has no channel {bad}")));
         }
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
-        let mut planes = vec![vec![0.0f32; width * height]; channels.len()];
+        let mut planes: Vec<Vec<f32>> = Vec::new();
         let of_part: Vec<&StoredChunk> = self.chunks.iter().filter(|c| c.part == part).collect();
         for batch in of_part.chunks(BATCH) {
             let blocks: Vec<_> = batch
@@ -37,6 +37,8 @@ impl Frame {
                     Ok((block.index, values))
                 })
                 .collect::<Result<_>>()?;
+            // Only now: a damaged size fails before memory is taken for it.
+            planes.resize_with(channels.len(), || vec![0.0; width * height]);
             for (at, values) in blocks.iter().filter(|(at, _)| at.level == Vec2(0, 0)) {
                 let values: &Vec<Vec<f32>> = values;
                 for (plane, values) in planes.iter_mut().zip(values) {

@@ -3,7 +3,10 @@
 
 use std::{collections::HashMap, fs::File, io::BufReader, path::Path};
 
-use exr::block::{chunk::TileCoordinates, reader::ChunksReader};
+use exr::{
+    block::{chunk::TileCoordinates, reader::ChunksReader},
+    meta::header::Header,
+};
 
 use super::{Frame, StoredChunk};
 use crate::{Error, Result};
@@ -12,6 +15,10 @@ use crate::{Error, Result};
 const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
 /// Offset-table entry of one chunk.
 const OFFSET_BYTES: u64 = 8;
+/// Longest edge believed (Blender renders at most 65536); a damaged header may promise billions.
+const MAX_EDGE: usize = 1 << 18;
+/// Most pixels believed in one part.
+const MAX_PIXELS: usize = 1 << 31;
 
 impl Frame {
     /// Reads a file: headers and compressed chunks; nothing is decoded yet.
@@ -29,11 +36,7 @@ impl Frame {
         check_magic(&mut buffered, path, info.len())?;
 
         let reader = exr::block::read(buffered, false).map_err(|e| Self::error(path, e))?;
-        // A damaged header may promise billions of chunks: believe only what the file has room for.
-        let promised: u64 = reader.headers().iter().map(|h| h.chunk_count as u64).sum();
-        if promised.saturating_mul(OFFSET_BYTES) > info.len() {
-            return Err(truncated(path));
-        }
+        check_sizes(reader.headers(), path, info.len())?;
 
         // Where each block of each part belongs, in increasing y.
         let places: Vec<HashMap<TileCoordinates, usize>> = reader
@@ -70,6 +73,25 @@ impl Frame {
         frame.describe();
         Ok(frame)
     }
+}
+
+/// Memory is set aside as headers say: believe only what is plausible and what the file has room for.
+fn check_sizes(headers: &[Header], path: &Path, byte_len: u64) -> Result<()> {
+    for header in headers {
+        let (width, height) = (header.layer_size.width(), header.layer_size.height());
+        // Block sizes are 32-bit in the format.
+        let fits = i32::try_from(header.max_block_byte_size()).is_ok();
+        if width.max(height) > MAX_EDGE || width * height > MAX_PIXELS || !fits {
+            return Err(Error::invalid(
+                path,
+                format!(
+                    "claims {width}x{height} pixels: damaged, or too large; copy it again or render it in regions"
+                ),
+            ));
+        }
+    }
+    let chunks: u64 = headers.iter().map(|h| h.chunk_count as u64).sum();
+    if chunks.saturating_mul(OFFSET_BYTES) > byte_len { Err(truncated(path)) } else { Ok(()) }
 }
 
 fn check_magic(file: &mut BufReader<File>, path: &Path, byte_len: u64) -> Result<()> {
