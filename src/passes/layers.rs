@@ -46,11 +46,14 @@ struct Unassigned {
     full_name: String,
 }
 
+/// A view layer's name and stereo view.
+type LayerKey = (String, Option<String>);
+
 /// The view layers of a frame, in file order, once for each stereo view.
 pub fn layers(frame: &Frame) -> Vec<Layer> {
     let views = frame.views();
     // (layer, view) in file order, each with its channels by pass name.
-    let mut found: Vec<((String, Option<String>), BTreeMap<String, Vec<Unassigned>>)> = Vec::new();
+    let mut found: Vec<(LayerKey, BTreeMap<String, Vec<Unassigned>>)> = Vec::new();
     for (p, part) in frame.parts().iter().enumerate() {
         // A single part's name is the name of the file's only image, not of a pass.
         let part_name = part.name.as_deref().filter(|n| frame.is_multi_part() || n.contains('.'));
