@@ -31,6 +31,16 @@ pub trait Denoiser: Send + Sync {
     /// A pass is missing, or the method cannot run here; the message says why.
     fn denoise(&self, passes: &PassSet) -> Result<Planes>;
 
+    /// As [`Denoiser::denoise`], working on squares of at most `tile` pixels at a time where the method
+    /// can, to bound its memory; a method that cannot ignores the hint.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`].
+    fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        let _ = tile;
+        self.denoise(passes)
+    }
+
     /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
     /// reports its filter's time, without start and file traffic.
     ///

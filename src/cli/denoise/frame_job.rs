@@ -21,6 +21,8 @@ pub struct Options {
     pub view_layer: Option<String>,
     /// The layer to add; none where the beauty is replaced.
     pub layer: Option<String>,
+    /// `--tile`.
+    pub tile: Option<usize>,
     /// `--preview`.
     pub preview: bool,
 }
@@ -101,12 +103,12 @@ pub struct Denoised {
 }
 
 /// Runs the model over each view.
-pub fn denoise(loaded: Frames<PassSet>, model: &dyn Denoiser) -> Result<Frames<Denoised>> {
+pub fn denoise(loaded: Frames<PassSet>, model: &dyn Denoiser, options: &Options) -> Result<Frames<Denoised>> {
     let Frames { frame, views, mut report } = loaded;
     let mut done = Vec::with_capacity(views.len());
     for (layer, mut set) in views {
         let start = Instant::now();
-        let radiance = model.denoise(&set)?;
+        let radiance = model.denoise_tiled(&set, options.tile)?;
         report.seconds += start.elapsed().as_secs_f64();
         if (radiance.channels, radiance.width, radiance.height) != (3, set.width, set.height) {
             return Err(Error::invalid(

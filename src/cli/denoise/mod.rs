@@ -59,6 +59,10 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 
+    /// Work on squares of at most N pixels where the model can, to bound memory [default: its choice]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(16..))]
+    tile: Option<u32>,
+
     /// Write a PNG beside each result, exposed for display
     #[arg(long)]
     preview: bool,
@@ -97,6 +101,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let options = Options {
         view_layer: args.view_layer,
         layer: (!args.replace).then_some(args.layer),
+        tile: args.tile.map(|t| t as usize),
         preview: args.preview,
     };
     let mut progress = progress::Progress::new(jobs.len(), args.json);

@@ -132,7 +132,7 @@ fn denoise_all(
 ) {
     for (index, loaded) in frames {
         let input = &batch.jobs[index].input;
-        let denoised = attempt(input, || frame_job::denoise(loaded, &*batch.model));
+        let denoised = attempt(input, || frame_job::denoise(loaded, &*batch.model, &batch.options));
         if !pass_on(index, denoised, next, events) {
             return;
         }

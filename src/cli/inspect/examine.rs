@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::{
-    Result, features,
+    Result,
     frame::{Frame, Window},
     models,
     passes::{self, Layer, POSITION_AOV, Pass},
@@ -77,34 +77,17 @@ pub struct Method {
     passes: Vec<Pass>,
 }
 
-/// Methods that the user may choose.
-const NAMES: [&str; 13] = [
-    "demc-s",
-    "demc-m",
-    "demc-l",
-    "demc",
-    "demc-nofusion",
-    "semc",
-    "kpcn",
-    "nfor",
-    "lbf",
-    "oidn-fast",
-    "oidn-balanced",
-    "oidn-high",
-    "oidn-high-prefilter",
-];
-
-/// The methods that run here, with the passes they need.
+/// The networks, the classical methods and the peers, with the passes they need.
 pub fn methods() -> Vec<Method> {
-    let open = |name: &&str| {
+    let networks = models::trainable().into_iter().map(|(name, config)| {
+        // The passes follow from the architecture alone: any seed will do.
+        Method { name: name.into(), passes: models::build(&config, 0).passes().to_vec() }
+    });
+    let others = ["nfor", "lbf"].into_iter().chain(models::oidn::NAMES).filter_map(|name| {
         let model = models::open(name).ok()?;
-        Some(Method { name: (*name).into(), passes: model.passes().to_vec() })
-    };
-    let mut methods: Vec<Method> = NAMES.iter().filter_map(open).collect();
-    if !methods.iter().any(|m| m.name == "demc") {
-        methods.insert(0, Method { name: "demc".into(), passes: features::PAPER_PASSES.to_vec() });
-    }
-    methods
+        Some(Method { name: name.into(), passes: model.passes().to_vec() })
+    });
+    networks.chain(others).collect()
 }
 
 /// Reads and decodes a whole file.
