@@ -125,7 +125,7 @@ impl Args {
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
         let multiple = models::build(&network, 0).multiple();
-        if self.patch == 0 || self.patch % multiple != 0 {
+        if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
         }
         for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {

@@ -331,7 +331,7 @@ fn corners(size: Size, y: usize, x: usize) -> [(usize, f32); 4] {
     let (h, w) = (size.h / 2, size.w / 2);
     let near = |i: usize, n: usize| {
         let own = i / 2;
-        let other = if i % 2 == 0 { own.saturating_sub(1) } else { (own + 1).min(n - 1) };
+        let other = if i.is_multiple_of(2) { own.saturating_sub(1) } else { (own + 1).min(n - 1) };
         (own, other)
     };
     let ((y0, y1), (x0, x1)) = (near(y, h), near(x, w));

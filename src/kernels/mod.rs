@@ -8,6 +8,8 @@
 //! the AVX2 and AVX-512 ones, and [`simd::Tier`] chooses among them once at run time.
 //! This is the only module with `unsafe`.
 #![allow(unsafe_code)]
+// Loops over lanes and registers index several arrays at once; iterators would hide the arithmetic.
+#![allow(clippy::needless_range_loop)]
 
 pub mod conv;
 pub mod filter;

@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// The built-in weights: name and file, smallest first.
-pub const BUILT_IN: [(&str, &[u8]); 0] = [];
+pub const BUILT_IN: [(&str, &[u8]); 1] = [("demc-m", include_bytes!("weights/demc-m.safetensors"))];
 
 /// A network with its weights.
 pub struct Learned {

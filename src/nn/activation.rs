@@ -48,7 +48,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     /// # Panics
     /// If rows or columns are odd, or the length of `values` is not what `shape` demands.
     pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
-        assert!(shape.h % 2 == 0 && shape.w % 2 == 0, "only even sizes halve");
+        assert!(shape.h.is_multiple_of(2) && shape.w.is_multiple_of(2), "only even sizes halve");
         let mut data = Buffer::new(shape.with_channels(4 * shape.c).with_size(shape.h / 2, shape.w / 2));
         data.fill(Block::default());
         to_blocked_shuffled(values, 0, 2, data.view_mut());

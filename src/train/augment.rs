@@ -75,7 +75,7 @@ impl Augment {
     /// Moves pixels: flip, then turns.
     fn moved(&self, planes: &Planes) -> Planes {
         let (w, h) = (planes.width, planes.height);
-        assert!(self.turns % 2 == 0 || w == h, "only squares turn by a quarter");
+        assert!(self.turns.is_multiple_of(2) || w == h, "only squares turn by a quarter");
         let mut out = Planes::new(planes.channels, w, h);
         for c in 0..planes.channels {
             let from = planes.channel(c);
