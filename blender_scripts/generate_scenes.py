@@ -38,7 +38,7 @@ from demc_scenes.kinds import KINDS
 from demc_scenes.stage import Stage
 
 _FRAME_SIZES = ((480, 270), (480, 270), (640, 360), (960, 540), (960, 540), (1280, 720))
-_DROPPED = ("Depth.Z",)  # passes a network has no use for
+_DROPPED = ("Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
 def parse(arguments):

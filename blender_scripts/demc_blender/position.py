@@ -8,7 +8,9 @@ write nothing: behind them stands the position of the surface seen through them.
 
 Cycles writes AOVs at every transparent layer that a camera ray passes, and adds them up. The value
 is therefore multiplied by 0 where the surface is more transparent than the view layer's alpha
-threshold, which is also the rule by which Cycles picks the surface for its data passes.
+threshold, which is also the rule by which Cycles picks the surface for its data passes. Paths that
+such a surface, or haze, scatters away write nothing, so behind it the position is darkened in
+proportion, as at edges against the background.
 """
 
 import bpy
@@ -58,7 +60,7 @@ def _cover_bare_objects(edits):
             if not obj.material_slots:
                 materials = obj.data.materials
                 materials.append(default)
-                edits.on_undo(lambda materials=materials: materials.pop())
+                edits.on_undo(lambda materials=materials: materials.clear())
         except (RuntimeError, AttributeError):  # data of a linked library cannot be edited
             continue
 
@@ -105,8 +107,8 @@ def _add_to_material(edits, material, threshold, groups):
         return  # volume alone, or nothing
     build = _Builder(edits, tree)
     opacity = _opacity(build, output.inputs["Surface"], groups, 0)
-    if opacity == 0.0:
-        return
+    if isinstance(opacity, float) and opacity < threshold:
+        return  # seen through everywhere
     value = build.node("ShaderNodeNewGeometry").outputs["Position"]
     if not isinstance(opacity, float):
         solid = build.math("GREATER_THAN", opacity, threshold - 1e-4)

@@ -15,6 +15,8 @@ from demc_blender.edits import Edits
 _PROBE = 160
 _DARKEST = 1e-5
 _LEAST_DETAIL = 0.05
+# A crop of the sky alone teaches nothing: surfaces must cover this share of it.
+_COVERED = 0.4
 # A crop darker than this share of its frame's brightness shows next to nothing.
 _DARK_SHARE = 0.02
 
@@ -160,7 +162,8 @@ def crops(rng, scene, guides, count, size):
         x, y = rng.randint(0, width - size[0]), rng.randint(0, height - size[1])
         part = np.s_[int(y * scale):max(int((y + size[1]) * scale), int(y * scale) + 2), int(x * scale):max(int((x + size[0]) * scale), int(x * scale) + 2)]
         light = image[part].mean(-1)
-        if light.mean() < _DARK_SHARE * frame_level:
+        covered = (np.abs(normal[part]).max(-1) > 0.1).mean()
+        if light.mean() < _DARK_SHARE * frame_level or covered < _COVERED:
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)

@@ -1,0 +1,268 @@
+//! The Blender scripts, run for real with bpy and read back by demc.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use common::python::{self, run};
+use demc::{
+    frame::Frame,
+    passes::{self, Pass, PassSet},
+    testset,
+};
+
+fn script(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("blender_scripts").join(name)
+}
+
+fn snippet(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data").join(name)
+}
+
+/// The interpreter with bpy. Old byte code must not hide a change of the scripts, nor new byte code
+/// litter the source tree.
+fn blender() -> Command {
+    let mut command = Command::new(python::python());
+    command.env("PYTHONDONTWRITEBYTECODE", "1");
+    command
+}
+
+fn make_scene(folder: &Path) -> PathBuf {
+    let blend = folder.join("shot.blend");
+    run(blender().arg(snippet("make_scene.py")).arg(&blend));
+    blend
+}
+
+fn export(blend: &Path, out: &Path, arguments: &str) -> String {
+    let mut command = blender();
+    command.arg(script("export_passes.py")).arg(blend).arg("--out").arg(out);
+    run(command.args(arguments.split_whitespace()))
+}
+
+fn files(folder: &Path) -> Vec<String> {
+    let mut names: Vec<_> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+/// The three channels of a pass at a place of the test scene's floor, in world units.
+fn at(set: &PassSet, pass: Pass, (x, y): (f32, f32)) -> [f32; 3] {
+    let planes = set.get(pass).unwrap();
+    // The frame shows 8 units across, centred on the origin.
+    let unit = planes.width as f32 / 8.0;
+    let column = (x * unit + planes.width as f32 / 2.0) as usize;
+    let row = (planes.height as f32 / 2.0 - y * unit) as usize;
+    std::array::from_fn(|c| planes.channel(c)[row * planes.width + column])
+}
+
+fn mean_luminance(set: &PassSet) -> f32 {
+    let planes = set.get(Pass::Combined).unwrap();
+    planes.data.iter().sum::<f32>() / planes.data.len() as f32
+}
+
+#[test]
+fn exports_every_pass_with_the_averaged_position_and_resumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let blend = make_scene(folder.path());
+    let before = fs::read(&blend).unwrap();
+    let out = folder.path().join("out");
+    // 50% of 200x150 in the scene.
+    let said = export(&blend, &out, "--spp 4,8 --ref-spp 64 --half-buffers");
+    assert_eq!(said.lines().count(), 1, "one line a frame: {said}");
+    assert_eq!(
+        files(&out),
+        [
+            "shot_0004spp.exr",
+            "shot_0004spp_a.exr",
+            "shot_0004spp_b.exr",
+            "shot_0008spp.exr",
+            "shot_0008spp_a.exr",
+            "shot_0008spp_b.exr",
+            "shot_ref.exr"
+        ]
+    );
+    assert_eq!(fs::read(&blend).unwrap(), before, "the scene is never saved");
+
+    let pairs = testset::pairs(out.to_str().unwrap()).unwrap();
+    assert_eq!(pairs.iter().map(|p| p.id()).collect::<Vec<_>>(), ["shot_0004spp", "shot_0008spp"]);
+
+    let noisy = passes::load(out.join("shot_0004spp.exr"), None).unwrap();
+    assert_eq!((noisy.width, noisy.height, noisy.view_layer.as_str()), (100, 75, "Main"));
+    for pass in [
+        Pass::Combined,
+        Pass::Alpha,
+        Pass::Normal,
+        Pass::Position,
+        Pass::DiffuseColor,
+        Pass::GlossyColor,
+        Pass::TransmissionColor,
+        Pass::DenoisingNormal,
+        Pass::DenoisingAlbedo,
+    ] {
+        assert!(noisy.get(pass).is_some(), "{pass}");
+    }
+    let stored: Vec<_> =
+        Frame::read(out.join("shot_0004spp.exr")).unwrap().parts().iter().map(|p| p.name.clone()).collect();
+    assert!(stored.iter().flatten().any(|name| name.ends_with("DEMC Position")), "{stored:?}");
+
+    // What the camera sees, and at which height: see make_scene.py.
+    for (place, height, what) in [
+        ((0.0, 0.0), 0.0, "floor"),
+        ((-2.0, -1.5), 1.0, "cube without a material"),
+        ((2.0, -1.5), 0.0, "floor behind a clear leaf"),
+        ((2.0, 1.5), 1.0, "card that a node group makes 0.9 opaque"),
+        ((-2.0, 1.5), 0.0, "floor behind a card that it makes 0.3 opaque"),
+    ] {
+        let position = at(&noisy, Pass::Position, place);
+        for (got, expected) in position.iter().zip([place.0, place.1, height]) {
+            assert!((got - expected).abs() < 0.1, "{what}: {position:?}");
+        }
+    }
+
+    let reference = passes::load(out.join("shot_ref.exr"), None).unwrap();
+    assert_eq!((reference.width, reference.height), (100, 75));
+    assert!(reference.get(Pass::Normal).is_none(), "references hold Combined alone");
+    same_picture(&noisy, &reference);
+    // Half buffers are noisy apart, and neither repeats the noisy frame.
+    let [a, b] =
+        ["a", "b"].map(|half| passes::load(out.join(format!("shot_0004spp_{half}.exr")), None).unwrap());
+    assert_ne!(a.get(Pass::Combined), b.get(Pass::Combined));
+    assert_ne!(a.get(Pass::Combined), noisy.get(Pass::Combined));
+
+    // A finished file is left alone, a missing one is made again.
+    let path = out.join("shot_0004spp.exr");
+    fs::write(&path, "finished").unwrap();
+    fs::remove_file(out.join("shot_0008spp.exr")).unwrap();
+    let said = export(&blend, &out, "--spp 4,8 --ref-spp 64 --half-buffers");
+    assert!(said.contains("4 spp is there") && said.contains("reference is there"), "{said}");
+    assert_eq!(fs::read_to_string(&path).unwrap(), "finished");
+    assert!(out.join("shot_0008spp.exr").exists());
+}
+
+/// Noisy and clean frames show the same textures at the same places.
+fn same_picture(noisy: &PassSet, reference: &PassSet) {
+    let (a, b) = (noisy.get(Pass::Combined).unwrap(), reference.get(Pass::Combined).unwrap());
+    let error = demc::metrics::error::relmse(a, b);
+    assert!(error < 0.1, "RelMSE {error}");
+    let (a, b) = (mean_luminance(noisy), mean_luminance(reference));
+    assert!(b > 0.05 && (a / b - 1.0).abs() < 0.05, "mean {a} and {b}");
+}
+
+#[test]
+fn exports_a_region_of_a_frame_range_and_puts_the_scene_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let blend = make_scene(folder.path());
+    let out = folder.path().join("out");
+    let said = export(
+        &blend,
+        &out,
+        "--frames 7-8 --spp 1 --ref-spp 2 --resolution 96x72 --region 60,54,30,18 --view-layer Second --name crop",
+    );
+    assert_eq!(said.lines().count(), 2, "{said}");
+    assert_eq!(
+        files(&out),
+        ["crop_0001spp.0007.exr", "crop_0001spp.0008.exr", "crop_ref.0007.exr", "crop_ref.0008.exr"]
+    );
+    let crop = passes::load(out.join("crop_0001spp.0007.exr"), None).unwrap();
+    assert_eq!((crop.width, crop.height, crop.view_layer.as_str()), (30, 18, "Second"));
+    // Its first pixel is column 60, row 54 of the whole frame: 12 pixels a unit from the middle.
+    let position: Vec<f32> = (0..2).map(|c| crop.get(Pass::Position).unwrap().channel(c)[0]).collect();
+    assert!(
+        (position[0] - 12.5 / 12.0).abs() < 0.06 && (position[1] + 18.5 / 12.0).abs() < 0.06,
+        "{position:?}"
+    );
+    let next = passes::load(out.join("crop_0001spp.0008.exr"), None).unwrap();
+    assert_ne!(crop.get(Pass::Combined), next.get(Pass::Combined), "noise differs from frame to frame");
+
+    let said = run(blender()
+        .arg(snippet("leaves_no_trace.py"))
+        .arg(script(""))
+        .arg(&blend)
+        .arg(folder.path().join("open")));
+    assert!(said.lines().any(|line| line.trim() == "changed: []"), "{said}");
+}
+
+#[test]
+fn names_what_is_wrong_in_one_line_and_fails() {
+    let folder = tempfile::tempdir().unwrap();
+    let blend = make_scene(folder.path());
+    let missing = folder.path().join("missing.blend");
+    for (scene, arguments, expected) in [
+        (&missing, "", "no such file"),
+        (&blend, "--view-layer Third", "it has Main, Second"),
+        (&blend, "--region 90,0,20,20", "leaves the frame of 100x75"),
+    ] {
+        let mut command = blender();
+        command.arg(script("export_passes.py")).arg(scene).arg("--out").arg(folder.path());
+        let output = command.args(arguments.split_whitespace()).output().unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        let errors: Vec<_> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
+        assert!(errors.len() == 1 && errors[0].contains(expected), "{stderr}");
+    }
+    assert!(!files(folder.path()).iter().any(|name| name.ends_with(".exr")));
+}
+
+fn generate(out: &Path, arguments: &str) -> String {
+    let mut command = blender();
+    command.arg(script("generate_scenes.py")).arg("--out").arg(out);
+    run(command.args(arguments.split_whitespace()))
+}
+
+#[test]
+fn generates_the_same_pixels_for_the_same_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (folder.path().join("first"), folder.path().join("second"));
+    let arguments =
+        "--seeds 3:5 --kinds materials,glass --size 40 --crops 2 --spp 2 --noisy-seeds 2 --ref-spp 16";
+    let said = generate(&first, arguments);
+    assert_eq!(said.lines().count(), 2, "a line a scene: {said}");
+    generate(&second, arguments);
+    let names = files(&first);
+    assert_eq!(names, files(&second));
+    let images: Vec<_> = names.iter().filter(|name| name.ends_with(".exr")).collect();
+    assert_eq!(images.len(), 2 * 2 * 3, "{names:?}");
+    for name in images {
+        assert_eq!(fs::read(first.join(name)).unwrap(), fs::read(second.join(name)).unwrap(), "{name}");
+    }
+
+    // The folder holds a pair a crop; the manifest knows the second noisy render of each too.
+    let pairs = testset::pairs(first.to_str().unwrap()).unwrap();
+    assert_eq!(pairs.len(), 4);
+    assert_eq!(testset::pairs(first.join("manifest.csv").to_str().unwrap()).unwrap().len(), 8);
+    for pair in &pairs {
+        let noisy = passes::load(&pair.noisy, None).unwrap();
+        let reference = passes::load(&pair.reference, None).unwrap();
+        assert_eq!((noisy.width, noisy.height), (40, 40));
+        assert!(noisy.get(Pass::Position).is_some() && noisy.get(Pass::DenoisingAlbedo).is_some());
+        // What was rendered shows something, and both show the same.
+        let (a, b) = (mean_luminance(&noisy), mean_luminance(&reference));
+        assert!(b > 1e-3 && (0.4..2.5).contains(&(a / b)), "{}: mean {a} and {b}", pair.id());
+        assert_eq!(noisy.get(Pass::Combined).unwrap().non_finite(), 0);
+    }
+
+    let said = generate(&first, arguments);
+    assert!(said.lines().all(|line| line.ends_with("is there")), "{said}");
+    let stop = folder.path().join("stop");
+    fs::write(&stop, "").unwrap();
+    let said = generate(&first, &format!("--seeds 9 --stop-file {}", stop.display()));
+    assert!(said.starts_with("stopped"), "{said}");
+}
+
+#[test]
+fn builds_every_kind_of_scene_without_assets() {
+    let said = run(blender().arg(snippet("every_kind.py")).arg(script("")));
+    let kinds: Vec<_> = said.lines().filter_map(|line| line.strip_prefix("KIND ")).collect();
+    assert_eq!(kinds.len(), 10, "{said}");
+    for kind in kinds {
+        let meshes: usize = kind.rsplit(' ').next().unwrap().parse().unwrap();
+        assert!(meshes >= 3, "{kind}");
+    }
+}
