@@ -186,13 +186,16 @@ pub fn pad_to_multiple(planes: &Planes, multiple: usize) -> Planes {
     out
 }
 
-/// The top-left `width` x `height` pixels: undoes [`pad_to_multiple`].
-pub fn crop(planes: &Planes, width: usize, height: usize) -> Planes {
+/// A rectangle of pixels, from column `x` and row `y`: undoes [`pad_to_multiple`] and cuts tiles.
+///
+/// # Panics
+/// If the rectangle leaves the planes.
+pub fn window(planes: &Planes, (x, y): (usize, usize), (width, height): (usize, usize)) -> Planes {
     let mut out = Planes::new(planes.channels, width, height);
     for c in 0..planes.channels {
         let from = planes.channel(c);
-        for (y, row) in out.channel_mut(c).chunks_mut(width).enumerate() {
-            row.copy_from_slice(&from[y * planes.width..][..width]);
+        for (row, out) in out.channel_mut(c).chunks_mut(width).enumerate() {
+            out.copy_from_slice(&from[(y + row) * planes.width + x..][..width]);
         }
     }
     out
@@ -222,11 +225,11 @@ mod tests {
     }
 
     #[test]
-    fn padding_repeats_the_edge_and_crop_undoes_it() {
+    fn padding_repeats_the_edge_and_a_window_undoes_it() {
         let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
         let padded = pad_to_multiple(&planes, 4);
         assert_eq!((padded.width, padded.height), (4, 4));
         assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
-        assert_eq!(crop(&padded, 3, 1), planes);
+        assert_eq!(window(&padded, (0, 0), (3, 1)), planes);
     }
 }

@@ -64,9 +64,28 @@ fn every_network_takes_every_size_from_one_pixel_up() {
     for (name, config) in models::trainable() {
         let network = models::build(&config, 1);
         for (width, height) in [(1, 1), (3, 1), (1, 7), (33, 17)] {
-            let image = run(&*network, &random_passes(width, height, 4)).expect("all passes are there");
+            let image = run(&*network, &random_passes(width, height, 4), None).expect("all passes are there");
             assert_eq!((image.channels, image.width, image.height), (3, width, height), "{name}");
             assert_eq!(image.non_finite(), 0, "{name} at {width}x{height}");
+        }
+    }
+}
+
+#[test]
+fn tiles_give_the_same_bits_as_the_whole_frame() {
+    for name in ["demc-s", "demc"] {
+        let mut config =
+            models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
+        config.widths.fill(8);
+        let network = models::build(&config, 1);
+        let passes = random_passes(1300, 40, 11);
+        let whole = run(&*network, &passes, Some(4096)).expect("all passes are there");
+        for tile in [100, 333] {
+            assert!(2 * network.reach() + tile < 1300, "no tile sees the whole frame");
+            assert!(
+                run(&*network, &passes, Some(tile)).expect("all passes are there") == whole,
+                "{name}, {tile}"
+            );
         }
     }
 }
@@ -78,7 +97,7 @@ fn a_missing_pass_is_named() {
         for &missing in network.passes() {
             let mut passes = random_passes(16, 16, 4);
             passes.remove(missing);
-            let error = run(&*network, &passes).expect_err("a pass is missing").to_string();
+            let error = run(&*network, &passes, None).expect_err("a pass is missing").to_string();
             assert!(error.contains(&missing.to_string()) && error.contains("random.exr"), "{name}: {error}");
         }
     }
@@ -89,14 +108,14 @@ fn the_kernel_predicting_network_scales_with_its_input() {
     let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-s").expect("it is trainable").1;
     let network = models::build(&config, 1);
     let passes = random_passes(40, 24, 9);
-    let base = run(&*network, &passes).expect("all passes are there");
+    let base = run(&*network, &passes, None).expect("all passes are there");
     for stops in [-8, -3, 5, 8] {
         let factor = 2f32.powi(stops);
         let mut scaled = passes.clone();
         let mut radiance = passes.get(Pass::Combined).expect("it is there").clone();
         radiance.data.iter_mut().for_each(|v| *v *= factor);
         scaled.insert(Pass::Combined, radiance);
-        let image = run(&*network, &scaled).expect("all passes are there");
+        let image = run(&*network, &scaled, None).expect("all passes are there");
         for (a, b) in image.data.iter().zip(&base.data) {
             assert!((a / factor - b).abs() <= 0.01 * b.abs(), "2^{stops}: {a} for {b}");
         }
@@ -116,6 +135,6 @@ fn a_constant_image_stays_as_it_is() {
     let network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 4);
-    let image = run(&*network, &passes).expect("all passes are there");
+    let image = run(&*network, &passes, None).expect("all passes are there");
     assert!(image.data.iter().all(|v| (v - 0.7).abs() < 1e-4), "{:?}", &image.data[..8]);
 }

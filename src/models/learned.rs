@@ -58,6 +58,10 @@ impl Denoiser for Learned {
     }
 
     fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        network::run(&*self.network, passes)
+        network::run(&*self.network, passes, None)
+    }
+
+    fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        network::run(&*self.network, passes, tile)
     }
 }

@@ -5,9 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Result,
-    features::{Inputs, crop, pad_to_multiple},
+    features::{Inputs, pad_to_multiple, window},
     kernels::Shape,
-    nn::{BatchNorm, Images, Param, Stats},
+    nn::{BatchNorm, Images, Param, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -107,18 +107,52 @@ pub trait Network: Send + Sync {
     fn duplicate(&self) -> Box<dyn Network>;
 }
 
-/// Denoised radiance of a whole frame, (3, H, W).
+/// Frames of more pixels than this are worked on in tiles of [`DEFAULT_TILE`] unless told otherwise:
+/// activations of an 8K frame would take more memory than a workstation has.
+const WHOLE_FRAME_PIXELS: usize = 8 << 20;
+
+/// Rows and columns of a tile, without the border that its pixels see.
+const DEFAULT_TILE: usize = 2048;
+
+/// Denoised radiance of a frame, (3, H, W), at once or in tiles of `tile` rows and columns. Every tile
+/// sees as far beyond its edge as the network reaches, so the result is the same, bit for bit.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn run(network: &dyn Network, passes: &PassSet) -> Result<Planes> {
+pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    let multiple = network.multiple();
     let mut inputs = network.inputs(passes)?;
     for planes in &mut inputs.planes {
-        *planes = pad_to_multiple(planes, network.multiple());
+        *planes = pad_to_multiple(planes, multiple);
     }
-    let images = network.forward(&stack(std::slice::from_ref(&inputs)), &mut Stats::Running);
     let (width, height) = (inputs.planes[0].width, inputs.planes[0].height);
-    let mut values = images.as_vec();
-    values.iter_mut().for_each(|v| *v *= inputs.scale);
-    Ok(crop(&Planes::from_vec(3, width, height, values), passes.width, passes.height))
+    let default = if width * height > WHOLE_FRAME_PIXELS { DEFAULT_TILE } else { width.max(height) };
+    let tile = tile.unwrap_or(default).next_multiple_of(multiple);
+    let reach = network.reach().next_multiple_of(multiple);
+    let mut image = Planes::new(3, width, height);
+    let mut last_seen = None;
+    for y in (0..height).step_by(tile) {
+        for x in (0..width).step_by(tile) {
+            // The tile, and what it sees: both clipped to the frame.
+            let size = (tile.min(width - x), tile.min(height - y));
+            let (x0, y0) = (x.saturating_sub(reach), y.saturating_sub(reach));
+            let seen = ((x + size.0 + reach).min(width) - x0, (y + size.1 + reach).min(height) - y0);
+            // Buffers of another size would only pile up.
+            if last_seen.replace(seen).is_some_and(|last| last != seen) {
+                clear_buffers();
+            }
+            let part = inputs.planes.iter().map(|planes| window(planes, (x0, y0), seen)).collect::<Vec<_>>();
+            let batch = stack(&[Inputs { planes: part, scale: inputs.scale }]);
+            let output = network.forward(&batch, &mut Stats::Running).as_vec();
+            let output = Planes::from_vec(3, seen.0, seen.1, output);
+            for c in 0..3 {
+                for row in 0..size.1 {
+                    let from = &output.channel(c)[(y - y0 + row) * seen.0 + x - x0..][..size.0];
+                    let into = &mut image.channel_mut(c)[(y + row) * width + x..][..size.0];
+                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * inputs.scale);
+                }
+            }
+        }
+    }
+    Ok(window(&image, (0, 0), (passes.width, passes.height)))
 }

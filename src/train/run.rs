@@ -214,7 +214,7 @@ fn validate(network: &dyn Network, frames: &Dataset) -> Result<Option<(f64, Opti
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
     for index in 0..frames.len() {
         let (name, sample) = frames.frame(index);
-        let image = models::network::run(network, &sample.passes)?;
+        let image = models::network::run(network, &sample.passes, None)?;
         let (image, reference) = (&image, &sample.reference);
         if image.non_finite() > 0 {
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
