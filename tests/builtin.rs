@@ -1,0 +1,266 @@
+//! The built-in model as its users get it: through the binary, on a render it never saw.
+//!
+//! What is demanded are properties of a denoiser (nearer the reference, the scale of its input, no
+//! value that is not finite), never numbers of one set of weights.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use assert_cmd::Command;
+use common::files::{bits, read_exr, values};
+use demc::{
+    metrics,
+    models::{self, learned},
+    passes::{self, Pass, PassSet},
+    planes::Planes,
+};
+use predicates::{prelude::*, str::contains};
+use tempfile::TempDir;
+
+fn example(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example").join(name)
+}
+
+/// The README's command.
+fn demc(input: &Path, out: &Path) -> Command {
+    let mut command = Command::cargo_bin("demc").unwrap();
+    command.arg("denoise").arg(input).arg("--out").arg(out);
+    command
+}
+
+/// A folder with one input, and the output folder in it.
+struct Job {
+    _dir: TempDir,
+    input: PathBuf,
+    out: PathBuf,
+}
+
+impl Job {
+    fn new(passes: &PassSet) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let input = dir.path().join("in.exr");
+        write(&input, passes);
+        Self { input, out: dir.path().join("out"), _dir: dir }
+    }
+
+    fn command(&self) -> Command {
+        demc(&self.input, &self.out)
+    }
+
+    fn denoised(&self) -> Planes {
+        denoised(&self.out.join("in.exr"))
+    }
+}
+
+/// Denoises passes.
+fn denoise(passes: &PassSet) -> Planes {
+    let job = Job::new(passes);
+    job.command().assert().success().stderr("");
+    job.denoised()
+}
+
+/// The layer that a denoised file gained.
+fn denoised(path: &Path) -> Planes {
+    let image = read_exr(path);
+    let data = ["R", "G", "B"].map(|c| values(&image, &format!("ViewLayer.Denoised.{c}"))).concat();
+    let size = image.layer_data.last().unwrap().size;
+    Planes::from_vec(3, size.width(), size.height(), data)
+}
+
+/// What the model reads, and no more, in 32-bit floats and one part.
+fn write(path: &Path, passes: &PassSet) {
+    use exr::prelude::*;
+    let mut list = Vec::new();
+    for (pass, components) in [
+        (Pass::Combined, ["R", "G", "B"]),
+        (Pass::DenoisingNormal, ["X", "Y", "Z"]),
+        (Pass::DenoisingAlbedo, ["R", "G", "B"]),
+    ] {
+        let planes = passes.get(pass).unwrap();
+        for (c, component) in components.iter().enumerate() {
+            let samples = FlatSamples::F32(planes.channel(c).to_vec());
+            list.push(AnyChannel::new(format!("ViewLayer.{pass}.{component}").as_str(), samples));
+        }
+    }
+    let layer = Layer::new(
+        (passes.width, passes.height),
+        LayerAttributes::default(),
+        Encoding::SMALL_LOSSLESS,
+        AnyChannels::sort(list.into_iter().collect()),
+    );
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}
+
+fn crop(planes: &Planes, x: usize, y: usize, width: usize, height: usize) -> Planes {
+    let mut data = Vec::with_capacity(planes.channels * width * height);
+    for c in 0..planes.channels {
+        for row in y..y + height {
+            data.extend_from_slice(&planes.channel(c)[row * planes.width + x..][..width]);
+        }
+    }
+    Planes::from_vec(planes.channels, width, height, data)
+}
+
+/// The passes of a window of the example, from column 150 and row 60.
+fn window(width: usize, height: usize) -> PassSet {
+    let whole = passes::load(example("house_0004spp.exr"), None).unwrap();
+    let mut set = PassSet::new("window", "ViewLayer", width, height);
+    for (pass, planes) in whole.iter() {
+        set.insert(pass, crop(planes, 150, 60, width, height));
+    }
+    set
+}
+
+fn edit(set: &mut PassSet, pass: Pass, change: impl FnOnce(&mut [f32])) {
+    let mut planes = set.remove(pass).unwrap();
+    change(&mut planes.data);
+    set.insert(pass, planes);
+}
+
+#[test]
+fn the_readme_s_command_denoises_and_keeps_every_layer() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = example("house_0004spp.exr");
+    demc(&input, dir.path()).assert().success().stderr("");
+    let output = dir.path().join("house_0004spp.exr");
+
+    let (before, after) = (read_exr(&input), read_exr(&output));
+    assert_eq!(before.attributes, after.attributes);
+    assert_eq!(before.layer_data.len() + 1, after.layer_data.len());
+    for (old, new) in before.layer_data.iter().zip(&after.layer_data) {
+        assert_eq!((old.size, &old.attributes, &old.encoding), (new.size, &new.attributes, &new.encoding));
+        for (was, is) in old.channel_data.list.iter().zip(&new.channel_data.list) {
+            assert_eq!((&was.name, bits(&was.sample_data)), (&is.name, bits(&is.sample_data)));
+        }
+    }
+    let alpha = |layer: &str| values(&after, &format!("ViewLayer.{layer}.A"));
+    assert_eq!(alpha("Denoised"), alpha("Combined"));
+
+    let radiance = |path: &Path| passes::load(path, None).unwrap().remove(Pass::Combined).unwrap();
+    let reference = radiance(&example("house_ref.exr"));
+    let noisy = metrics::score(&radiance(&input), &reference).unwrap();
+    let clean = metrics::score(&denoised(&output), &reference).unwrap();
+    assert!(clean.relmse < 0.5 * noisy.relmse, "RelMSE {} of {} noisy", clean.relmse, noisy.relmse);
+    assert!(clean.ssim.unwrap() > noisy.ssim.unwrap(), "SSIM {:?} of {:?} noisy", clean.ssim, noisy.ssim);
+    assert!(clean.flip.unwrap() < noisy.flip.unwrap(), "FLIP {:?} of {:?} noisy", clean.flip, noisy.flip);
+}
+
+#[test]
+fn nan_and_infinity_in_any_pass_are_reported_and_never_spread() {
+    const SIZE: (usize, usize) = (96, 64);
+    let clean = window(SIZE.0, SIZE.1);
+    let mut broken = clean.clone();
+    let pixels = SIZE.0 * SIZE.1;
+    edit(&mut broken, Pass::Combined, |v| {
+        v[700] = f32::NAN;
+        v[pixels + 700] = f32::INFINITY;
+        v[2 * pixels + 3100] = f32::NEG_INFINITY;
+    });
+    edit(&mut broken, Pass::DenoisingAlbedo, |v| {
+        v[0] = f32::NAN;
+        v[pixels + 4000] = f32::INFINITY;
+    });
+    edit(&mut broken, Pass::DenoisingNormal, |v| {
+        v[pixels - 1] = f32::NAN;
+        v[2 * pixels + 2000] = f32::INFINITY;
+        v[2 * pixels + 2001] = f32::INFINITY;
+        v[2 * pixels + 2002] = f32::NEG_INFINITY;
+    });
+    let job = Job::new(&broken);
+    job.command()
+        .assert()
+        .success()
+        .stderr(contains("3 in Combined").and(contains("2 in Denoising Albedo")))
+        .stderr(contains("4 in Denoising Normal"));
+    let result = job.denoised();
+    assert_eq!(result.non_finite(), 0);
+    // Nine values of 55296 were guessed: the rest of the image must look as it would have.
+    let expected = denoise(&clean);
+    let near = |(a, b): &(&f32, &f32)| (*a - *b).abs() <= 0.02 * b.abs();
+    let same = result.data.iter().zip(&expected.data).filter(near).count();
+    assert!(same * 100 > 95 * result.data.len(), "{same} of {} values as before", result.data.len());
+
+    let json = job.command().args(["--json", "--overwrite"]).assert().success();
+    let line: serde_json::Value = serde_json::from_slice(&json.get_output().stdout).unwrap();
+    let counts = serde_json::json!({"Combined": 3, "Denoising Albedo": 2, "Denoising Normal": 4});
+    assert_eq!(line["non_finite"], counts);
+}
+
+#[test]
+fn passes_without_a_single_number_still_make_a_finite_image() {
+    for pass in [Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+        let mut broken = window(40, 24);
+        edit(&mut broken, pass, |v| v.fill(f32::NAN));
+        let job = Job::new(&broken);
+        job.command().assert().success().stderr(contains(format!("2880 in {pass}")));
+        assert_eq!(job.denoised().non_finite(), 0, "{pass}");
+    }
+}
+
+#[test]
+fn radiance_256_times_darker_or_brighter_is_denoised_alike() {
+    let plain = window(160, 96);
+    let expected = denoise(&plain);
+    for stops in [-8, 8] {
+        let factor = 2f32.powi(stops);
+        let mut scaled = plain.clone();
+        edit(&mut scaled, Pass::Combined, |v| v.iter_mut().for_each(|v| *v *= factor));
+        for (got, want) in denoise(&scaled).data.iter().zip(&expected.data) {
+            assert!((got / factor - want).abs() <= 0.01 * want.abs(), "2^{stops}: {got} for {want}");
+        }
+    }
+}
+
+#[test]
+fn frames_of_a_few_pixels() {
+    for (width, height) in [(1, 1), (2, 3), (17, 5)] {
+        let small = window(width, height);
+        let image = denoise(&small);
+        assert_eq!((image.width, image.height, image.non_finite()), (width, height, 0));
+        let noisy = small.get(Pass::Combined).unwrap();
+        let mean = |p: &Planes| p.data.iter().sum::<f32>() / p.data.len() as f32;
+        let (before, after) = (mean(noisy), mean(&image));
+        assert!(
+            before > 0.0 && (0.5..2.0).contains(&(after / before)),
+            "{width}x{height}: {before}, {after}"
+        );
+        if width * height == 1 {
+            // A pixel has no neighbour but itself.
+            for (got, want) in image.data.iter().zip(&noisy.data) {
+                assert!((got - want).abs() <= 1e-3 * want, "{got} for {want}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_a_bit() {
+    let job = Job::new(&window(130, 70));
+    let bytes = |threads: &str| {
+        job.command().args(["--overwrite", "--threads", threads]).assert().success();
+        fs::read(job.out.join("in.exr")).unwrap()
+    };
+    let one = bytes("1");
+    for threads in ["2", "5"] {
+        assert!(one == bytes(threads), "{threads} threads give other bytes than one");
+    }
+}
+
+#[test]
+fn every_built_in_weights_file_is_sound_and_small() {
+    assert!(learned::BUILT_IN.iter().any(|(name, _)| *name == "demc-m"), "the default model");
+    for (name, bytes) in learned::BUILT_IN {
+        assert!(bytes.len() < 5_000_000, "{name}: {} bytes", bytes.len());
+        let mut model = learned::Learned::built_in(name).unwrap();
+        let expected = models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
+        assert_eq!(model.metadata.network, expected, "{name}");
+        for param in model.network().params() {
+            assert!(param.values().iter().all(|v| v.is_finite()), "{name}: {}", param.name);
+        }
+        models::open(name).unwrap();
+    }
+}

@@ -1,0 +1,284 @@
+//! Every layer against JAX: outputs, and gradients with respect to inputs and parameters.
+//!
+//! `data/layers.safetensors` holds what `data/make_layers.py` computed in float64; what may differ is
+//! the rounding of f32 alone.
+
+use demc::{
+    kernels::Shape,
+    models::network::Taped,
+    nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
+};
+use dfdx::{
+    shapes::{HasShape, Rank0},
+    tensor::{Cpu, Gradients, NoneTape, TensorFromVec, Trace},
+    tensor_ops::{Backward, SumTo},
+};
+use safetensors::SafeTensors;
+
+/// How far a value may be off, relative to the largest magnitude in its array.
+const TOLERANCE: f64 = 1e-5;
+
+/// The arrays of one case.
+struct Case {
+    name: &'static str,
+    file: SafeTensors<'static>,
+}
+
+impl Case {
+    fn new(name: &'static str) -> Self {
+        let file = SafeTensors::deserialize(include_bytes!("data/layers.safetensors")).unwrap();
+        Self { name, file }
+    }
+
+    fn array(&self, key: &str) -> (Vec<usize>, Vec<f32>) {
+        let name = format!("{}/{key}", self.name);
+        let view = self.file.tensor(&name).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let values = view.data().chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
+        (view.shape().into(), values.collect())
+    }
+
+    fn values(&self, key: &str) -> Vec<f32> {
+        self.array(key).1
+    }
+
+    fn has(&self, key: &str) -> bool {
+        self.file.tensor(&format!("{}/{key}", self.name)).is_ok()
+    }
+
+    /// An argument as (N, C, H, W).
+    fn images(&self, key: &str) -> Images {
+        let (shape, values) = self.array(key);
+        let [n, c, h, w] = shape[..] else { panic!("{}/{key} has shape {shape:?}", self.name) };
+        Cpu::default().tensor_from_vec(values, (n, c, h, w))
+    }
+
+    #[track_caller]
+    fn compare(&self, key: &str, got: &[f32]) {
+        let want = self.values(key);
+        assert_eq!(got.len(), want.len(), "{}/{key}", self.name);
+        let largest = want.iter().fold(0.0, |m: f64, w| m.max(f64::from(w.abs())));
+        assert!(largest > 0.01, "{}/{key} is as good as zero", self.name);
+        for (i, (g, w)) in got.iter().zip(&want).enumerate() {
+            let error = (f64::from(*g) - f64::from(*w)).abs() / largest;
+            assert!(error <= TOLERANCE, "{}/{key}[{i}]: {g}, by JAX {w}: {error:.1e}", self.name);
+        }
+    }
+
+    /// Compares the output with `y`; returns the gradients of `sum(r * output)`.
+    #[track_caller]
+    fn project(&self, output: Images<Taped>) -> Gradients<f32, Cpu> {
+        let shape = self.array("y").0;
+        let &(n, c, h, w) = output.shape();
+        assert_eq!([n, c, h, w], shape[..], "{}", self.name);
+        self.compare("y", &output.as_vec());
+        (output * self.images("r")).sum::<Rank0, _>().backward()
+    }
+
+    #[track_caller]
+    fn compare_image(&self, key: &str, gradients: &Gradients<f32, Cpu>, image: &Images) {
+        self.compare(key, &gradients.get(image).as_vec());
+    }
+
+    #[track_caller]
+    fn compare_param(&self, key: &str, gradients: &Gradients<f32, Cpu>, param: &Param) {
+        self.compare(key, &gradients.get(&param.tensor).as_vec());
+    }
+}
+
+fn traced(images: &Images) -> Activation<Taped> {
+    Activation::from_images(images.leaky_trace())
+}
+
+/// A field whose gradient arrives at `images`.
+fn traced_field(images: &Images) -> Field<Taped> {
+    Field::from_activation(traced(images), 0, images.shape().1, 1)
+}
+
+/// Outputs and gradients of a convolution, on the tape and off it.
+#[track_caller]
+fn check_conv(name: &'static str, mut conv: Conv, sources: &[&str]) {
+    let case = Case::new(name);
+    conv.weight.set(&case.values("weight"));
+    conv.bias.set(&case.values("bias"));
+    assert_eq!(conv.weight.shape, case.array("weight").0, "{name}");
+    let inputs: Vec<Images> = sources.iter().map(|s| case.images(s)).collect();
+    let plain = inputs.iter().map(|i| Activation::<NoneTape>::from_images(i.clone())).collect();
+    case.compare("y", &conv.forward(plain).into_images().as_vec());
+    let gradients = case.project(conv.forward(inputs.iter().map(traced).collect()).into_images());
+    for (source, input) in sources.iter().zip(&inputs) {
+        case.compare_image(&format!("d_{source}"), &gradients, input);
+    }
+    case.compare_param("d_weight", &gradients, &conv.weight);
+    case.compare_param("d_bias", &gradients, &conv.bias);
+}
+
+fn same(inputs: &[usize], outputs: usize, k: usize) -> Conv {
+    Conv::new(&mut Rng::new(1, 1), "c", inputs, outputs, k, Init::Xavier)
+}
+
+#[test]
+fn convolution_3x3() {
+    check_conv("conv3x3", same(&[5], 18, 3).linear(), &["x0"]);
+    check_conv("conv3x3_relu", same(&[5], 18, 3), &["x0"]);
+}
+
+#[test]
+fn convolution_3x3_of_two_sources() {
+    check_conv("conv3x3_of_two", same(&[17, 3], 4, 3).linear(), &["x0", "x1"]);
+    check_conv("conv3x3_of_two_relu", same(&[17, 3], 4, 3), &["x0", "x1"]);
+}
+
+#[test]
+fn fusion_1x1_of_three_sources() {
+    check_conv("fusion", same(&[17, 3, 2], 17, 1).linear(), &["x0", "x1", "x2"]);
+    check_conv("fusion_relu", same(&[17, 3, 2], 17, 1), &["x0", "x1", "x2"]);
+}
+
+#[test]
+fn transposed_convolution() {
+    let conv = Conv::transposed(&mut Rng::new(1, 1), "t", 18, 5);
+    check_conv("transposed", conv.clone().linear(), &["x"]);
+    check_conv("transposed_relu", conv, &["x"]);
+}
+
+/// One activation read twice: its gradient is the sum of what both readers send back.
+#[test]
+fn gradients_of_two_readers_add_up() {
+    let case = Case::new("conv3x3");
+    let mut conv = same(&[5], 18, 3).linear();
+    conv.weight.set(&case.values("weight"));
+    conv.bias.set(&case.values("bias"));
+    let input = case.images("x0");
+    let first = traced(&input);
+    let second = first.fork();
+    let output = conv.forward(vec![first]).into_images() + conv.forward(vec![second]).into_images();
+    let gradients = (output * case.images("r")).sum::<Rank0, _>().backward();
+    let half = |values: Vec<f32>| values.into_iter().map(|v| 0.5 * v).collect::<Vec<f32>>();
+    case.compare("d_x0", &half(gradients.get(&input).as_vec()));
+    case.compare("d_weight", &half(gradients.get(&conv.weight.tensor).as_vec()));
+    case.compare("d_bias", &half(gradients.get(&conv.bias.tensor).as_vec()));
+}
+
+#[test]
+fn max_pool() {
+    let case = Case::new("max_pool");
+    let input = case.images("x");
+    let gradients = case.project(MaxPool.forward(traced(&input)).into_images());
+    case.compare_image("d_x", &gradients, &input);
+}
+
+fn batch_norm(case: &Case) -> BatchNorm {
+    let mut norm = BatchNorm::new("n", 18);
+    norm.scale.set(&case.values("scale"));
+    norm.shift.set(&case.values("shift"));
+    norm
+}
+
+/// Of the batch's own moments, which depend on the input: its gradient says so.
+#[test]
+fn batch_norm_in_training() {
+    let case = Case::new("batch_norm_training");
+    let norm = batch_norm(&case);
+    let input = case.images("x");
+    let mut stats = Stats::Batch(Vec::new());
+    let gradients = case.project(norm.forward(traced(&input), &mut stats).into_images());
+    case.compare_image("d_x", &gradients, &input);
+    case.compare_param("d_scale", &gradients, &norm.scale);
+    case.compare_param("d_shift", &gradients, &norm.shift);
+    let Stats::Batch(seen) = stats else { panic!("training records") };
+    case.compare("mean", &seen[0].mean);
+    case.compare("variance", &seen[0].variance);
+}
+
+#[test]
+fn batch_norm_in_inference() {
+    let case = Case::new("batch_norm_inference");
+    let mut norm = batch_norm(&case);
+    norm.mean.set(&case.values("mean"));
+    norm.variance.set(&case.values("variance"));
+    let input = case.images("x");
+    let gradients = case.project(norm.forward(traced(&input), &mut Stats::Running).into_images());
+    case.compare_image("d_x", &gradients, &input);
+    case.compare_param("d_scale", &gradients, &norm.scale);
+    case.compare_param("d_shift", &gradients, &norm.shift);
+}
+
+#[test]
+fn filtering_by_predicted_kernels() {
+    for name in [
+        "filter3",
+        "filter3_confidence",
+        "filter5",
+        "filter5_confidence",
+        "filter5_wider_than_image",
+        "filter5_wider_than_image_confidence",
+    ] {
+        let case = Case::new(name);
+        let (image, logits) = (case.images("image"), case.images("logits"));
+        let confidence = case.has("confidence").then(|| case.images("confidence"));
+        let &(n, taps, h, w) = logits.shape();
+        // The radiance of the network's input takes no gradient; that of coarser levels does.
+        for is_input in [false, true] {
+            let field = match is_input {
+                true => Field::input((n, 3, h, w), image.as_vec()),
+                false => traced_field(&image),
+            };
+            let trust = confidence.as_ref().map(traced_field);
+            let output = field.filter(taps.isqrt(), traced_field(&logits), trust);
+            let gradients = case.project(output.into_images());
+            case.compare_image("d_logits", &gradients, &logits);
+            if let Some(confidence) = &confidence {
+                case.compare_image("d_confidence", &gradients, confidence);
+            }
+            if !is_input {
+                case.compare_image("d_image", &gradients, &image);
+            }
+        }
+    }
+}
+
+#[test]
+fn reducing_by_confidence() {
+    let case = Case::new("reduce");
+    let (image, confidence) = (case.images("image"), case.images("confidence"));
+    for is_input in [false, true] {
+        let field = match is_input {
+            true => Field::input(*image.shape(), image.as_vec()),
+            false => traced_field(&image),
+        };
+        let gradients = case.project(field.reduce(traced_field(&confidence)).into_images());
+        case.compare_image("d_confidence", &gradients, &confidence);
+        if !is_input {
+            case.compare_image("d_image", &gradients, &image);
+        }
+    }
+}
+
+#[test]
+fn blending_a_coarse_level_into_a_fine_one() {
+    for name in ["blend", "blend_smallest"] {
+        let case = Case::new(name);
+        let [fine, coarse, alpha] = ["fine", "coarse", "alpha"].map(|key| case.images(key));
+        let output = traced_field(&fine).blend(traced_field(&coarse), traced_field(&alpha));
+        let gradients = case.project(output.into_images());
+        case.compare_image("d_fine", &gradients, &fine);
+        case.compare_image("d_coarse", &gradients, &coarse);
+        case.compare_image("d_alpha", &gradients, &alpha);
+    }
+}
+
+/// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.
+#[test]
+fn channels_to_pixels_and_back() {
+    let case = Case::new("shuffle");
+    let input = case.images("x");
+    let gradients = case.project(Field::from_activation(traced(&input), 3, 12, 2).into_images());
+    case.compare_image("d_x", &gradients, &input);
+
+    let (shape, fine) = case.array("y");
+    let shape = Shape::new(shape[0], shape[1], shape[2], shape[3]);
+    let halved = Activation::<NoneTape>::input_halved(shape, &fine).into_images();
+    let &(n, c, h, w) = input.shape();
+    let middle = (0..n).flat_map(|n| input.as_vec()[(n * c + 3) * h * w..][..12 * h * w].to_vec());
+    assert_eq!(halved.as_vec(), middle.collect::<Vec<f32>>());
+}
