@@ -1,6 +1,8 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 
+use rayon::prelude::*;
+
 use crate::{
     Result,
     passes::{Pass, PassSet},
@@ -116,11 +118,9 @@ pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     let exposure = exposure(radiance);
     albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
     let mut irradiance = radiance.clone();
-    for (v, a) in irradiance.data.iter_mut().zip(&albedo.data) {
-        *v = v.max(0.0) * exposure / a;
-    }
+    irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
     let mut encoded = irradiance.clone();
-    encoded.data.iter_mut().for_each(|v| *v = log_transfer(*v));
+    encoded.data.par_iter_mut().for_each(|v| *v = log_transfer(*v));
     Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
 }
 

@@ -269,23 +269,30 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
         (size.h, size.w, 3 * size.pixels(), size.pixels())
     );
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
-    let weights: Vec<f32> = confidence.iter().map(|c| exp(*c)).collect();
-    let squares = |v: &[f32], y: usize, x: usize| {
-        let at = 2 * y * size.w + 2 * x;
-        [v[at], v[at + 1], v[at + size.w], v[at + size.w + 1]]
-    };
-    for y in 0..h {
-        for x in 0..w {
-            let weight = squares(&weights, y, x);
-            let sum: f32 = weight.iter().sum();
-            total[y * w + x] = sum;
-            for c in 0..3 {
-                let v = squares(&image[c * size.pixels()..], y, x);
-                let product: f32 = v.iter().zip(weight).map(|(v, w)| v * w).sum();
-                output[c * h * w + y * w + x] = product / sum;
+    let n = size.pixels();
+    let (r, rest) = output.split_at_mut(h * w);
+    let (g, b) = rest.split_at_mut(h * w);
+    r.par_chunks_mut(w)
+        .zip(g.par_chunks_mut(w))
+        .zip(b.par_chunks_mut(w))
+        .zip(total.par_chunks_mut(w))
+        .enumerate()
+        .for_each(|(y, (((r, g), b), total))| {
+            let at = 2 * y * size.w;
+            let weights: Vec<f32> = confidence[at..][..2 * size.w].iter().map(|c| exp(*c)).collect();
+            let square =
+                |v: &[f32], x: usize| [v[2 * x], v[2 * x + 1], v[size.w + 2 * x], v[size.w + 2 * x + 1]];
+            for (x, total) in total.iter_mut().enumerate() {
+                *total = square(&weights, x).iter().sum();
             }
-        }
-    }
+            for (c, out) in [r, g, b].into_iter().enumerate() {
+                let image = &image[c * n + at..][..2 * size.w];
+                for (x, out) in out.iter_mut().enumerate() {
+                    let (v, k) = (square(image, x), square(&weights, x));
+                    *out = (v[0] * k[0] + v[1] * k[1] + v[2] * k[2] + v[3] * k[3]) / total[x];
+                }
+            }
+        });
 }
 
 /// Adds what [`reduce`]'s output gradient sends back to image and confidence.
@@ -324,16 +331,18 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
+/// The coarse row (or column) of `n` that fine one `i` lies in, and the next nearest, the edge repeated.
+#[inline(always)]
+fn near(i: usize, n: usize) -> (usize, usize) {
+    let own = i / 2;
+    (own, if i.is_multiple_of(2) { own.saturating_sub(1) } else { (own + 1).min(n - 1) })
+}
+
 /// Weights of the four coarse pixels around a fine one, bilinear: `(row, column)` pairs with the edge
 /// repeated.
 #[inline(always)]
 fn corners(size: Size, y: usize, x: usize) -> [(usize, f32); 4] {
     let (h, w) = (size.h / 2, size.w / 2);
-    let near = |i: usize, n: usize| {
-        let own = i / 2;
-        let other = if i.is_multiple_of(2) { own.saturating_sub(1) } else { (own + 1).min(n - 1) };
-        (own, other)
-    };
     let ((y0, y1), (x0, x1)) = (near(y, h), near(x, w));
     [(y0 * w + x0, 0.5625), (y0 * w + x1, 0.1875), (y1 * w + x0, 0.1875), (y1 * w + x1, 0.0625)]
 }
@@ -357,23 +366,28 @@ pub fn blend(
     let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
     assert_eq!((fine.len(), coarse.len(), alpha.len()), (3 * n, 3 * h * w, n));
     assert_eq!((difference.len(), output.len()), (coarse.len(), fine.len()));
-    let weights: Vec<f32> = alpha.par_iter().map(|a| sigmoid(*a)).collect();
-    let planes = output.par_chunks_mut(n).zip(difference.par_chunks_mut(h * w)).enumerate();
-    planes.for_each(|(c, (output, difference))| {
-        let fine = &fine[c * n..][..n];
-        for y in 0..h {
-            for x in 0..w {
-                let at = 2 * y * size.w + 2 * x;
-                let mean = 0.25 * (fine[at] + fine[at + 1] + fine[at + size.w] + fine[at + size.w + 1]);
-                difference[y * w + x] = coarse[c * h * w + y * w + x] - mean;
-            }
+    difference.par_chunks_mut(w).enumerate().for_each(|(i, row)| {
+        let (c, y) = (i / h, i % h);
+        let fine = &fine[c * n + 2 * y * size.w..][..2 * size.w];
+        for (x, (out, coarse)) in row.iter_mut().zip(&coarse[i * w..][..w]).enumerate() {
+            let sum = fine[2 * x] + fine[2 * x + 1] + fine[size.w + 2 * x] + fine[size.w + 2 * x + 1];
+            *out = coarse - 0.25 * sum;
         }
-        for y in 0..size.h {
-            for x in 0..size.w {
-                let up: f32 = corners(size, y, x).iter().map(|&(i, k)| k * difference[i]).sum();
-                let at = y * size.w + x;
-                output[at] = fine[at] + weights[at] * up;
-            }
+    });
+    let weights: Vec<f32> = alpha.par_iter().map(|a| sigmoid(*a)).collect();
+    let difference = &*difference;
+    output.par_chunks_mut(size.w).enumerate().for_each(|(i, out)| {
+        let (c, y) = (i / size.h, i % size.h);
+        // Bilinear, one direction after the other; `corners` is the same in one step.
+        let (own, other) = near(y, h);
+        let coarse = |row: usize| &difference[(c * h + row) * w..][..w];
+        let column: Vec<f32> =
+            coarse(own).iter().zip(coarse(other)).map(|(a, b)| 0.75 * a + 0.25 * b).collect();
+        let fine = &fine[c * n + y * size.w..][..size.w];
+        let weights = &weights[y * size.w..][..size.w];
+        for (x, out) in out.iter_mut().enumerate() {
+            let (own, other) = near(x, w);
+            *out = fine[x] + weights[x] * (0.75 * column[own] + 0.25 * column[other]);
         }
     });
 }

@@ -201,21 +201,34 @@ fn shuffled(channel: usize, factor: usize) -> (usize, usize, usize) {
 /// If `output` does not hold whole channels of the input.
 pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &mut [f32]) {
     let s = input.shape;
+    let area = factor * factor;
     let channels = output.len() / (s.n * s.h * s.w);
-    let planes = channels / (factor * factor);
-    assert_eq!(output.len(), s.n * planes * factor * factor * s.h * s.w);
+    assert_eq!(output.len(), s.n * (channels / area) * area * s.h * s.w);
     assert!(first + channels <= s.c);
+    assert!(LANES.is_multiple_of(area) && first.is_multiple_of(area), "a square's channels share a block");
     let (h, w) = (factor * s.h, factor * s.w);
-    output.par_chunks_mut(h * w).enumerate().for_each(|(i, plane)| {
-        let (n, p) = (i / planes, i % planes);
-        for c in p * factor * factor..(p + 1) * factor * factor {
-            let (_, sy, sx) = shuffled(c, factor);
-            let lane = (first + c) % LANES;
-            for y in 0..s.h {
-                let row = &input.data[s.row(n, (first + c) / LANES, y)..][..s.w];
-                let out = &mut plane[(factor * y + sy) * w..][..w];
+    // One task for the channels of each block plane: a row of blocks is read once and serves them all.
+    let mut tasks = Vec::new();
+    let mut rest = output;
+    for n in 0..s.n {
+        let mut c = 0;
+        while c < channels {
+            let plane = (first + c) / LANES;
+            let end = channels.min((plane + 1) * LANES - first);
+            let (mine, others) = rest.split_at_mut((end - c) / area * h * w);
+            tasks.push((n, plane, (first + c) % LANES, end - c, mine));
+            rest = others;
+            c = end;
+        }
+    }
+    tasks.into_par_iter().for_each(|(n, plane, lane, count, out)| {
+        for y in 0..s.h {
+            let row = &input.data[s.row(n, plane, y)..][..s.w];
+            for c in 0..count {
+                let (p, sy, sx) = shuffled(c, factor);
+                let out = &mut out[p * h * w + (factor * y + sy) * w..][..w];
                 for (out, block) in out[sx..].iter_mut().step_by(factor).zip(row) {
-                    *out = block.0[lane];
+                    *out = block.0[lane + c];
                 }
             }
         }
@@ -236,13 +249,12 @@ pub fn to_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: V
     let (h, w) = (factor * s.h, factor * s.w);
     planes(s, output.data, |n, plane, out| {
         let lanes = (plane * LANES).max(first)..((plane + 1) * LANES).min(first + channels);
-        for layer_channel in lanes {
-            let c = layer_channel - first;
-            let (p, sy, sx) = shuffled(c, factor);
-            let source = &input[(n * (channels / area) + p) * h * w..][..h * w];
-            for y in 0..s.h {
+        for y in 0..s.h {
+            let out = &mut out[row_in_plane(s, y)..][..s.w];
+            for layer_channel in lanes.clone() {
+                let (p, sy, sx) = shuffled(layer_channel - first, factor);
+                let source = &input[(n * (channels / area) + p) * h * w..][..h * w];
                 let row = &source[(factor * y + sy) * w..][..w];
-                let out = &mut out[row_in_plane(s, y)..][..s.w];
                 for (out, v) in out.iter_mut().zip(row[sx..].iter().step_by(factor)) {
                     out.0[layer_channel % LANES] = *v;
                 }

@@ -5,7 +5,7 @@ use std::{cell::RefCell, rc::Rc, sync::Arc};
 use dfdx::tensor::{Cpu, Merge, PutTape, Tape, TensorFromVec};
 use rayon::prelude::*;
 
-use super::{Activation, Images};
+use super::{Activation, Images, pool::PlaneBuffer};
 use crate::kernels::{
     filter::{Filter, FilterGradient, Size, blend, blend_gradient, reduce, reduce_gradient},
     pool::{from_blocked_shuffled, to_blocked_shuffled},
@@ -19,7 +19,7 @@ pub type Extent = (usize, usize, usize, usize);
 #[derive(Clone, Debug)]
 struct Values {
     extent: Extent,
-    data: Arc<Vec<f32>>,
+    data: Arc<PlaneBuffer>,
 }
 
 impl Values {
@@ -39,12 +39,12 @@ impl Values {
 struct Saved {
     values: Values,
     /// `None` for inputs, whose gradient nobody asks for.
-    gradient: Option<Rc<RefCell<Option<Vec<f32>>>>>,
+    gradient: Option<Rc<RefCell<Option<PlaneBuffer>>>>,
 }
 
 impl Saved {
     /// The gradient that has flowed in, if any.
-    fn take(&self) -> Option<Vec<f32>> {
+    fn take(&self) -> Option<PlaneBuffer> {
         self.gradient.as_ref().and_then(|g| g.take())
     }
 
@@ -53,7 +53,7 @@ impl Saved {
         match &self.gradient {
             Some(slot) => {
                 let mut slot = slot.borrow_mut();
-                add(Some(slot.get_or_insert_with(|| vec![0.0; self.values.data.len()])));
+                add(Some(slot.get_or_insert_with(|| PlaneBuffer::zeros(self.values.data.len()))));
             }
             None => add(None),
         }
@@ -82,11 +82,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// If the length of `values` is not what `extent` demands.
     pub fn input(extent: Extent, values: Vec<f32>) -> Self {
         assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
-        let values = Values { extent, data: Arc::new(values) };
+        let values = Values { extent, data: Arc::new(values.into()) };
         Self { saved: Saved { values, gradient: None }, tape: T::default() }
     }
 
-    fn output(extent: Extent, data: Vec<f32>, tape: T) -> (Self, Saved) {
+    fn output(extent: Extent, data: PlaneBuffer, tape: T) -> (Self, Saved) {
         let values = Values { extent, data: Arc::new(data) };
         let saved = Saved { values, gradient: Some(Rc::default()) };
         (Self { saved: saved.clone(), tape }, saved)
@@ -109,7 +109,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         let shape = activation.shape();
         let planes = channels / (factor * factor);
         let extent = (shape.n, planes, factor * shape.h, factor * shape.w);
-        let mut data = vec![0.0; shape.n * channels * shape.h * shape.w];
+        let mut data = PlaneBuffer::new(shape.n * channels * shape.h * shape.w);
         from_blocked_shuffled(activation.saved.data.view(), first, factor, &mut data);
         let (mut field, out) = Self::output(extent, data, activation.tape);
         if T::OWNS_TAPE {
@@ -141,8 +141,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
             trust = Some(confidence.saved);
         }
         let values = (image.values.clone(), logits.values.clone(), trust.as_ref().map(|t| t.values.clone()));
-        let mut output = vec![0.0; images * 3 * h * w];
-        let mut total = vec![0.0; images * h * w];
+        let mut output = PlaneBuffer::new(images * 3 * h * w);
+        let mut total = PlaneBuffer::new(images * h * w);
         for (n, (output, total)) in output.chunks_mut(3 * h * w).zip(total.chunks_mut(h * w)).enumerate() {
             filter_of(&values, n, k).apply(tier, output, total);
         }
@@ -184,7 +184,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn reduce(self, confidence: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let quarter = h * w / 4;
-        let (mut output, mut total) = (vec![0.0; images * 3 * quarter], vec![0.0; images * quarter]);
+        let (mut output, mut total) =
+            (PlaneBuffer::new(images * 3 * quarter), PlaneBuffer::new(images * quarter));
         let (image, trust) = (self.saved, confidence.saved);
         let (values, weights) = (image.values.clone(), trust.values.clone());
         output.par_chunks_mut(3 * quarter).zip(total.par_chunks_mut(quarter)).enumerate().for_each(
@@ -226,8 +227,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
         let size = Size { h, w };
-        let mut output = vec![0.0; images * 3 * pixels];
-        let mut difference = vec![0.0; images * 3 * quarter];
+        let mut output = PlaneBuffer::new(images * 3 * pixels);
+        let mut difference = PlaneBuffer::new(images * 3 * quarter);
         let (fine, below, mask) = (self.saved, coarse.saved, alpha.saved);
         let chunks = output.chunks_mut(3 * pixels).zip(difference.chunks_mut(3 * quarter));
         for (n, (output, difference)) in chunks.enumerate() {

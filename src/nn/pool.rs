@@ -63,7 +63,58 @@ impl Drop for Buffer {
     }
 }
 
+/// Free planar buffers by length.
+static FREE_PLANES: LazyLock<Mutex<HashMap<usize, Vec<Vec<f32>>>>> = LazyLock::new(Mutex::default);
+
+/// The memory of planar images, returned to the pool when dropped. Its values are whatever the last
+/// user left.
+#[derive(Debug)]
+pub struct PlaneBuffer(Vec<f32>);
+
+impl PlaneBuffer {
+    /// A buffer of arbitrary values.
+    pub fn new(len: usize) -> Self {
+        let reused =
+            FREE_PLANES.lock().unwrap_or_else(PoisonError::into_inner).get_mut(&len).and_then(Vec::pop);
+        Self(reused.unwrap_or_else(|| vec![0.0; len]))
+    }
+
+    /// A buffer of zeros.
+    pub fn zeros(len: usize) -> Self {
+        let mut buffer = Self::new(len);
+        buffer.fill(0.0);
+        buffer
+    }
+}
+
+impl From<Vec<f32>> for PlaneBuffer {
+    fn from(values: Vec<f32>) -> Self {
+        Self(values)
+    }
+}
+
+impl Deref for PlaneBuffer {
+    type Target = [f32];
+    fn deref(&self) -> &[f32] {
+        &self.0
+    }
+}
+
+impl DerefMut for PlaneBuffer {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.0
+    }
+}
+
+impl Drop for PlaneBuffer {
+    fn drop(&mut self) {
+        let data = std::mem::take(&mut self.0);
+        FREE_PLANES.lock().unwrap_or_else(PoisonError::into_inner).entry(data.len()).or_default().push(data);
+    }
+}
+
 /// Gives every free buffer back to the system: for when frames of another size follow.
 pub fn clear() {
     FREE.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    FREE_PLANES.lock().unwrap_or_else(PoisonError::into_inner).clear();
 }
