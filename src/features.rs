@@ -218,7 +218,8 @@ mod tests {
         let mut channel = [1.0, 2.0, 3.0, 4.0];
         z_score(&mut channel);
         let deviation = 1.25f32.sqrt();
-        assert_eq!(channel, [-1.5, -0.5, 0.5, 1.5].map(|v: f32| v / deviation));
+        let want = [-1.5, -0.5, 0.5, 1.5].map(|v: f32| v / deviation);
+        assert!(channel.iter().zip(want).all(|(c, w)| (c - w).abs() < 1e-6), "{channel:?} for {want:?}");
         let mut flat = [7.0; 9];
         z_score(&mut flat);
         assert_eq!(flat, [0.0; 9]);
