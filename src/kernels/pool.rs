@@ -205,30 +205,31 @@ pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &
     let channels = output.len() / (s.n * s.h * s.w);
     assert_eq!(output.len(), s.n * (channels / area) * area * s.h * s.w);
     assert!(first + channels <= s.c);
-    assert!(LANES.is_multiple_of(area) && first.is_multiple_of(area), "a square's channels share a block");
     let (h, w) = (factor * s.h, factor * s.w);
-    // One task for the channels of each block plane: a row of blocks is read once and serves them all.
+    // One task for the planes whose channels begin in the same block: a row of blocks is read once and
+    // serves them all.
     let mut tasks = Vec::new();
     let mut rest = output;
     for n in 0..s.n {
-        let mut c = 0;
-        while c < channels {
-            let plane = (first + c) / LANES;
-            let end = channels.min((plane + 1) * LANES - first);
-            let (mine, others) = rest.split_at_mut((end - c) / area * h * w);
-            tasks.push((n, plane, (first + c) % LANES, end - c, mine));
+        let block = |p: usize| (first + p * area) / LANES;
+        let mut p = 0;
+        while p < channels / area {
+            let end = (p..channels / area).find(|&q| block(q) != block(p)).unwrap_or(channels / area);
+            let (mine, others) = rest.split_at_mut((end - p) * h * w);
+            tasks.push((n, p * area..end * area, mine));
             rest = others;
-            c = end;
+            p = end;
         }
     }
-    tasks.into_par_iter().for_each(|(n, plane, lane, count, out)| {
+    tasks.into_par_iter().for_each(|(n, channels, out)| {
         for y in 0..s.h {
-            let row = &input.data[s.row(n, plane, y)..][..s.w];
-            for c in 0..count {
-                let (p, sy, sx) = shuffled(c, factor);
+            for c in channels.clone() {
+                let (p, sy, sx) = shuffled(c - channels.start, factor);
+                let (plane, lane) = ((first + c) / LANES, (first + c) % LANES);
+                let row = &input.data[s.row(n, plane, y)..][..s.w];
                 let out = &mut out[p * h * w + (factor * y + sy) * w..][..w];
                 for (out, block) in out[sx..].iter_mut().step_by(factor).zip(row) {
-                    *out = block.0[lane + c];
+                    *out = block.0[lane];
                 }
             }
         }
