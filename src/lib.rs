@@ -3,7 +3,7 @@
 //! Modules point downwards only:
 //! [`cli`] dispatches; [`report`] scores methods over a test set; [`train`] fits weights;
 //! [`models`] holds every denoising method behind one trait; [`nn`] is differentiable image
-//! operations on dfdx's tape; [`features`] turns passes into network inputs; [`passes`] says what
+//! operations on dfdx's tape; [`filters`] are classical building blocks; [`features`] turns passes into network inputs; [`passes`] says what
 //! a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions;
 //! [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
@@ -12,6 +12,7 @@
 pub mod cli;
 pub mod error;
 pub mod features;
+pub mod filters;
 pub mod frame;
 pub mod kernels;
 pub mod metrics;

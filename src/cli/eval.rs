@@ -161,11 +161,13 @@ struct Progress {
     bar: Option<ProgressBar>,
     rows: usize,
     done: usize,
+    /// Notes told: each is told once.
+    told: HashSet<String>,
 }
 
 impl Progress {
     fn new() -> Self {
-        Self { bar: None, rows: 0, done: 0 }
+        Self { bar: None, rows: 0, done: 0, told: HashSet::new() }
     }
 
     fn tell(&mut self, event: &Event) {
@@ -187,6 +189,14 @@ impl Progress {
             Event::Pair(pair) => {
                 if let Some(bar) = &self.bar {
                     bar.set_message(pair.id());
+                }
+            }
+            Event::Note(note) => {
+                if self.told.insert((*note).to_owned()) {
+                    match &self.bar {
+                        Some(bar) => bar.println(format!("note: {note}")),
+                        None => eprintln!("note: {note}"),
+                    }
                 }
             }
             Event::Row(row) => {

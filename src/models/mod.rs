@@ -3,6 +3,7 @@
 pub mod demc;
 pub mod learned;
 pub mod network;
+pub mod nfor;
 pub mod oidn;
 pub mod pyramid;
 pub mod weights_file;
@@ -24,6 +25,17 @@ pub trait Denoiser: Send + Sync {
 
     /// The passes it needs.
     fn passes(&self) -> &[Pass];
+
+    /// Passes it makes use of where a file holds them.
+    fn optional_passes(&self) -> &[Pass] {
+        &[]
+    }
+
+    /// What the user should know about how it treats this frame.
+    fn notes(&self, passes: &PassSet) -> Option<String> {
+        let _ = passes;
+        None
+    }
 
     /// Denoised radiance, (3, H, W), of finite passes (see [`PassSet::sanitize`]).
     ///
@@ -87,6 +99,7 @@ impl Denoiser for Noisy {
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     match name_or_file {
         "noisy" => Ok(Box::new(Noisy)),
+        nfor::NAME => Ok(Box::new(nfor::Nfor)),
         name if oidn::NAMES.contains(&name) => {
             Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
         }

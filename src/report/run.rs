@@ -32,6 +32,8 @@ pub enum Event<'a> {
     },
     /// A pair is being read.
     Pair(&'a Pair),
+    /// What a method says about its treatment of a pair.
+    Note(&'a str),
     /// A row is finished.
     Row(&'a Row),
 }
@@ -71,6 +73,7 @@ pub fn evaluate(
         }
         on(Event::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options);
+        done.notes.iter().for_each(|note| on(Event::Note(note)));
         for row in done.rows {
             on(Event::Row(&row));
             table.push(row)?;
@@ -105,6 +108,8 @@ fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
 
 /// What running a pair gave.
 struct Done {
+    /// What the methods say about their treatment of the pair.
+    notes: Vec<String>,
     /// Rows of the methods that were not finished.
     rows: Vec<Row>,
     /// Images for the sheet, where the pair could be read.
@@ -154,7 +159,7 @@ fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, opt
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
-            return Done { rows: open().map(fail).collect(), scene: None };
+            return Done { notes: Vec::new(), rows: open().map(fail).collect(), scene: None };
         }
     };
     let pixels = loaded.noisy.pixels();
@@ -192,6 +197,7 @@ fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, opt
         }
     }
     Done {
+        notes: open().filter_map(|m| m.denoiser.notes(&loaded.passes)).collect(),
         rows: rows.into_iter().flatten().collect(),
         scene: shown.then_some(Scene { reference: loaded.reference, images }),
     }

@@ -61,7 +61,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
         report.notes.extend(note_other_layers(&layers, chosen));
     }
     let mut wanted = vec![Pass::Combined, Pass::Alpha, Pass::NoisyImage];
-    wanted.extend(model.passes());
+    wanted.extend(model.passes().iter().chain(model.optional_passes()));
     let mut views = Vec::new();
     for layer in layers.iter().filter(|l| l.name == chosen.name) {
         let mut set = passes::read_layer(&frame, layer, &wanted)?;
@@ -107,6 +107,7 @@ pub fn denoise(loaded: Frames<PassSet>, model: &dyn Denoiser, options: &Options)
     let Frames { frame, views, mut report } = loaded;
     let mut done = Vec::with_capacity(views.len());
     for (layer, mut set) in views {
+        report.notes.extend(model.notes(&set).filter(|note| !report.notes.contains(note)));
         let start = Instant::now();
         let radiance = model.denoise_tiled(&set, options.tile)?;
         report.seconds += start.elapsed().as_secs_f64();
