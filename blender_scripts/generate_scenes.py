@@ -230,7 +230,7 @@ def render_scene(options, library, records, seed, kind, scene_name):
             if kind not in options.blends:
                 views.lens_effects(stage, camera)
             guides = views.probe(stage.scene)
-            reason = views.refusal(guides[0])
+            reason = views.refusal(guides)
             regions = [] if reason else views.crops(stage.rng, stage.scene, guides, options.crops, options.size)
             if len(regions) == options.crops:
                 break

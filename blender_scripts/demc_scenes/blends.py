@@ -41,15 +41,20 @@ def open_blend(stage, path):
         reach = focus or 5.0
         for _ in range(40):
             shift = Vector([rng.gauss(0, reach * 0.15) for _ in range(3)])
-            turn = Euler((rng.gauss(0, 0.12), rng.gauss(0, 0.02), rng.gauss(0, 0.35)))
             camera.matrix_world = home
+            camera.data.lens = lens * math.exp(rng.gauss(0, 0.25))
+            # Turned by a part of the angle of view, so that the subject seldom leaves the frame.
+            angle = camera.data.angle
+            turn = Euler((rng.gauss(0, 0.12 * angle), rng.gauss(0, 0.02), rng.gauss(0, 0.3 * angle)))
             camera.location = home.translation + shift
             camera.rotation_mode = "QUATERNION"
             rotation = home.to_quaternion()
             world_turn = Euler((0, 0, turn.z)).to_quaternion()
             camera.rotation_quaternion = world_turn @ rotation @ Euler((turn.x, 0, turn.y)).to_quaternion()
-            camera.data.lens = lens * math.exp(rng.gauss(0, 0.25))
             ahead = camera.rotation_quaternion @ Vector((0, 0, -1))
+            hit = distance_ahead(scene, camera.location, ahead)
+            if focus and (hit is None or hit > 4 * focus):
+                continue
             if views.sees_ahead(stage, camera.location, ahead, reach * 0.12):
                 return camera
         return None

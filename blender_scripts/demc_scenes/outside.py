@@ -141,8 +141,8 @@ def outdoor(stage):
         mix.inputs[0].default_value = 0.35
         blade.set(mix.inputs[1], blade.shader("ShaderNodeBsdfDiffuse", Color=shade))
         blade.set(mix.inputs[2], blade.shader("ShaderNodeBsdfTranslucent", Color=shade))
-        settings = grow(stage, lawn, rng.randint(60000, 160000), rng.uniform(0.06, 0.25), blade.finish(mix.outputs[0]), rng.uniform(0, 0.4))
-        settings.radius_scale = 0.006
+        settings = grow(stage, lawn, rng.randint(15000, 40000), rng.uniform(0.08, 0.3), blade.finish(mix.outputs[0]), rng.uniform(0, 0.4))
+        settings.radius_scale = 0.009
     plants = lib.with_role("plant")
     rocks = lib.with_role("nature")
     others = lib.with_role("figure", "chair", "vehicle", largest=3) + lib.with_role("building", smallest=2, largest=8)

@@ -132,7 +132,7 @@ def window(shell, wall, opening, trim):
     elif roll < 0.6:
         slats = [((w, 0.04, 0.003), (u, 0.03, v0 + i * 0.045)) for i in range(int(h / 0.045))]
         stage.add(shapes.boxes(slats), m.paint(rng), at, turn)
-    # Where the light comes from, for lamps placed outside.
+    # Where the light comes from, for lamps placed outside and portals in the opening.
     outside = Vector(shell.wall_point(wall, u, -1.5)) + Vector((0, 0, (v0 + v1) / 2))
     inside = Vector(shell.wall_point(wall, u, 1.5)) + Vector((0, 0, (v0 + v1) / 2))
     shell.windows.append((outside, inside, w, h))
@@ -141,9 +141,9 @@ def window(shell, wall, opening, trim):
 def furnish(shell):
     """Furniture along the walls, a group in the middle, plants and lamps in between."""
     stage, rng, lib = shell.stage, shell.stage.rng, shell.stage.library
-    for _ in range(rng.randint(4, 9)):
-        along_wall(shell)
     middle(shell)
+    for _ in range(rng.randint(8, 18)):  # what finds no room is left out
+        along_wall(shell)
     if rng.random() < 0.6:
         w, d = rng.uniform(1.2, 2.6), rng.uniform(1.0, 2.0)
         carpet = shapes.box((w, d, 0.012), 0.004, (0, 0, 0.006))
@@ -215,7 +215,7 @@ def along_wall(shell):
             return
         height = placed.size.z
     if height < 1.4 and rng.random() < 0.8:
-        props.scatter_on(stage, placed, rng.randint(1, 6))
+        props.scatter_on(stage, placed, rng.randint(2, 7))
 
 
 def middle(shell):
@@ -271,7 +271,7 @@ def decorate_walls(shell):
 def clutter(shell):
     """Things on the floor, and cables."""
     stage, rng = shell.stage, shell.stage.rng
-    for _ in range(rng.randint(0, 8)):
+    for _ in range(rng.randint(1, 10)):
         spot = empty_spot(shell, 0.3)
         if spot:
             props.small(stage, spot, largest=1.2)
@@ -287,6 +287,7 @@ def lights(shell, mood):
         darkness(stage, rng.uniform(0.0, 0.05))
     else:
         environment(stage, ("sunny", "city", "forest", "garden", "sky", "sun", "dawn"), rng.uniform(0.6, 3.0) if mood == "day" else rng.uniform(0.2, 0.8), ("night",))
+        daylight(shell, mood)
         if shell.windows and rng.random() < 0.55:
             outside, inside, *_ = rng.choice(shell.windows)
             toward = inside - outside
@@ -296,6 +297,20 @@ def lights(shell, mood):
     lamps = {"day": rng.choice((0, 0, 1)), "dim": rng.randint(0, 1), "night": rng.randint(1, 4)}[mood]
     for _ in range(lamps):
         rng.choice((pendant, panel, downlights, floor_lamp, floor_lamp))(shell)
+
+
+def daylight(shell, mood):
+    """Portals that guide samples to the sky, or soft area lights in the windows: both are what
+    artists do for interiors; some do neither."""
+    stage, rng = shell.stage, shell.stage.rng
+    way = rng.choice(("portal", "portal", "portal", "area", "none"))
+    if way == "none":
+        return
+    energy = rng.uniform(10, 80) * (0.3 if mood == "dim" else 1.0)
+    for outside, inside, width, height in shell.windows:
+        at = outside.lerp(inside, 0.5) + (outside - inside).normalized() * _THICK * 0.8
+        lamp = stage.lamp("AREA", at, energy * width * height, (0.85, 0.93, 1.0), aim=inside, shape="RECTANGLE", size=width, size_y=height)
+        lamp.data.cycles.is_portal = way == "portal"
 
 
 def pendant(shell):

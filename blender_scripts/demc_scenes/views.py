@@ -17,6 +17,9 @@ _DARKEST = 1e-5
 _LEAST_DETAIL = 0.05
 # A crop of the sky alone teaches nothing: surfaces must cover this share of it.
 _COVERED = 0.4
+# Where light finds so few samples at 4 spp that more surface pixels than this stay black, no
+# affordable reference comes clean.
+_STARVED = 0.5
 # A crop darker than this share of its frame's brightness shows next to nothing.
 _DARK_SHARE = 0.02
 
@@ -25,8 +28,10 @@ def room_camera(stage, shell):
     """Inside a room, from near a wall or over the furniture, toward what stands in it."""
     rng = stage.rng
     for _ in range(60):
-        at = Vector((rng.uniform(0.25, shell.width - 0.25), rng.uniform(0.25, shell.depth - 0.25), rng.uniform(0.6, min(1.9, shell.height - 0.3))))
-        target = rng.choice(stage.interest) if stage.interest else Vector((shell.width / 2, shell.depth / 2, 0.8))
+        at = Vector((rng.uniform(0.25, shell.width - 0.25), rng.uniform(0.25, shell.depth - 0.25), rng.uniform(0.8, min(1.8, shell.height - 0.3))))
+        target = Vector(rng.choice(stage.interest) if stage.interest else (shell.width / 2, shell.depth / 2, 0.8))
+        if rng.random() < 0.8:  # people look at furniture, not at ceilings
+            target.z = min(target.z, rng.uniform(0.6, 1.3))
         near = rng.random() < 0.2  # a close look at one thing
         direction = Vector(target) - at
         if near and direction.length > 1.2:
@@ -93,8 +98,8 @@ def move(rng, obj, distance):
     obj.location = start
 
 
-def probe(scene, spp=3):
-    """A tiny denoised render of the whole frame: (height, width, 3) radiance and albedo."""
+def probe(scene, spp=4):
+    """A tiny render of the whole frame: (height, width, 3) radiance, albedo and normal."""
     width, height = rendering.frame_size(scene)
     scale = _PROBE / max(width, height)
     handle, path = tempfile.mkstemp(suffix=".exr")
@@ -119,11 +124,23 @@ def find(passes, ending):
     return next(plane for name, plane in passes.items() if name.endswith("." + ending) or name == ending)
 
 
-def refusal(image):
+def starved(image, normal):
+    """Share of the pixels on surfaces that no light has reached yet."""
+    covered = np.abs(normal).max(-1) > 0.1
+    return float((image.max(-1)[covered] <= 1e-7).mean()) if covered.any() else 0.0
+
+
+def refusal(guides):
     """Why a probe frame is not worth rendering, or None."""
+    image, _, normal = guides
     luminance = image @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    if brightness(image) < _DARKEST or np.median(luminance) < 1e-3 * luminance.mean():
+    # A few samples leave most pixels of an interior black: judge means of small blocks.
+    height, width = (n // 8 * 8 for n in luminance.shape)
+    blocks = luminance[:height, :width].reshape(height // 8, 8, width // 8, 8).mean((1, 3))
+    if brightness(image) < _DARKEST or np.median(blocks) < 0.01 * blocks.mean():
         return "black"
+    if starved(image, normal) > _STARVED:
+        return "too noisy"
     return None
 
 
@@ -163,7 +180,7 @@ def crops(rng, scene, guides, count, size):
         part = np.s_[int(y * scale):max(int((y + size[1]) * scale), int(y * scale) + 2), int(x * scale):max(int((x + size[0]) * scale), int(x * scale) + 2)]
         light = image[part].mean(-1)
         covered = (np.abs(normal[part]).max(-1) > 0.1).mean()
-        if light.mean() < _DARK_SHARE * frame_level or covered < _COVERED:
+        if light.mean() < _DARK_SHARE * frame_level or covered < _COVERED or starved(image[part], normal[part]) > _STARVED + 0.1:
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)
