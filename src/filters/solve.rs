@@ -90,8 +90,8 @@ impl Symmetric {
     pub fn forward(&self, v: &mut [Lanes]) {
         for i in 0..self.size {
             let mut sum = v[i];
-            for k in 0..i {
-                let (a, b) = (self.values[at(i, k)], v[k]);
+            for (k, b) in v[..i].iter().enumerate() {
+                let a = self.values[at(i, k)];
                 for l in 0..LANES {
                     sum[l] -= a[l] * b[l];
                 }
@@ -108,8 +108,8 @@ impl Symmetric {
     fn backward(&self, v: &mut [Lanes]) {
         for i in (0..self.size).rev() {
             let mut sum = v[i];
-            for k in i + 1..self.size {
-                let (a, b) = (self.values[at(k, i)], v[k]);
+            for (k, b) in v[..self.size].iter().enumerate().skip(i + 1) {
+                let a = self.values[at(k, i)];
                 for l in 0..LANES {
                     sum[l] -= a[l] * b[l];
                 }
