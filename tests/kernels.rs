@@ -1,8 +1,9 @@
 //! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
-//! remainders included; and every tier against the portable one.
+//! remainders included. The bfloat16 engines get values that bfloat16 holds, and so must be as exact.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
+    bf16::{self, Engine},
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
     pool::{from_blocked, max_pool, max_pool_gradient, to_blocked},
     simd::Tier,
@@ -73,11 +74,71 @@ fn assert_close(got: &[f32], want: &[f64], what: &str) {
     }
 }
 
-/// Forward, input gradient and weight gradient of one layer on one tier.
-fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
+/// How a layer is computed.
+#[derive(Clone, Copy, Debug)]
+enum Arithmetic {
+    F32(Tier),
+    Bf16(Engine),
+}
+
+impl Arithmetic {
+    fn available() -> Vec<Self> {
+        let tiers = Tier::available().into_iter().map(Self::F32);
+        tiers.chain(Engine::available().into_iter().map(Self::Bf16)).collect()
+    }
+
+    fn convolve(
+        self,
+        sources: &[View],
+        weights: (&[f32], &[usize], usize, Direction, usize),
+        geometry: Geometry,
+        bias: &[Block],
+        epilogue: Epilogue,
+        output: ViewMut,
+    ) {
+        let (weights, inputs, outputs, direction, source) = weights;
+        let used = match (direction, geometry) {
+            (Direction::Backward, Geometry::Transposed) => Geometry::Strided,
+            _ => geometry,
+        };
+        match self {
+            Self::F32(tier) => {
+                let len = match direction {
+                    Direction::Forward => packed_len(inputs, outputs, geometry),
+                    Direction::Backward => packed_len(&[outputs], inputs[source], geometry),
+                };
+                let mut packed = vec![Block::default(); len];
+                pack(weights, inputs, outputs, geometry, direction, source, &mut packed);
+                convolve(tier, sources, &packed, bias, used, epilogue, output);
+            }
+            Self::Bf16(engine) => {
+                let packed = bf16::conv::Weights::pack(weights, inputs, outputs, geometry, direction, source);
+                let input = bf16::Operand::new(engine, sources, used);
+                bf16::conv::convolve(engine, &input, &packed, bias, epilogue, output);
+            }
+        }
+    }
+
+    fn weight_gradient(self, x: View, g: View, geometry: Geometry, place: (usize, usize), dw: &mut [f32]) {
+        match self {
+            Self::F32(tier) => weight_gradient(tier, x, g, geometry, place, dw),
+            Self::Bf16(engine) => {
+                let channels = bf16::weight_grad::Channels::new(engine, x);
+                let pairs = bf16::weight_grad::Pairs::new(g, geometry);
+                bf16::weight_grad::weight_gradient(engine, &channels, &pairs, place, dw);
+            }
+        }
+    }
+}
+
+/// Forward, input gradient and weight gradient of one layer.
+fn check_layer(tier: Arithmetic, geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
     let sources = if split == 0 || split >= shape.c { vec![shape.c] } else { vec![split, shape.c - split] };
     let (oh, ow) = geometry.output(shape.h, shape.w);
     let out_shape = shape.with_channels(outputs).with_size(oh, ow);
+    let noise = |seed, len| {
+        noise(seed, len).into_iter().map(|v| half::bf16::from_f32(v).to_f32()).collect::<Vec<f32>>()
+    };
     let x = noise(seed, shape.n * shape.c * shape.h * shape.w);
     let w = noise(seed + 1, shape.c * outputs * geometry.taps());
     let bias = noise(seed + 2, outputs);
@@ -107,26 +168,18 @@ fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outpu
         })
         .collect();
     let views: Vec<View> = parts.iter().map(|(s, d, _)| View::new(*s, d)).collect();
-    let mut packed = vec![Block::default(); packed_len(&sources, outputs, geometry)];
-    pack(&w, &sources, outputs, geometry, Direction::Forward, 0, &mut packed);
+    let forward = (&w[..], &sources[..], outputs, Direction::Forward, 0);
     let mut bias_blocks = vec![Block::default(); outputs.div_ceil(LANES)];
     for (i, b) in bias.iter().enumerate() {
         bias_blocks[i / LANES].0[i % LANES] = *b;
     }
     let mut out = vec![Block::default(); out_shape.blocks()];
     let what = format!("{tier:?} {geometry:?} {shape:?} -> {outputs}");
-    convolve(
-        tier,
-        &views,
-        &packed,
-        &bias_blocks,
-        geometry,
-        Epilogue::default(),
-        ViewMut::new(out_shape, &mut out),
-    );
+    let output = ViewMut::new(out_shape, &mut out);
+    tier.convolve(&views, forward, geometry, &bias_blocks, Epilogue::default(), output);
     assert_close(&plain(out_shape, &out), &want, &format!("{what} forward"));
     let relu = Epilogue { relu: true, accumulate: false };
-    convolve(tier, &views, &packed, &bias_blocks, geometry, relu, ViewMut::new(out_shape, &mut out));
+    tier.convolve(&views, forward, geometry, &bias_blocks, relu, ViewMut::new(out_shape, &mut out));
     let rectified: Vec<f64> = want.iter().map(|v| v.max(0.0)).collect();
     assert_close(&plain(out_shape, &out), &rectified, &format!("{what} relu"));
 
@@ -134,13 +187,11 @@ fn check_layer(tier: Tier, geometry: Geometry, shape: Shape, split: usize, outpu
     let g_view = View::new(out_shape, &g_blocks);
     let mut dw = vec![0.0; w.len()];
     for (index, (s, data, first)) in parts.iter().enumerate() {
-        weight_gradient(tier, View::new(*s, data), g_view, geometry, (*first, shape.c), &mut dw);
-        let mut packed = vec![Block::default(); packed_len(&[outputs], s.c, geometry)];
-        pack(&w, &sources, outputs, geometry, Direction::Backward, index, &mut packed);
+        tier.weight_gradient(View::new(*s, data), g_view, geometry, (*first, shape.c), &mut dw);
         let mut dx = blocked(*s, &vec![0.5; s.n * s.c * pixels]);
-        let back = if geometry == Geometry::Transposed { Geometry::Strided } else { geometry };
+        let backward = (&w[..], &sources[..], outputs, Direction::Backward, index);
         let add = Epilogue { relu: false, accumulate: true };
-        convolve(tier, &[g_view], &packed, &[], back, add, ViewMut::new(*s, &mut dx));
+        tier.convolve(&[g_view], backward, geometry, &[], add, ViewMut::new(*s, &mut dx));
         let want: Vec<f64> = (0..shape.n)
             .flat_map(|n| want_dx[(n * shape.c + first) * pixels..][..s.c * pixels].to_vec())
             .map(|v| v + 0.5)
@@ -175,8 +226,8 @@ proptest! {
         split in 0usize..40, seed in any::<u64>(),
     ) {
         let shape = Shape { pad: 2, ..Shape::new(n, c, h, w) };
-        for tier in Tier::available() {
-            check_layer(tier, geometry, shape, split, outputs, seed);
+        for arithmetic in Arithmetic::available() {
+            check_layer(arithmetic, geometry, shape, split, outputs, seed);
         }
     }
 

@@ -3,7 +3,7 @@
 use std::{
     fs,
     io::IsTerminal,
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::ExitCode,
     sync::{
         Arc,
@@ -14,7 +14,9 @@ use std::{
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{
-    Error, Result, models, report,
+    Error, Result, models,
+    nn::Precision,
+    report,
     testset::{self, Pair},
     train::{self, Event, Loss, Options},
 };
@@ -49,6 +51,9 @@ pub struct Args {
     /// What is minimised: relmse, smape, or both summed
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
+    /// What convolutions round their factors to: f32 (nothing) or bf16; without it, the faster one here
+    #[arg(long, value_parser = parse_precision)]
+    precision: Option<Precision>,
     /// Weight of the past in the average of the weights that is kept
     #[arg(long, default_value_t = 0.999)]
     average: f64,
@@ -89,6 +94,14 @@ fn parse_loss(text: &str) -> Result<Loss, String> {
     found.ok_or_else(|| format!("expected {}", names.join(" or ")))
 }
 
+fn parse_precision(text: &str) -> Result<Precision, String> {
+    match text {
+        "f32" => Ok(Precision::F32),
+        "bf16" => Ok(Precision::Bf16),
+        _ => Err("expected f32 or bf16".into()),
+    }
+}
+
 fn usage(message: impl Into<String>) -> Error {
     Error::Usage(message.into())
 }
@@ -102,10 +115,11 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a scene is held out: decided by its name alone, so that every sample count, seed and frame
-/// of it goes the same way. (FNV-1a, Fowler, Noll, Vo.)
-fn held_out(scene: &str) -> bool {
-    let hash = scene
+/// Whether a pair is held out: decided by its reference's file name alone, so that every sample count and
+/// seed of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+fn held_out(reference: &Path) -> bool {
+    let name = reference.file_name().unwrap_or_default().to_string_lossy();
+    let hash = name
         .bytes()
         .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
     // The low bits of this hash depend on few bits of the name.
@@ -138,7 +152,7 @@ impl Args {
         }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
-            pairs.into_iter().partition(|p| held_out(&p.scene))
+            pairs.into_iter().partition(|p| held_out(&p.reference))
         } else {
             (all_pairs(&self.val)?, pairs)
         };
@@ -162,6 +176,7 @@ impl Args {
             patch: self.patch,
             lr: self.lr,
             loss: self.loss,
+            precision: self.precision.unwrap_or_else(Precision::for_training),
             average: self.average,
             every: self.every,
             seed: self.seed,

@@ -11,6 +11,7 @@
 // Loops over lanes and registers index several arrays at once; iterators would hide the arithmetic.
 #![allow(clippy::needless_range_loop)]
 
+pub mod bf16;
 pub mod conv;
 pub mod filter;
 pub mod peak;

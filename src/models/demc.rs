@@ -238,6 +238,18 @@ impl Network for Demc {
         Ok(Inputs { planes: vec![paper_colour(passes, name)?, paper_features(passes, name)?], scale: 1.0 })
     }
 
+    fn convolutions(&mut self) -> Vec<&mut Conv> {
+        let fusion = self.fusion.iter_mut().flat_map(|f| {
+            let middle = f.middle.iter_mut().map(|(conv, _)| conv);
+            [&mut f.first].into_iter().chain(middle).chain([&mut f.last])
+        });
+        fusion
+            .chain(self.encoders.iter_mut().flat_map(|e| e.units.iter_mut().flatten()))
+            .chain(self.decoder.iter_mut().flat_map(|level| [&mut level.up, &mut level.fuse]))
+            .chain([&mut self.output])
+            .collect()
+    }
+
     fn params(&mut self) -> Vec<&mut Param> {
         let mut params = Vec::new();
         if let Some(fusion) = &mut self.fusion {

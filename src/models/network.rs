@@ -7,7 +7,7 @@ use crate::{
     Result,
     features::{Inputs, pad_to_multiple, window},
     kernels::Shape,
-    nn::{BatchNorm, Images, Param, Stats, clear_buffers},
+    nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -87,6 +87,11 @@ pub trait Network: Send + Sync {
 
     /// Its parameters, in a fixed order.
     fn params(&mut self) -> Vec<&mut Param>;
+
+    /// Its convolutions, whose arithmetic can be chosen; none if it is fixed.
+    fn convolutions(&mut self) -> Vec<&mut Conv> {
+        Vec::new()
+    }
 
     /// Its batch-norm layers, in the order in which a forward pass records their statistics.
     fn batch_norms(&mut self) -> Vec<&mut BatchNorm>;

@@ -197,7 +197,7 @@ impl Pyramid {
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.
-    fn convolutions(&self) -> impl Iterator<Item = (&Conv, usize)> {
+    fn convolution_levels(&self) -> impl Iterator<Item = (&Conv, usize)> {
         let encoders = self.encoders.iter().flat_map(|e| {
             e.levels.iter().enumerate().flat_map(|(level, convs)| convs.iter().map(move |c| (c, level + 1)))
         });
@@ -230,6 +230,10 @@ impl Network for Pyramid {
     }
 
     fn params(&mut self) -> Vec<&mut Param> {
+        self.convolutions().into_iter().flat_map(Conv::params).collect()
+    }
+
+    fn convolutions(&mut self) -> Vec<&mut Conv> {
         let encoders = self.encoders.iter_mut().flat_map(|e| e.levels.iter_mut().flatten());
         let decoder =
             self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
@@ -237,7 +241,6 @@ impl Network for Pyramid {
             .chain(decoder)
             .chain([&mut self.full])
             .chain(&mut self.heads)
-            .flat_map(|conv| conv.params())
             .collect()
     }
 
@@ -255,7 +258,7 @@ impl Network for Pyramid {
 
     fn macs_per_pixel(&self) -> f64 {
         let convolutions: f64 = self
-            .convolutions()
+            .convolution_levels()
             .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
             .sum();
         // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.

@@ -5,13 +5,14 @@
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::{Activation, Init, Param, Rng, activation::Saved, pool::Buffer};
+use super::{
+    Activation, Init, Param, Precision, Rng, activation::Saved, arithmetic::Arithmetic, pool::Buffer,
+};
 use crate::kernels::{
     Block, LANES,
-    conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len},
+    conv::Geometry,
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
-    simd::Tier,
-    weight_grad::{bias_gradient, weight_gradient},
+    weight_grad::bias_gradient,
 };
 
 /// A convolution of one or several sources, with bias and optional ReLU.
@@ -21,9 +22,7 @@ pub struct Conv {
     pub weight: Param,
     /// `(O)`.
     pub bias: Param,
-    inputs: Vec<usize>,
-    outputs: usize,
-    geometry: Geometry,
+    arithmetic: Arithmetic,
     relu: bool,
 }
 
@@ -56,9 +55,7 @@ impl Conv {
         Self {
             weight: Param::new(&device, format!("{name}.weight"), &shape, weights),
             bias: Param::new(&device, format!("{name}.bias"), &[outputs], vec![0.0; outputs]),
-            inputs: inputs.into(),
-            outputs,
-            geometry,
+            arithmetic: Arithmetic { inputs: inputs.into(), outputs, geometry, precision: Precision::F32 },
             relu: true,
         }
     }
@@ -70,15 +67,21 @@ impl Conv {
 
     /// The same layer with every bias at `value`.
     pub fn with_bias(mut self, value: f32) -> Self {
-        self.bias.set(&vec![value; self.outputs]);
+        self.bias.set(&vec![value; self.arithmetic.outputs]);
         self
+    }
+
+    /// Chooses the arithmetic of the layer and of its gradients.
+    pub fn set_precision(&mut self, precision: Precision) {
+        self.arithmetic.precision = precision;
     }
 
     /// Multiply-accumulates for one pixel of the layer's output.
     pub fn macs_per_output_pixel(&self) -> usize {
         // An output pixel of the transposed convolution sees 4 of its 16 taps.
-        let taps = if self.geometry == Geometry::Transposed { 4 } else { self.geometry.taps() };
-        self.inputs.iter().sum::<usize>() * self.outputs * taps
+        let Arithmetic { inputs, outputs, geometry, .. } = &self.arithmetic;
+        let taps = if *geometry == Geometry::Transposed { 4 } else { geometry.taps() };
+        inputs.iter().sum::<usize>() * outputs * taps
     }
 
     /// Its parameters, in a fixed order.
@@ -93,19 +96,16 @@ impl Conv {
     /// If the sources do not have the layer's channels, or differ in size.
     pub fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, sources: Vec<Activation<T>>) -> Activation<T> {
         let channels: Vec<usize> = sources.iter().map(|s| s.shape().c).collect();
-        assert_eq!(channels, self.inputs, "{} reads {:?} channels", self.weight.name, self.inputs);
+        let Arithmetic { inputs, outputs, geometry, .. } = &self.arithmetic;
+        assert_eq!(&channels, inputs, "{} reads {inputs:?} channels", self.weight.name);
         let shape = sources[0].shape();
-        let (h, w) = self.geometry.output(shape.h, shape.w);
-        let mut output = Buffer::new(shape.with_channels(self.outputs).with_size(h, w));
+        let (h, w) = geometry.output(shape.h, shape.w);
+        let mut output = Buffer::new(shape.with_channels(*outputs).with_size(h, w));
 
         let weights = self.weight.tensor.as_vec();
-        let mut packed = vec![Block::default(); packed_len(&self.inputs, self.outputs, self.geometry)];
-        pack(&weights, &self.inputs, self.outputs, self.geometry, Direction::Forward, 0, &mut packed);
         let bias = to_blocks(&self.bias.tensor.as_vec());
-        let tier = Tier::detect();
         let views: Vec<_> = sources.iter().map(|s| s.saved.data.view()).collect();
-        let epilogue = Epilogue { relu: self.relu, accumulate: false };
-        convolve(tier, &views, &packed, &bias, self.geometry, epilogue, output.view_mut());
+        self.arithmetic.forward(&views, &weights, &bias, self.relu, output.view_mut());
 
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();
@@ -116,36 +116,19 @@ impl Conv {
         let (mut activation, out) = Activation::output(output, tape);
         if T::OWNS_TAPE {
             let (weight, bias) = (self.weight.tensor.clone(), self.bias.tensor.clone());
-            let Self { inputs, outputs, geometry, relu, .. } = self.clone();
+            let (arithmetic, relu) = (self.arithmetic.clone(), self.relu);
             activation.tape.add_backward_op(move |gradients| {
                 let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
                 if relu {
                     relu_mask(out.data.view(), gradient.view_mut());
                 }
                 bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
-                let total = inputs.iter().sum();
+                let views: Vec<_> = saved.iter().map(|s| s.data.view()).collect();
+                arithmetic.weight_gradient(&views, gradient.view(), gradients.get_or_alloc_mut(&weight)?);
                 let weights = weight.as_vec();
-                let mut first = 0;
+                let input_gradient = arithmetic.input_gradient(gradient.view(), &weights);
                 for (index, source) in saved.iter().enumerate() {
-                    weight_gradient(
-                        tier,
-                        source.data.view(),
-                        gradient.view(),
-                        geometry,
-                        (first, total),
-                        gradients.get_or_alloc_mut(&weight)?,
-                    );
-                    first += inputs[index];
-                    source.accumulate(|into, fresh| {
-                        let mut packed =
-                            vec![Block::default(); packed_len(&[outputs], inputs[index], geometry)];
-                        pack(&weights, &inputs, outputs, geometry, Direction::Backward, index, &mut packed);
-                        let zero = vec![Block::default(); into.shape().planes()];
-                        let back =
-                            if geometry == Geometry::Transposed { Geometry::Strided } else { geometry };
-                        let epilogue = Epilogue { relu: false, accumulate: !fresh };
-                        convolve(tier, &[gradient.view()], &packed, &zero, back, epilogue, into.view_mut());
-                    });
+                    source.accumulate(|into, fresh| input_gradient(index, into.view_mut(), !fresh));
                 }
                 Ok(())
             });

@@ -5,6 +5,7 @@
 //! and carries a dfdx tape; parameters, losses and the optimiser are ordinary dfdx tensors.
 
 mod activation;
+mod arithmetic;
 mod field;
 mod layers;
 mod param;
@@ -12,6 +13,7 @@ mod pool;
 pub mod weights;
 
 pub use activation::Activation;
+pub use arithmetic::Precision;
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use param::{Init, Param, Rng};

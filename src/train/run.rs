@@ -24,7 +24,7 @@ use crate::{
         network::{Config, Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Rng, Stats},
+    nn::{Precision, Rng, Stats},
     testset::Pair,
 };
 
@@ -47,6 +47,8 @@ pub struct Options {
     pub lr: (f64, f64),
     /// What is minimised.
     pub loss: Loss,
+    /// What convolutions round their factors to.
+    pub precision: Precision,
     /// Weight of the past in the running average of the weights, which is what is validated and kept.
     pub average: f64,
     /// Steps between rows of the log, each with a validation.
@@ -92,6 +94,7 @@ pub fn run(
         Some(path) => weights_file::read_as(path, &options.network)?,
         None => models::build(&options.network, options.seed),
     };
+    network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
     let mut adam = Adam::default();
     let mut progress = Progress::default();

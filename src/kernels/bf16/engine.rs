@@ -1,0 +1,586 @@
+//! What depends on the processor: two matrix products and two conversions, three times.
+
+use std::{fmt, sync::OnceLock};
+
+use half::bf16;
+
+use super::{Block, CHUNK, LANES, Sums, Term, WIDE, Wide};
+
+/// A way to multiply bfloat16 matrices that this processor has.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct Engine(Unit);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Unit {
+    Portable,
+    /// AVX512-BF16: two multiply-accumulates a lane.
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    /// AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction.
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    Amx,
+}
+
+impl fmt::Debug for Engine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl Engine {
+    /// The reference implementation, on any processor.
+    pub const PORTABLE: Engine = Engine(Unit::Portable);
+
+    /// Every engine this processor can run, slowest first.
+    pub fn available() -> Vec<Engine> {
+        #[allow(unused_mut)]
+        let mut engines = vec![Engine::PORTABLE];
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx512bf16") && is_x86_feature_detected!("avx512bw") {
+            engines.push(Engine(Unit::Avx512));
+            #[cfg(target_os = "linux")]
+            if amx::permitted() {
+                engines.push(Engine(Unit::Amx));
+            }
+        }
+        engines
+    }
+
+    /// The fastest engine, found once. The environment variable `DEMC_BF16` (`portable`, `avx512`, `amx`)
+    /// chooses a slower one, to compare them.
+    pub fn detect() -> Engine {
+        static CHOICE: OnceLock<Engine> = OnceLock::new();
+        *CHOICE.get_or_init(|| {
+            let engines = Engine::available();
+            let wanted = std::env::var("DEMC_BF16").unwrap_or_default().to_lowercase();
+            let named = engines.iter().find(|e| format!("{e:?}").to_lowercase() == wanted);
+            *named.or(engines.last()).expect("the portable engine is always available")
+        })
+    }
+
+    /// Whether forward products are faster than f32 ones.
+    pub fn is_native(self) -> bool {
+        self != Engine::PORTABLE
+    }
+
+    /// Whether the products of training are faster than f32 ones, weight gradients included.
+    pub fn trains(self) -> bool {
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        if self.0 == Unit::Amx {
+            return true;
+        }
+        false
+    }
+
+    /// Makes the processor ready for products on this thread while `work` runs.
+    pub(super) fn ready<R>(self, work: impl FnOnce() -> R) -> R {
+        match self.0 {
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            Unit::Amx => {
+                let _tiles = amx::Tiles::configure();
+                work()
+            }
+            _ => work(),
+        }
+    }
+
+    /// `sums[o][p] = sum over terms of input[p + term.input] * weights[o][term.weights]` for 32 positions
+    /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart.
+    ///
+    /// # Safety
+    /// Called inside [`Engine::ready`]; every term's 32 rows of input and 16 rows of weights can be read.
+    pub(super) unsafe fn multiply(
+        self,
+        terms: &[Term],
+        input: *const Wide,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: an engine is only made after its instructions were detected; the rest is the caller's.
+        unsafe {
+            match self.0 {
+                Unit::Portable => portable::multiply(terms, input, weights, (outputs, plane), sums),
+                #[cfg(target_arch = "x86_64")]
+                Unit::Avx512 => avx512::multiply(terms, input, weights, (outputs, plane), sums),
+                #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+                Unit::Amx => amx::multiply(terms, input, weights, (outputs, plane), sums),
+            }
+        }
+    }
+
+    /// `sums[o][half][i] += sum over positions of channels[16 half + i][position] * pairs[o][position]`:
+    /// 32 input channels, each a row of `stride` bytes, against `outputs` (1 or 2) output planes, `plane`
+    /// rows apart, of `steps` times 32 positions interleaved two by two.
+    ///
+    /// # Safety
+    /// Called inside [`Engine::ready`]; all rows can be read.
+    pub(super) unsafe fn correlate(
+        self,
+        steps: usize,
+        channels: *const bf16,
+        stride: usize,
+        pairs: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: as in `multiply`.
+        unsafe {
+            match self.0 {
+                #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+                Unit::Amx => amx::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
+                _ => portable::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
+            }
+        }
+    }
+
+    /// Rounds 32 channels, the upper 16 of which may be absent, to bfloat16, block by block.
+    pub(super) fn narrow(self, low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
+        match self.0 {
+            Unit::Portable => portable::narrow(low, high, out),
+            // SAFETY: an engine is only made after its instructions were detected.
+            #[cfg(target_arch = "x86_64")]
+            _ => unsafe { avx512::narrow(low, high, out) },
+        }
+    }
+
+    /// Rounds up to 16 blocks to bfloat16 and lays each of their 16 channels out as a row: channel `c` of
+    /// block `i` becomes `rows[c * stride + i]`. All 16 places of a row are written.
+    ///
+    /// # Safety
+    /// `rows` is valid for writes of 16 values in each of 16 rows of `stride` values.
+    pub(super) unsafe fn transpose(self, blocks: &[Block], rows: *mut bf16, stride: usize) {
+        // SAFETY: the caller's promise; instructions as above.
+        unsafe {
+            match self.0 {
+                Unit::Portable => portable::transpose(blocks, rows, stride),
+                #[cfg(target_arch = "x86_64")]
+                _ => avx512::transpose(blocks, rows, stride),
+            }
+        }
+    }
+}
+
+/// Plain loops: the oracle of the other engines.
+mod portable {
+    use super::*;
+
+    pub unsafe fn multiply(
+        terms: &[Term],
+        input: *const Wide,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        for (o, sums) in sums.0[..outputs].iter_mut().enumerate() {
+            sums.fill(Block::default());
+            for term in terms {
+                for (p, sum) in sums.iter_mut().enumerate() {
+                    // SAFETY: the caller's promise.
+                    let (x, w) = unsafe {
+                        let w = weights.byte_add(term.weights).add(o * plane);
+                        (&*input.byte_offset(term.input).add(p), std::slice::from_raw_parts(w, LANES))
+                    };
+                    for (pair, w) in w.iter().enumerate() {
+                        let (a, b) = (x.0[2 * pair].to_f32(), x.0[2 * pair + 1].to_f32());
+                        for l in 0..LANES {
+                            sum.0[l] += a * w.0[2 * l].to_f32() + b * w.0[2 * l + 1].to_f32();
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    pub unsafe fn correlate(
+        steps: usize,
+        channels: *const bf16,
+        stride: usize,
+        pairs: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        for (o, sums) in sums.0[..outputs].iter_mut().enumerate() {
+            for (channel, sum) in sums.iter_mut().enumerate() {
+                for pair in 0..steps * CHUNK / 2 {
+                    // SAFETY: the caller's promise.
+                    let (x, g) = unsafe {
+                        let row = channels.byte_add(channel * stride).add(2 * pair);
+                        ([row.read_unaligned(), row.add(1).read_unaligned()], &*pairs.add(o * plane + pair))
+                    };
+                    for l in 0..LANES {
+                        sum.0[l] += x[0].to_f32() * g.0[2 * l].to_f32() + x[1].to_f32() * g.0[2 * l + 1].to_f32();
+                    }
+                }
+            }
+        }
+    }
+
+    pub fn narrow(low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
+        for (i, (out, low)) in out.iter_mut().zip(low).enumerate() {
+            for l in 0..LANES {
+                out.0[l] = bf16::from_f32(low.0[l]);
+                out.0[LANES + l] = high.map_or(bf16::ZERO, |h| bf16::from_f32(h[i].0[l]));
+            }
+        }
+    }
+
+    pub unsafe fn transpose(blocks: &[Block], rows: *mut bf16, stride: usize) {
+        for c in 0..LANES {
+            for i in 0..LANES {
+                let value = blocks.get(i).map_or(bf16::ZERO, |b| bf16::from_f32(b.0[c]));
+                // SAFETY: the caller's promise.
+                unsafe { rows.add(c * stride + i).write(value) };
+            }
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod avx512 {
+    use std::arch::x86_64::*;
+
+    use super::{Block, CHUNK, LANES, Sums, Term, Wide, bf16};
+
+    /// Positions whose sums stay in registers: 2 planes x 8 of them, beside 2 registers of weights.
+    const TILE: usize = 8;
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    pub unsafe fn multiply(
+        terms: &[Term],
+        input: *const Wide,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            if outputs == 2 {
+                tiles::<2>(terms, input, weights, plane, sums);
+            } else {
+                tiles::<1>(terms, input, weights, plane, sums);
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    #[inline]
+    unsafe fn tiles<const OUT: usize>(
+        terms: &[Term],
+        input: *const Wide,
+        weights: *const Wide,
+        plane: usize,
+        sums: &mut Sums,
+    ) {
+        for first in (0..CHUNK).step_by(TILE) {
+            let mut acc = [[_mm512_setzero_ps(); TILE]; OUT];
+            for term in terms {
+                // SAFETY: the caller's promise.
+                unsafe {
+                    let x = input.byte_offset(term.input).add(first).cast::<i32>();
+                    let w = weights.byte_add(term.weights);
+                    for pair in 0..LANES {
+                        let w: [__m512bh; OUT] = std::array::from_fn(|o| {
+                            std::mem::transmute(_mm512_load_si512(w.add(o * plane + pair).cast()))
+                        });
+                        for p in 0..TILE {
+                            let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(*x.add(p * LANES + pair)));
+                            for o in 0..OUT {
+                                acc[o][p] = _mm512_dpbf16_ps(acc[o][p], w[o], x);
+                            }
+                        }
+                    }
+                }
+            }
+            for (acc, sums) in acc.iter().zip(&mut sums.0) {
+                for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
+                    // SAFETY: a block is 64 bytes, aligned to as many.
+                    unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), *acc) };
+                }
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    pub unsafe fn narrow(low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
+        for (i, (out, low)) in out.iter_mut().zip(low).enumerate() {
+            // SAFETY: blocks and wides are 64 bytes, aligned to as many.
+            unsafe {
+                let low = _mm512_load_ps(low.0.as_ptr());
+                let high = high.map_or(_mm512_setzero_ps(), |h| _mm512_load_ps(h[i].0.as_ptr()));
+                let both: __m512i = std::mem::transmute(_mm512_cvtne2ps_pbh(high, low));
+                _mm512_store_si512(out.0.as_mut_ptr().cast(), both);
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    pub unsafe fn transpose(blocks: &[Block], rows: *mut bf16, stride: usize) {
+        let mut r: [__m512; LANES] = [_mm512_setzero_ps(); LANES];
+        for (r, block) in r.iter_mut().zip(blocks) {
+            // SAFETY: a block is 64 bytes, aligned to as many.
+            *r = unsafe { _mm512_load_ps(block.0.as_ptr()) };
+        }
+        let pd = |v| _mm512_castps_pd(v);
+        let ps = |v| _mm512_castpd_ps(v);
+        // 2x2, then 4x4 inside 128-bit lanes, then the lanes themselves.
+        let mut t = r;
+        for i in 0..8 {
+            t[2 * i] = _mm512_unpacklo_ps(r[2 * i], r[2 * i + 1]);
+            t[2 * i + 1] = _mm512_unpackhi_ps(r[2 * i], r[2 * i + 1]);
+        }
+        for i in (0..16).step_by(4) {
+            r[i] = ps(_mm512_unpacklo_pd(pd(t[i]), pd(t[i + 2])));
+            r[i + 1] = ps(_mm512_unpackhi_pd(pd(t[i]), pd(t[i + 2])));
+            r[i + 2] = ps(_mm512_unpacklo_pd(pd(t[i + 1]), pd(t[i + 3])));
+            r[i + 3] = ps(_mm512_unpackhi_pd(pd(t[i + 1]), pd(t[i + 3])));
+        }
+        const EVEN: i32 = 0x88;
+        const ODD: i32 = 0xdd;
+        for j in 0..4 {
+            t[j] = _mm512_shuffle_f32x4::<EVEN>(r[j], r[4 + j]);
+            t[4 + j] = _mm512_shuffle_f32x4::<ODD>(r[j], r[4 + j]);
+            t[8 + j] = _mm512_shuffle_f32x4::<EVEN>(r[8 + j], r[12 + j]);
+            t[12 + j] = _mm512_shuffle_f32x4::<ODD>(r[8 + j], r[12 + j]);
+        }
+        for j in 0..4 {
+            r[j] = _mm512_shuffle_f32x4::<EVEN>(t[j], t[8 + j]);
+            r[8 + j] = _mm512_shuffle_f32x4::<ODD>(t[j], t[8 + j]);
+            r[4 + j] = _mm512_shuffle_f32x4::<EVEN>(t[4 + j], t[12 + j]);
+            r[12 + j] = _mm512_shuffle_f32x4::<ODD>(t[4 + j], t[12 + j]);
+        }
+        for (c, r) in r.iter().enumerate() {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let row: __m256i = std::mem::transmute(_mm512_cvtneps_pbh(*r));
+                _mm256_storeu_si256(rows.add(c * stride).cast(), row);
+            }
+        }
+    }
+}
+
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod amx {
+    use std::{
+        arch::{
+            asm,
+            x86_64::{__cpuid, __cpuid_count},
+        },
+        sync::OnceLock,
+    };
+
+    use super::*;
+
+    /// Whether the processor has AMX-BF16 and the kernel lets this process use it.
+    pub fn permitted() -> bool {
+        /// Bits of CPUID leaf 7, EDX.
+        const AMX_BF16: u32 = 1 << 22;
+        const AMX_TILE: u32 = 1 << 24;
+        /// The tile data's bit among the extended states, and the request for it (Linux 5.16).
+        const TILE_DATA: libc::c_ulong = 18;
+        const ARCH_REQ_XCOMP_PERM: libc::c_ulong = 0x1023;
+        static PERMITTED: OnceLock<bool> = OnceLock::new();
+        *PERMITTED.get_or_init(|| {
+            if __cpuid(0).eax < 7 {
+                return false;
+            }
+            let features = __cpuid_count(7, 0).edx;
+            // SAFETY: the call only sets a permission of this process; older kernels refuse it.
+            features & AMX_BF16 != 0
+                && features & AMX_TILE != 0
+                && unsafe { libc::syscall(libc::SYS_arch_prctl, ARCH_REQ_XCOMP_PERM, TILE_DATA) } == 0
+        })
+    }
+
+    /// Bytes of a tile's row, and of a tile.
+    const ROW: usize = 64;
+    const TILE: usize = 16 * ROW;
+
+    /// Eight tiles of 16 rows of 64 bytes, while it lives.
+    pub struct Tiles;
+
+    impl Tiles {
+        pub fn configure() -> Self {
+            #[repr(C, align(64))]
+            struct Config([u8; 64]);
+            let mut config = Config([0; 64]);
+            config.0[0] = 1;
+            for tile in 0..8 {
+                config.0[16 + 2 * tile] = ROW as u8;
+                config.0[48 + tile] = 16;
+            }
+            // SAFETY: the palette is the architecture's only one; an AMX engine exists, so the state is
+            // permitted.
+            unsafe { asm!("ldtilecfg [{}]", in(reg) &config, options(nostack, readonly)) };
+            Tiles
+        }
+    }
+
+    impl Drop for Tiles {
+        fn drop(&mut self) {
+            // SAFETY: gives the tile state back, so that later context switches need not save it.
+            unsafe { asm!("tilerelease", options(nostack, nomem)) };
+        }
+    }
+
+    pub unsafe fn multiply(
+        terms: &[Term],
+        input: *const Wide,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        debug_assert!(!terms.is_empty());
+        // SAFETY: the caller's promise; the loops run over `terms`, which are not empty; the sums of an
+        // output plane are two tiles.
+        unsafe {
+            if outputs == 2 {
+                asm!(
+                    "tilezero tmm0",
+                    "tilezero tmm1",
+                    "tilezero tmm2",
+                    "tilezero tmm3",
+                    "2:",
+                    "mov {x}, qword ptr [{term}]",
+                    "mov {w}, qword ptr [{term} + 8]",
+                    "add {x}, {input}",
+                    "add {w}, {weights}",
+                    "tileloadd tmm4, [{x} + {row}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "add {w}, {plane}",
+                    "tileloadd tmm5, [{x} + {row}*1 + 1024]",
+                    "tileloadd tmm7, [{w} + {row}*1]",
+                    "add {term}, 16",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "tdpbf16ps tmm2, tmm4, tmm7",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    "cmp {term}, {end}",
+                    "jne 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    "tilestored [{sums} + {row}*1 + 2048], tmm2",
+                    "tilestored [{sums} + {row}*1 + 3072], tmm3",
+                    x = out(reg) _,
+                    w = out(reg) _,
+                    term = inout(reg) terms.as_ptr() => _,
+                    end = in(reg) terms.as_ptr_range().end,
+                    input = in(reg) input,
+                    weights = in(reg) weights,
+                    plane = in(reg) plane * ROW,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            } else {
+                asm!(
+                    "tilezero tmm0",
+                    "tilezero tmm1",
+                    "2:",
+                    "mov {x}, qword ptr [{term}]",
+                    "mov {w}, qword ptr [{term} + 8]",
+                    "add {x}, {input}",
+                    "add {w}, {weights}",
+                    "tileloadd tmm4, [{x} + {row}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{x} + {row}*1 + 1024]",
+                    "add {term}, 16",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "cmp {term}, {end}",
+                    "jne 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    x = out(reg) _,
+                    w = out(reg) _,
+                    term = inout(reg) terms.as_ptr() => _,
+                    end = in(reg) terms.as_ptr_range().end,
+                    input = in(reg) input,
+                    weights = in(reg) weights,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            }
+        }
+    }
+
+    pub unsafe fn correlate(
+        steps: usize,
+        channels: *const bf16,
+        stride: usize,
+        pairs: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        debug_assert!(steps > 0);
+        // SAFETY: the caller's promise; `steps` is not zero.
+        unsafe {
+            let upper = channels.byte_add(16 * stride);
+            if outputs == 2 {
+                asm!(
+                    "tileloadd tmm0, [{sums} + {row}*1]",
+                    "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
+                    "tileloadd tmm2, [{sums} + {row}*1 + 2048]",
+                    "tileloadd tmm3, [{sums} + {row}*1 + 3072]",
+                    "2:",
+                    "tileloadd tmm4, [{x} + {stride}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{y} + {stride}*1]",
+                    "tileloadd tmm7, [{v} + {row}*1]",
+                    "add {x}, 64",
+                    "add {y}, 64",
+                    "add {w}, 1024",
+                    "add {v}, 1024",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "tdpbf16ps tmm2, tmm4, tmm7",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    "dec {steps}",
+                    "jnz 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    "tilestored [{sums} + {row}*1 + 2048], tmm2",
+                    "tilestored [{sums} + {row}*1 + 3072], tmm3",
+                    x = inout(reg) channels => _,
+                    y = inout(reg) upper => _,
+                    w = inout(reg) pairs => _,
+                    v = inout(reg) pairs.add(plane) => _,
+                    steps = inout(reg) steps => _,
+                    stride = in(reg) stride,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            } else {
+                asm!(
+                    "tileloadd tmm0, [{sums} + {row}*1]",
+                    "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
+                    "2:",
+                    "tileloadd tmm4, [{x} + {stride}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{y} + {stride}*1]",
+                    "add {x}, 64",
+                    "add {y}, 64",
+                    "add {w}, 1024",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "dec {steps}",
+                    "jnz 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    x = inout(reg) channels => _,
+                    y = inout(reg) upper => _,
+                    w = inout(reg) pairs => _,
+                    steps = inout(reg) steps => _,
+                    stride = in(reg) stride,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            }
+        }
+        const { assert!(TILE == 1024 && size_of::<Sums>() == 4 * TILE && size_of::<Term>() == 16) };
+        const { assert!(size_of::<Wide>() == ROW && WIDE == 32) };
+    }
+}

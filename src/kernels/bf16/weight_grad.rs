@@ -1,0 +1,203 @@
+//! Weight gradients in bfloat16: a matrix product whose inner dimension runs over pixels.
+//!
+//! The input is laid out channel by channel ([`Channels`]), so that a tap is a shift along the row; the
+//! output gradient in interleaved pairs of positions ([`Pairs`]), zero on every border, so that rows need
+//! not be told apart.
+
+use half::bf16;
+use rayon::prelude::*;
+
+use super::{Block, Buffer, CHUNK, Engine, Geometry, Grid, LANES, Shape, Sums, View, WIDE, Wide, halves};
+use crate::kernels::conv::weight_index;
+
+/// Products of 32 positions that keep both factors in the first-level cache over all taps.
+const STEPS: usize = 8;
+
+/// An activation, channel by channel.
+#[derive(Debug)]
+pub struct Channels {
+    /// `[image][plane of 32][channel]`, each a row of `stride` values.
+    data: Buffer,
+    stride: usize,
+    shape: Shape,
+}
+
+impl Channels {
+    /// Rounds and transposes an activation.
+    pub fn new(engine: Engine, source: View) -> Self {
+        let s = source.shape;
+        let planes = s.c.div_ceil(WIDE);
+        let grid = Grid::new(s, false);
+        // An odd number of cache lines: rows of a tile then lie in different cache sets.
+        let lines = (grid.positions() + grid.slack()).div_ceil(WIDE) | 1;
+        let mut data = Buffer::new(s.n * planes * WIDE * lines);
+        data.0.par_chunks_mut(WIDE * lines).enumerate().for_each(|(i, out)| {
+            let (low, high) = halves(source, i / planes, i % planes);
+            let stride = lines * WIDE;
+            let (lower, upper) = out.split_at_mut(LANES * lines);
+            for (blocks, rows) in [(Some(low), lower), (high, upper)] {
+                let Some(blocks) = blocks else {
+                    rows.fill(Wide::ZERO);
+                    continue;
+                };
+                let rows = rows.as_mut_ptr().cast::<bf16>();
+                let covered = blocks.len().next_multiple_of(LANES);
+                for (i, blocks) in blocks.chunks(LANES).enumerate() {
+                    // SAFETY: a row holds all positions, rounded up to 16.
+                    unsafe { engine.transpose(blocks, rows.add(i * LANES), stride) };
+                }
+                for channel in 0..LANES {
+                    // SAFETY: the rest of the row; another user may have left NaN there.
+                    unsafe { rows.add(channel * stride + covered).write_bytes(0, stride - covered) };
+                }
+            }
+        });
+        Self { data, stride: lines * WIDE, shape: s }
+    }
+}
+
+/// An output gradient, positions interleaved two by two.
+#[derive(Debug)]
+pub struct Pairs {
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the left border of row 0.
+    data: Buffer,
+    rows: usize,
+    grid: Grid,
+    shape: Shape,
+    geometry: Geometry,
+}
+
+impl Pairs {
+    /// Rounds and interleaves the output gradient of a convolution of `geometry`.
+    pub fn new(gradient: View, geometry: Geometry) -> Self {
+        let g = gradient.shape;
+        let grid = Grid::new(g, geometry == Geometry::Transposed);
+        let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
+        let mut data = Buffer::new(g.n * g.planes() * grid.phases() * rows);
+        let origin = grid.row(0) - grid.pad;
+        data.0.par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
+            let (phase, plane) = (i % grid.phases(), i / grid.phases());
+            let blocks = &gradient.data[plane * g.plane_stride()..][..g.plane_stride()];
+            if grid.split {
+                out.fill(Wide::ZERO);
+                grid.pixels(g, phase, |to, from| {
+                    let to = to - origin;
+                    for l in 0..LANES {
+                        out[to / 2].0[2 * l + to % 2] = bf16::from_f32(blocks[from].0[l]);
+                    }
+                });
+            } else {
+                let positions = grid.h * grid.stride();
+                let (pairs, rest) = blocks[origin..][..positions].as_chunks::<2>();
+                let (whole, tail) = out.split_at_mut(pairs.len());
+                for (out, pair) in whole.iter_mut().zip(pairs) {
+                    *out = interleave(&pair[0], &pair[1]);
+                }
+                tail.fill(Wide::ZERO);
+                if let (Some(out), Some(last)) = (tail.first_mut(), rest.first()) {
+                    *out = interleave(last, &Block::default());
+                }
+            }
+        });
+        Self { data, rows, grid, shape: g, geometry }
+    }
+}
+
+/// Two blocks as pairs.
+fn interleave(a: &Block, b: &Block) -> Wide {
+    let mut out = Wide::ZERO;
+    for l in 0..LANES {
+        out.0[2 * l] = bf16::from_f32(a.0[l]);
+        out.0[2 * l + 1] = bf16::from_f32(b.0[l]);
+    }
+    out
+}
+
+/// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
+///
+/// # Panics
+/// If sizes or lengths do not fit together.
+pub fn weight_gradient(
+    engine: Engine,
+    source: &Channels,
+    output_gradient: &Pairs,
+    (first, inputs): (usize, usize),
+    gradient: &mut [f32],
+) {
+    let (s, g, grid) = (source.shape, output_gradient.shape, output_gradient.grid);
+    let geometry = output_gradient.geometry;
+    assert_eq!((g.n, (g.h, g.w)), (s.n, geometry.output(s.h, s.w)));
+    assert_eq!(grid.pad, s.pad, "both factors need one border");
+    let taps = geometry.taps();
+    assert_eq!(gradient.len(), inputs * g.c * taps);
+
+    // Where each tap finds the input, and the phase of the gradient it goes with.
+    let signed = |v: usize| isize::try_from(v).expect("buffers fit in memory");
+    let shifts: Vec<(isize, usize)> = (0..taps)
+        .map(|t| match geometry {
+            Geometry::Same(k) => {
+                let (dy, dx) = (signed(t / k) - signed(k / 2), signed(t % k) - signed(k / 2));
+                (dy * signed(grid.stride()) + dx, 0)
+            }
+            // out[2m + k - 1] += in[m] w[k]: the gradient at square m + (k - 1) div 2, pixel (k - 1) mod 2.
+            _ => {
+                let (ky, kx) = (signed(t / 4) - 1, signed(t % 4) - 1);
+                let shift = ky.div_euclid(2) * signed(grid.stride()) + kx.div_euclid(2);
+                (-shift, (2 * ky.rem_euclid(2) + kx.rem_euclid(2)).unsigned_abs())
+            }
+        })
+        .collect();
+
+    let (wide, groups) = (s.c.div_ceil(WIDE), g.planes().div_ceil(2));
+    // Few planes leave too few tasks, so images become tasks as well, each with its own sum.
+    let parts = if wide * groups >= 8 { 1 } else { s.n.min(8) };
+    let task_sums = |task: usize| {
+        let (part, pair) = (task / (wide * groups), task % (wide * groups));
+        let (group, input) = (pair / wide, pair % wide);
+        let outputs = (g.planes() - 2 * group).min(2);
+        let mut sums: Vec<Sums> = shifts.iter().map(|_| Sums([[Block::default(); CHUNK]; 2])).collect();
+        let phases = grid.phases() * output_gradient.rows;
+        engine.ready(|| {
+            for n in part * s.n / parts..(part + 1) * s.n / parts {
+                let channels = (n * wide + input) * WIDE * source.stride;
+                let pairs = (n * g.planes() + 2 * group) * phases;
+                let steps = output_gradient.rows * 2 / CHUNK;
+                for step in (0..steps).step_by(STEPS) {
+                    let count = STEPS.min(steps - step);
+                    for (&(shift, phase), sums) in shifts.iter().zip(&mut sums) {
+                        let position = signed(grid.row(0) - grid.pad + step * CHUNK) + shift;
+                        // SAFETY: borders and slack cover the shift; `ready` was called.
+                        unsafe {
+                            let channels = source.data.0.as_ptr().cast::<bf16>().add(channels).offset(position);
+                            let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
+                            let pairs = output_gradient.data.0.as_ptr().add(at);
+                            let stride = source.stride * size_of::<bf16>();
+                            engine.correlate(count, channels, stride, pairs, (outputs, phases), sums);
+                        }
+                    }
+                }
+            }
+        });
+        sums
+    };
+    let sums: Vec<Vec<Sums>> = (0..parts * wide * groups).into_par_iter().map(task_sums).collect();
+
+    gradient.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
+        let (o, i) = match geometry {
+            Geometry::Same(_) => (at / inputs, at % inputs),
+            _ => (at % g.c, at / g.c),
+        };
+        if i < first || i >= first + s.c {
+            return;
+        }
+        debug_assert_eq!(weight_index(geometry, g.c, inputs, o, i, 0), at * taps);
+        let i = i - first;
+        let (plane, lane) = (o / LANES, o % LANES);
+        for part in 0..parts {
+            let sums = &sums[(part * groups + plane / 2) * wide + i / WIDE];
+            for (value, sums) in chunk.iter_mut().zip(sums) {
+                *value += sums.0[plane % 2][i % WIDE].0[lane];
+            }
+        }
+    });
+}

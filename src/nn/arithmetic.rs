@@ -1,0 +1,119 @@
+//! A convolution and its gradients in either precision: what the layers' passes call.
+
+use serde::{Deserialize, Serialize};
+
+use crate::kernels::{
+    Block, View, ViewMut,
+    bf16::{self, Engine},
+    conv::{self, Direction, Epilogue, Geometry},
+    simd::Tier,
+    weight_grad,
+};
+
+/// What the factors of a convolution are rounded to; sums are always f32.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// Not at all.
+    F32,
+    /// To bfloat16 (8 bits of mantissa), as matrix units want them.
+    Bf16,
+}
+
+impl Precision {
+    /// The faster one for training on this processor.
+    pub fn for_training() -> Self {
+        if Engine::detect().trains() { Self::Bf16 } else { Self::F32 }
+    }
+}
+
+/// What a convolution is, apart from its weights.
+#[derive(Clone, Debug)]
+pub(super) struct Arithmetic {
+    /// Channels of every source.
+    pub inputs: Vec<usize>,
+    pub outputs: usize,
+    pub geometry: Geometry,
+    pub precision: Precision,
+}
+
+impl Arithmetic {
+    /// `output = relu(bias + conv(sources, weights))`, the ReLU only where asked for.
+    pub fn forward(&self, sources: &[View], weights: &[f32], bias: &[Block], relu: bool, output: ViewMut) {
+        let Self { inputs, outputs, geometry, .. } = self;
+        let epilogue = Epilogue { relu, accumulate: false };
+        match self.precision {
+            Precision::F32 => {
+                let mut packed = vec![Block::default(); conv::packed_len(inputs, *outputs, *geometry)];
+                conv::pack(weights, inputs, *outputs, *geometry, Direction::Forward, 0, &mut packed);
+                conv::convolve(Tier::detect(), sources, &packed, bias, *geometry, epilogue, output);
+            }
+            Precision::Bf16 => {
+                let engine = Engine::detect();
+                let packed =
+                    bf16::conv::Weights::pack(weights, inputs, *outputs, *geometry, Direction::Forward, 0);
+                let input = bf16::Operand::new(engine, sources, *geometry);
+                bf16::conv::convolve(engine, &input, &packed, bias, epilogue, output);
+            }
+        }
+    }
+
+    /// Adds the gradient of the weights to `into`.
+    pub fn weight_gradient(&self, sources: &[View], gradient: View, into: &mut [f32]) {
+        let total = self.inputs.iter().sum();
+        let engine = Engine::detect();
+        let pairs = (self.precision == Precision::Bf16)
+            .then(|| bf16::weight_grad::Pairs::new(gradient, self.geometry));
+        let mut first = 0;
+        for source in sources {
+            match &pairs {
+                None => weight_grad::weight_gradient(
+                    Tier::detect(),
+                    *source,
+                    gradient,
+                    self.geometry,
+                    (first, total),
+                    into,
+                ),
+                Some(pairs) => {
+                    let channels = bf16::weight_grad::Channels::new(engine, *source);
+                    bf16::weight_grad::weight_gradient(engine, &channels, pairs, (first, total), into);
+                }
+            }
+            first += source.shape.c;
+        }
+    }
+
+    /// The gradient of each source from that of the output: a function of the source's index, where to
+    /// write, and whether to add to what is there.
+    pub fn input_gradient(&self, gradient: View, weights: &[f32]) -> impl Fn(usize, ViewMut, bool) {
+        let back = if self.geometry == Geometry::Transposed { Geometry::Strided } else { self.geometry };
+        let engine = Engine::detect();
+        let operand =
+            (self.precision == Precision::Bf16).then(|| bf16::Operand::new(engine, &[gradient], back));
+        move |index, into, accumulate| {
+            let Self { inputs, outputs, geometry, .. } = self;
+            let epilogue = Epilogue { relu: false, accumulate };
+            let zero = vec![Block::default(); into.shape.planes()];
+            match &operand {
+                None => {
+                    let mut packed =
+                        vec![Block::default(); conv::packed_len(&[*outputs], inputs[index], *geometry)];
+                    conv::pack(weights, inputs, *outputs, *geometry, Direction::Backward, index, &mut packed);
+                    conv::convolve(Tier::detect(), &[gradient], &packed, &zero, back, epilogue, into);
+                }
+                Some(operand) => {
+                    let packed = bf16::conv::Weights::pack(
+                        weights,
+                        inputs,
+                        *outputs,
+                        *geometry,
+                        Direction::Backward,
+                        index,
+                    );
+                    bf16::conv::convolve(engine, operand, &packed, &zero, epilogue, into);
+                }
+            }
+        }
+    }
+}
