@@ -37,7 +37,8 @@ from demc_scenes.blends import find_blends, open_blend
 from demc_scenes.kinds import KINDS
 from demc_scenes.stage import Stage
 
-_FRAME_SIZES = ((480, 270), (480, 270), (640, 360), (960, 540), (960, 540), (1280, 720))
+_FRAME_SIZES = ((480, 270), (480, 270), (480, 270), (640, 360), (640, 360), (960, 540))
+_LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
 _DROPPED = ("Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
@@ -53,9 +54,13 @@ def parse(arguments):
     parser.add_argument("--blend-share", type=float, default=0.3, metavar="F",
                         help="share of seeds that go to --blend scenes (default 0.3)")
     parser.add_argument("--kinds", metavar="a,b", help="kinds of scenes (default: all)")
-    parser.add_argument("--size", type=cl.positive, default=128, metavar="N", help="side of a crop in pixels (default 128)")
+    parser.add_argument("--size", type=cl.side_or_size, default=(128, 128), metavar="N[xM]",
+                        help="crops of N by N pixels, or of N by M (default 128)")
     parser.add_argument("--crops", type=cl.positive, default=1, metavar="N", help="crops per scene (default 1)")
     parser.add_argument("--spp", type=cl.counts, default=[4], metavar="N[,N]", help="samples of the noisy crops (default 4)")
+    parser.add_argument("--also-spp", type=cl.counts, default=[], metavar="N[,N]",
+                        help="a share of the crops is also rendered with one of these sample counts")
+    parser.add_argument("--also-share", type=float, default=0.25, metavar="F", help="that share (default 0.25)")
     parser.add_argument("--noisy-seeds", type=cl.positive, default=1, metavar="N",
                         help="noisy renders of each crop and sample count (default 1)")
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
@@ -101,6 +106,11 @@ def noisy_names(options, crop):
         for n in range(options.noisy_seeds):
             plain = names.noisy_name(crop, spp)
             yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n
+    rng = random.Random(f"also {crop}")
+    if options.also_spp and rng.random() < options.also_share:
+        spp = rng.choice(options.also_spp)
+        if spp not in options.spp:
+            yield names.noisy_name(crop, spp), spp, 0
 
 
 class Records:
@@ -170,13 +180,13 @@ def settings_of_scene(edits, scene, rng, options, is_blend):
         return
     cycles = scene.cycles
     cycles.device = "CPU"
-    cycles.max_bounces, cycles.diffuse_bounces = 8, rng.choice((3, 4, 4))
+    cycles.max_bounces, cycles.diffuse_bounces = rng.choice((6, 8)), rng.choice((2, 3, 4))
     cycles.glossy_bounces, cycles.transmission_bounces, cycles.transparent_max_bounces = 4, 8, 8
     cycles.sample_clamp_indirect = rng.choice((0.0, 0.0, 10.0, 10.0))
     cycles.sample_clamp_direct = 0.0
     cycles.blur_glossy = rng.choice((0.0, 1.0))
     cycles.caustics_reflective = cycles.caustics_refractive = rng.random() < 0.85
-    cycles.use_light_tree = True
+    cycles.use_light_tree = rng.random() < 0.7
     scene.frame_set(1)
 
 
@@ -207,7 +217,8 @@ def render_crop(options, scene, region, crop, seed, partial):
                 render_compact(scene, os.path.join(options.out, file), partial)
         with Edits() as passes:
             rendering.combined_only(passes, layers)
-            rendering.set_sampling(passes, scene, options.ref_spp, rendering.mixed_seed(seed, crop, "reference"), options.ref_noise)
+            rendering.set_sampling(passes, scene, options.ref_spp, rendering.mixed_seed(seed, crop, "reference"),
+                                   options.ref_noise, _LEAST_SAMPLES if options.denoise_references else 0)
             if options.denoise_references:
                 rendering.denoise(passes, scene, layers)
             render_compact(scene, os.path.join(options.out, names.reference_name(crop)), partial)

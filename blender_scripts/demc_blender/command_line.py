@@ -63,6 +63,11 @@ def size(text):
     return positive(parts[0]), positive(parts[1])
 
 
+def side_or_size(text):
+    """Parses `128` or `320x180` into (width, height)."""
+    return size(text) if "x" in text.lower() else (positive(text),) * 2
+
+
 def frame_range(text):
     """Parses `A-B` or a single `A` into (first, last); negative frames are written `-5--1`."""
     cut = text.find("-", 1)

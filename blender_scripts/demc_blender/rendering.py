@@ -109,15 +109,16 @@ def set_region(edits, scene, region):
     edits.set(render, "use_crop_to_border", True)
 
 
-def set_sampling(edits, scene, spp, seed, noise_threshold=0.0):
-    """Exactly `spp` samples a pixel, or adaptive up to `spp` where a noise threshold is given."""
+def set_sampling(edits, scene, spp, seed, noise_threshold=0.0, least=0):
+    """Exactly `spp` samples a pixel, or adaptive where a noise threshold is given: from `least` (0
+    for Cycles' own choice) up to `spp`."""
     cycles = scene.cycles
     edits.set(cycles, "samples", spp)
     edits.set(cycles, "seed", seed)
     edits.set(cycles, "use_adaptive_sampling", noise_threshold > 0.0)
     if noise_threshold > 0.0:
         edits.set(cycles, "adaptive_threshold", noise_threshold)
-        edits.set(cycles, "adaptive_min_samples", 0)
+        edits.set(cycles, "adaptive_min_samples", least)
 
 
 def render_to(scene, path, layer=None):

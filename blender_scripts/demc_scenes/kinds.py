@@ -70,7 +70,7 @@ def _fog(stage):
 
 # Name -> (builder, weight). A builder fills the stage and returns a function that places a camera.
 KINDS = {
-    "room": (_room, 7),
+    "room": (_room, 12),
     "street": (_street, 2),
     "outdoor": (_outdoor, 3),
     "studio": (_table(studio.studio), 2),

@@ -172,7 +172,7 @@ def crops(rng, scene, guides, count, size):
     little detail, or darkness alone, are not offered."""
     image, albedo, normal = guides
     width, height = rendering.frame_size(scene)
-    size = (min(size, width), min(size, height))
+    size = (min(size[0], width), min(size[1], height))
     scale, frame_level = image.shape[1] / width, max(brightness(image), 1e-9)
     found = []
     for _ in range(60):
