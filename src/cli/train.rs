@@ -66,7 +66,7 @@ pub struct Args {
     /// Seed of initial weights, crops and augmentation
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Weights file to begin with, of the same model and widths
+    /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
     /// Go on from the run folder's checkpoint, with its config.json

@@ -1,5 +1,4 @@
-//! Applying predicted kernels to an image, and building and blending its pyramid: planar f32, one
-//! image at a time.
+//! Applying predicted kernels to an image, and building its pyramid: planar f32, one image at a time.
 //!
 //! A pixel's filtered value is `sum_k w_k x_k / sum_k w_k` over its k x k neighbourhood with
 //! `w_k = exp(logit_k + confidence_k)`: the pixel says how much it wants each neighbour, the neighbour
@@ -57,7 +56,7 @@ pub struct FilterGradient<'a> {
 /// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2 (the minimax
 /// coefficients of Cephes' expf, Moshier).
 #[inline(always)]
-fn exp(x: f32) -> f32 {
+pub(super) fn exp(x: f32) -> f32 {
     let x = x.clamp(-LIMIT, LIMIT);
     // Adding 1.5 * 2^23 rounds to an integer, whose low bits then stand in the mantissa.
     const ROUND: f32 = 12_582_912.0;
@@ -320,115 +319,6 @@ pub fn reduce_gradient(
                 into_confidence[at] += g * weight * (image[c * n + at] - output[c * h * w + to]);
                 if let Some(into) = &mut into_image {
                     into[c * n + at] += g * weight;
-                }
-            }
-        }
-    }
-}
-
-/// The logistic function, which keeps a blend between its two images.
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp(-x))
-}
-
-/// The coarse row (or column) of `n` that fine one `i` lies in, and the next nearest, the edge repeated.
-#[inline(always)]
-fn near(i: usize, n: usize) -> (usize, usize) {
-    let own = i / 2;
-    (own, if i.is_multiple_of(2) { own.saturating_sub(1) } else { (own + 1).min(n - 1) })
-}
-
-/// Weights of the four coarse pixels around a fine one, bilinear: `(row, column)` pairs with the edge
-/// repeated.
-#[inline(always)]
-fn corners(size: Size, y: usize, x: usize) -> [(usize, f32); 4] {
-    let (h, w) = (size.h / 2, size.w / 2);
-    let ((y0, y1), (x0, x1)) = (near(y, h), near(x, w));
-    [(y0 * w + x0, 0.5625), (y0 * w + x1, 0.1875), (y1 * w + x0, 0.1875), (y1 * w + x1, 0.0625)]
-}
-
-/// Blends a coarse level into a fine one, (3, H, W): `fine + sigmoid(alpha) * up(coarse - down(fine))`,
-/// with `down` the mean of 2x2 and `up` bilinear: the coarse level replaces the low frequencies of the
-/// fine one and leaves its detail (Vogels et al. 2018, Section 4.3, with a mask for each pixel).
-///
-/// `difference` (3, H/2, W/2) gets `coarse - down(fine)`.
-///
-/// # Panics
-/// If lengths do not fit.
-pub fn blend(
-    size: Size,
-    fine: &[f32],
-    coarse: &[f32],
-    alpha: &[f32],
-    difference: &mut [f32],
-    output: &mut [f32],
-) {
-    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
-    assert_eq!((fine.len(), coarse.len(), alpha.len()), (3 * n, 3 * h * w, n));
-    assert_eq!((difference.len(), output.len()), (coarse.len(), fine.len()));
-    difference.par_chunks_mut(w).enumerate().for_each(|(i, row)| {
-        let (c, y) = (i / h, i % h);
-        let fine = &fine[c * n + 2 * y * size.w..][..2 * size.w];
-        for (x, (out, coarse)) in row.iter_mut().zip(&coarse[i * w..][..w]).enumerate() {
-            let sum = fine[2 * x] + fine[2 * x + 1] + fine[size.w + 2 * x] + fine[size.w + 2 * x + 1];
-            *out = coarse - 0.25 * sum;
-        }
-    });
-    let weights: Vec<f32> = alpha.par_iter().map(|a| sigmoid(*a)).collect();
-    let difference = &*difference;
-    output.par_chunks_mut(size.w).enumerate().for_each(|(i, out)| {
-        let (c, y) = (i / size.h, i % size.h);
-        // Bilinear, one direction after the other; `corners` is the same in one step.
-        let (own, other) = near(y, h);
-        let coarse = |row: usize| &difference[(c * h + row) * w..][..w];
-        let column: Vec<f32> =
-            coarse(own).iter().zip(coarse(other)).map(|(a, b)| 0.75 * a + 0.25 * b).collect();
-        let fine = &fine[c * n + y * size.w..][..size.w];
-        let weights = &weights[y * size.w..][..size.w];
-        for (x, out) in out.iter_mut().enumerate() {
-            let (own, other) = near(x, w);
-            *out = fine[x] + weights[x] * (0.75 * column[own] + 0.25 * column[other]);
-        }
-    });
-}
-
-/// Adds what [`blend`]'s output gradient sends back to fine, coarse and alpha.
-///
-/// # Panics
-/// As [`blend`].
-pub fn blend_gradient(
-    size: Size,
-    alpha: &[f32],
-    difference: &[f32],
-    output_gradient: &[f32],
-    into_fine: &mut [f32],
-    into_coarse: &mut [f32],
-    into_alpha: &mut [f32],
-) {
-    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
-    assert_eq!((alpha.len(), difference.len(), output_gradient.len()), (n, 3 * h * w, 3 * n));
-    for c in 0..3 {
-        let mut sent = vec![0.0; h * w];
-        for y in 0..size.h {
-            for x in 0..size.w {
-                let at = y * size.w + x;
-                let (g, weight) = (output_gradient[c * n + at], sigmoid(alpha[at]));
-                into_fine[c * n + at] += g;
-                let mut up = 0.0;
-                for (i, k) in corners(size, y, x) {
-                    up += k * difference[c * h * w + i];
-                    sent[i] += k * g * weight;
-                }
-                into_alpha[at] += g * up * weight * (1.0 - weight);
-            }
-        }
-        for y in 0..h {
-            for x in 0..w {
-                let g = sent[y * w + x];
-                into_coarse[c * h * w + y * w + x] += g;
-                let at = c * n + 2 * y * size.w + 2 * x;
-                for i in [at, at + 1, at + size.w, at + size.w + 1] {
-                    into_fine[i] -= 0.25 * g;
                 }
             }
         }

@@ -12,6 +12,7 @@
 #![allow(clippy::needless_range_loop)]
 
 pub mod bf16;
+pub mod blend;
 pub mod conv;
 pub mod filter;
 pub mod peak;

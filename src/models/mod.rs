@@ -123,9 +123,9 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
         widths: widths.into(),
     };
     vec![
-        ("demc-s", pyramid([16, 32, 48, 64])),
-        ("demc-m", pyramid([32, 48, 64, 80])),
-        ("demc-l", pyramid([64, 80, 96, 112])),
+        ("demc-s", pyramid([32, 48, 64, 80])),
+        ("demc-m", pyramid([64, 80, 96, 112])),
+        ("demc-l", pyramid([96, 128, 160, 160])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),

@@ -15,6 +15,7 @@ use super::network::{Batch, Config, Network, Taped};
 use crate::{
     Result,
     features::{GUIDE_PASSES, Inputs, guides},
+    kernels::blend::CORNERS,
     nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
 };
@@ -30,6 +31,11 @@ const ALBEDO_KERNEL: usize = 3;
 
 /// Channels of a radiance level's head: kernel, confidence, and the mask that blends the level below.
 const HEAD: usize = KERNEL * KERNEL + 2;
+
+/// Channels of the full-resolution head for one pixel, and of a trunk level's: the former's albedo kernel,
+/// and the corners from which the level below is upsampled.
+const FULL_HEAD: usize = HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL + CORNERS;
+const LEVEL_HEAD: usize = HEAD + CORNERS;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -130,10 +136,9 @@ impl Pyramid {
         let mut head = |name: String, width: usize, channels: usize| {
             Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).linear()
         };
-        let full = 4 * (HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL);
         Self {
-            full: head("head.full".into(), decoder_width(0), full),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), HEAD)).collect(),
+            full: head("head.full".into(), decoder_width(0), 4 * FULL_HEAD),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
             config: config.clone(),
             encoders,
             decoder,
@@ -168,30 +173,33 @@ impl Pyramid {
         let split = |head: Activation<T>, factor: usize| {
             let area = factor * factor;
             let taps = KERNEL * KERNEL * area;
+            let corners = head.shape().c - CORNERS * area;
             let kernel = Field::from_activation(head.fork(), 0, taps, factor);
             let confidence = Field::from_activation(head.fork(), taps, area, factor);
-            let mask = Field::from_activation(head, taps + area, area, factor);
-            (kernel, confidence, mask)
+            let mask = Field::from_activation(head.fork(), taps + area, area, factor);
+            let corners = Field::from_activation(head, corners, CORNERS * area, factor);
+            (kernel, confidence, (mask, corners))
         };
-        let albedo_kernel = Field::from_activation(full.fork(), 4 * HEAD, 36, 2);
+        let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
+        let albedo_kernel = Field::from_activation(full.fork(), 4 * HEAD, albedo_taps, 2);
         let mut levels = vec![split(full, 2)];
         levels.extend(heads.into_iter().rev().map(|head| split(head, 1)));
 
         // Radiance pyramid: each level filtered, then blended from the coarsest up.
         let mut image = field(irradiance);
-        let mut filtered: Vec<(Field<T>, Field<T>)> = Vec::with_capacity(levels.len());
+        let mut filtered: Vec<(Field<T>, (Field<T>, Field<T>))> = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
-        for (level, (kernel, confidence, mask)) in levels.into_iter().enumerate() {
+        for (level, (kernel, confidence, masks)) in levels.into_iter().enumerate() {
             let below = (level < last).then(|| image.fork().reduce(confidence.fork()));
-            filtered.push((image.filter(KERNEL, kernel, Some(confidence)), mask));
+            filtered.push((image.filter(KERNEL, kernel, Some(confidence)), masks));
             match below {
                 Some(below) => image = below,
                 None => break,
             }
         }
         let (mut out, _) = filtered.pop().expect("there are levels");
-        while let Some((fine, mask)) = filtered.pop() {
-            out = fine.blend(out, mask); // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+        while let Some((fine, (mask, corners))) = filtered.pop() {
+            out = fine.blend(out, mask, corners); // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
         }
         out.into_images() * field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None).into_images()
     }

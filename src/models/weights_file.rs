@@ -7,7 +7,10 @@ use serde::{Deserialize, Serialize};
 use super::network::{Config, Network};
 use crate::{
     Error, Result,
-    nn::weights::{self, Precision, Tensor},
+    nn::{
+        Arithmetic,
+        weights::{self, Precision, Tensor},
+    },
 };
 
 /// How a network was trained.
@@ -72,20 +75,52 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
     parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
 }
 
-/// Reads a weights file that must hold the network `config`.
+/// Reads the network `config` from a weights file that holds it, or a narrower one of the same design:
+/// the wider network then begins as the same function (see `Conv::widen_from`), its further channels as
+/// `seed` draws them.
 ///
 /// # Errors
 /// As [`read`], or the file holds another network.
-pub fn read_as(path: &Path, config: &Config) -> Result<Box<dyn Network>> {
-    let (network, metadata) = read(path)?;
-    if metadata.network != *config {
-        let (held, wanted) = (metadata.network, config);
+pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Network>> {
+    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    if let Ok((network, metadata)) = parse(&bytes, path)
+        && metadata.network == *config
+    {
+        return Ok(network);
+    }
+    let (metadata, tensors) = metadata(&bytes, path)?;
+    let held = &metadata.network;
+    let mut network = super::build(config, seed);
+    // Only convolutions can be widened: a network's every parameter must belong to one.
+    let all = 2 * network.convolutions().len() == network.params().len();
+    let fits = held.architecture == config.architecture && all && {
+        let mut narrow = super::build(held, 0);
+        let find = |name: &str| tensors.iter().find(|t| t.name == name);
+        network.convolutions().into_iter().zip(narrow.convolutions()).all(|(wide, narrow)| {
+            let (weight, bias) = (find(&wide.weight.name), find(&wide.bias.name));
+            weight.zip(bias).is_some_and(|(weight, bias)| {
+                let held = Arithmetic { outputs: bias.values.len(), ..narrow.arithmetic().clone() };
+                wide.widen_from(&held, &weight.values, &bias.values)
+            })
+        })
+    };
+    if !fits {
         return Err(Error::invalid(
             path,
-            format!("holds {held}, not {wanted}; choose --model and --widths alike"),
+            format!("holds {held}, which is neither {config} nor narrower; choose --model and --widths alike"),
         ));
     }
     Ok(network)
+}
+
+/// The metadata and the tensors of a weights file.
+fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
+    let (metadata, tensors) = weights::parse(bytes, path)?;
+    let metadata: Metadata = serde_json::from_str(&metadata).map_err(|e| {
+        Error::invalid(path, format!("no network in its metadata ({e}); use a run's best.safetensors"))
+    })?;
+    super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
+    Ok((metadata, tensors))
 }
 
 /// Parses the bytes of a weights file; `path` is for messages.
@@ -93,11 +128,7 @@ pub fn read_as(path: &Path, config: &Config) -> Result<Box<dyn Network>> {
 /// # Errors
 /// As [`read`].
 pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
-    let (metadata, tensors) = weights::parse(bytes, path)?;
-    let metadata: Metadata = serde_json::from_str(&metadata).map_err(|e| {
-        Error::invalid(path, format!("no network in its metadata ({e}); use a run's best.safetensors"))
-    })?;
-    super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
+    let (metadata, tensors) = metadata(bytes, path)?;
     let mut network = super::build(&metadata.network, 0);
     for param in network.params() {
         let found = tensors.binary_search_by(|t| t.name.cmp(&param.name)).ok().map(|i| &tensors[i]);

@@ -29,11 +29,14 @@ impl Precision {
 
 /// What a convolution is, apart from its weights.
 #[derive(Clone, Debug)]
-pub(super) struct Arithmetic {
+pub struct Arithmetic {
     /// Channels of every source.
     pub inputs: Vec<usize>,
+    /// Channels of the output.
     pub outputs: usize,
+    /// Kernel size and stride.
     pub geometry: Geometry,
+    /// What factors are rounded to.
     pub precision: Precision,
 }
 

@@ -7,7 +7,8 @@ use rayon::prelude::*;
 
 use super::{Activation, Images, pool::PlaneBuffer};
 use crate::kernels::{
-    filter::{Filter, FilterGradient, Size, blend, blend_gradient, reduce, reduce_gradient},
+    blend::{BlendGradient, CORNERS, Masks, blend, blend_gradient},
+    filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     pool::{from_blocked_shuffled, to_blocked_shuffled},
     simd::Tier,
 };
@@ -221,45 +222,52 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Blends a coarse level, (N, 3, H/2, W/2), into this one by the mask `sigmoid(alpha)`,
-    /// (N, 1, H, W). See [`blend`].
-    pub fn blend(self, coarse: Self, alpha: Self) -> Self {
+    /// Blends a coarse level, (N, 3, H/2, W/2), into this one, (N, 3, H, W): its share before the
+    /// logistic is `alpha`, (N, 1, H, W), the logits of its upsampling `corners`, (N, 4, H, W). See
+    /// [`crate::kernels::blend`].
+    pub fn blend(self, coarse: Self, alpha: Self, corners: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
         let size = Size { h, w };
         let mut output = PlaneBuffer::new(images * 3 * pixels);
         let mut difference = PlaneBuffer::new(images * 3 * quarter);
-        let (fine, below, mask) = (self.saved, coarse.saved, alpha.saved);
+        let tape = self.tape.merge(coarse.tape).merge(alpha.tape).merge(corners.tape);
+        let (fine, below, mask, corners) = (self.saved, coarse.saved, alpha.saved, corners.saved);
+        let predicted = (mask.values.clone(), corners.values.clone());
         let chunks = output.chunks_mut(3 * pixels).zip(difference.chunks_mut(3 * quarter));
         for (n, (output, difference)) in chunks.enumerate() {
-            let (fine, below, mask) = (fine.values.image(n), below.values.image(n), mask.values.image(n));
-            blend(size, fine, below, mask, difference, output);
+            let levels = (fine.values.image(n), below.values.image(n));
+            blend(size, levels, masks_of(&predicted, n), difference, output);
         }
-        let tape = self.tape.merge(coarse.tape).merge(alpha.tape);
         let (mut field, out) = Self::output((images, 3, h, w), output, tape);
         if T::OWNS_TAPE {
-            let weights = mask.values.clone();
             field.tape.add_backward_op(move |_| {
                 let Some(gradient) = out.take() else { return Ok(()) };
-                const FILTERED: &str = "what is blended was filtered";
-                fine.accumulate(|into_fine| {
-                    below.accumulate(|into_below| {
-                        mask.accumulate(|into_mask| {
-                            let into_below = into_below.expect(FILTERED);
-                            into_fine
-                                .expect(FILTERED)
-                                .par_chunks_mut(3 * pixels)
-                                .zip(into_below.par_chunks_mut(3 * quarter))
-                                .zip(into_mask.expect(FILTERED).par_chunks_mut(pixels))
-                                .enumerate()
-                                .for_each(|(n, ((into_fine, into_below), into_mask))| {
-                                    let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
-                                    let difference = &difference[n * 3 * quarter..][..3 * quarter];
-                                    let weights = weights.image(n);
-                                    blend_gradient(
-                                        size, weights, difference, gradient, into_fine, into_below, into_mask,
-                                    );
-                                });
+                let run = |fine: &mut [f32], coarse: &mut [f32], alpha: &mut [f32], corners: &mut [f32]| {
+                    fine.par_chunks_mut(3 * pixels)
+                        .zip(coarse.par_chunks_mut(3 * quarter))
+                        .zip(alpha.par_chunks_mut(pixels))
+                        .zip(corners.par_chunks_mut(CORNERS * pixels))
+                        .enumerate()
+                        .for_each(|(n, (((fine, coarse), alpha), corners))| {
+                            let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
+                            let difference = &difference[n * 3 * quarter..][..3 * quarter];
+                            let into = BlendGradient { fine, coarse, alpha, corners };
+                            blend_gradient(size, masks_of(&predicted, n), difference, gradient, into);
+                        });
+                };
+                const LEARNED: &str = "what is blended was filtered or predicted";
+                fine.accumulate(|fine| {
+                    below.accumulate(|below| {
+                        mask.accumulate(|mask| {
+                            corners.accumulate(|corners| {
+                                run(
+                                    fine.expect(LEARNED),
+                                    below.expect(LEARNED),
+                                    mask.expect(LEARNED),
+                                    corners.expect(LEARNED),
+                                );
+                            });
                         });
                     });
                 });
@@ -287,6 +295,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         }
         images.put_tape(tape)
     }
+}
+
+/// What was predicted for the blend of image `n`.
+fn masks_of((alpha, corners): &(Values, Values), n: usize) -> Masks<'_> {
+    Masks { alpha: alpha.image(n), corners: corners.image(n) }
 }
 
 /// The forward problem of image `n`.

@@ -10,7 +10,7 @@ use super::{
 };
 use crate::kernels::{
     Block, LANES,
-    conv::Geometry,
+    conv::{Geometry, weight_index},
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
     weight_grad::bias_gradient,
 };
@@ -69,6 +69,45 @@ impl Conv {
     pub fn with_bias(mut self, value: f32) -> Self {
         self.bias.set(&vec![value; self.arithmetic.outputs]);
         self
+    }
+
+    /// Takes over the weights of a narrower layer of the same kind, so that it computes the same on the
+    /// channels they share: its further inputs begin without effect on the old outputs. Further outputs
+    /// keep their fresh weights, or begin at zero in a layer without ReLU. Returns whether the layers fit.
+    pub fn widen_from(&mut self, narrow: &Arithmetic, weight: &[f32], bias: &[f32]) -> bool {
+        let wide = &self.arithmetic;
+        let fits = wide.geometry == narrow.geometry
+            && wide.outputs >= narrow.outputs
+            && wide.inputs.len() == narrow.inputs.len()
+            && wide.inputs.iter().zip(&narrow.inputs).all(|(w, n)| w >= n);
+        let (taps, total) = (wide.geometry.taps(), [wide, narrow].map(|a| a.inputs.iter().sum::<usize>()));
+        if !fits || (weight.len(), bias.len()) != (total[1] * narrow.outputs * taps, narrow.outputs) {
+            return false;
+        }
+        let (mut weights, mut biases) = (self.weight.values(), self.bias.values());
+        if !self.relu {
+            weights.fill(0.0);
+        }
+        let place = |a: &Arithmetic, total, o, i, t| weight_index(a.geometry, a.outputs, total, o, i, t);
+        let mut first = [0; 2];
+        for (w, n) in wide.inputs.iter().zip(&narrow.inputs) {
+            for (o, i, t) in (0..narrow.outputs).flat_map(|o| {
+                (0..*w).flat_map(move |i| (0..taps).map(move |t| (o, i, t)))
+            }) {
+                let old = (i < *n).then(|| weight[place(narrow, total[1], o, first[1] + i, t)]);
+                weights[place(wide, total[0], o, first[0] + i, t)] = old.unwrap_or(0.0);
+            }
+            first = [first[0] + w, first[1] + n];
+        }
+        biases[..bias.len()].copy_from_slice(bias);
+        self.weight.set(&weights);
+        self.bias.set(&biases);
+        true
+    }
+
+    /// What the layer computes, apart from its weights.
+    pub fn arithmetic(&self) -> &Arithmetic {
+        &self.arithmetic
     }
 
     /// Chooses the arithmetic of the layer and of its gradients.

@@ -13,7 +13,7 @@ mod pool;
 pub mod weights;
 
 pub use activation::Activation;
-pub use arithmetic::Precision;
+pub use arithmetic::{Arithmetic, Precision};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use param::{Init, Param, Rng};

@@ -91,7 +91,7 @@ pub fn run(
     log::create_dir(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
     let mut network = match &options.init {
-        Some(path) => weights_file::read_as(path, &options.network)?,
+        Some(path) => weights_file::read_as(path, &options.network, options.seed)?,
         None => models::build(&options.network, options.seed),
     };
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
