@@ -1,6 +1,13 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 
+mod kpcn;
+
+pub use kpcn::{
+    DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
+    kpcn_streams,
+};
+
 use rayon::prelude::*;
 
 use crate::{
@@ -158,6 +165,19 @@ fn exposure(radiance: &Planes) -> f32 {
     if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
 }
 
+/// Distance as a feature between 0 (near, and where nothing is hit) and 1, one half at the median.
+pub fn relative_depth(distance: &Planes) -> Planes {
+    /// Cycles writes 1e10 where a ray hits nothing.
+    const FAR: f32 = 1e9;
+    let valid = |v: f32| v > 0.0 && v < FAR;
+    let mut sorted: Vec<f32> = distance.data.iter().copied().filter(|v| valid(*v)).collect();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let median = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
+    let mut out = distance.clone();
+    out.data.iter_mut().for_each(|v| *v = if valid(*v) { *v / (*v + median) } else { 0.0 });
+    out
+}
+
 /// A frame as a network wants it.
 #[derive(Clone, Debug)]
 pub struct Inputs {
@@ -223,6 +243,12 @@ mod tests {
         let mut flat = [7.0; 9];
         z_score(&mut flat);
         assert_eq!(flat, [0.0; 9]);
+    }
+
+    #[test]
+    fn depth_ends_at_one_and_misses_are_zero() {
+        let out = relative_depth(&Planes::from_vec(1, 5, 1, vec![0.0, 1.0, 2.0, 8.0, 1e10]));
+        assert_eq!(out.data, [0.0, 1.0 / 3.0, 0.5, 0.8, 0.0]);
     }
 
     #[test]

@@ -254,3 +254,16 @@ fn the_networks_of_the_paper() {
         check_network(name, &mut *network, &batch);
     }
 }
+
+#[test]
+fn kpcn() {
+    for (name, planes) in [("kpcn-combined", &[3, 3, 34][..]), ("kpcn", &[3, 3, 3, 3, 34, 34])] {
+        let mut config = trainable(name);
+        config.widths = vec![6];
+        let mut network = models::build(&config, 3);
+        let mut rng = Rng::new(17, 0);
+        let mut plane = |c: usize| (0..2 * c * 12 * 15).map(|_| 0.1 + rng.uniform()).collect();
+        let batch = planes.iter().map(|&c| (Shape::new(2, c, 12, 15), plane(c))).collect();
+        check_network(name, &mut *network, &batch);
+    }
+}

@@ -4,8 +4,9 @@ use demc::{
     features::Inputs,
     models::{
         self,
-        demc::{Demc, PAPER_WIDTHS},
-        network::{Architecture, Network, run},
+        demc::{Demc, PAPER_WIDTHS, semc_widths},
+        kpcn::PUBLISHED_WIDTH,
+        network::{Architecture, Config, Network, run},
     },
     nn::Rng,
     passes::{Pass, PassSet},
@@ -40,6 +41,30 @@ fn the_paper_s_network_has_its_size_and_latent() {
     assert_eq!(parameters(&mut network), fusion + 2 * encoder + decoder + output);
 }
 
+#[test]
+fn semc_has_as_many_parameters_as_demc() {
+    for widths in [[16, 32, 64, 96, 96], [16, 32, 32, 48, 48], [8; 5], [5, 9, 20, 33, 40], PAPER_WIDTHS] {
+        let wanted = demc::models::demc::parameters(Architecture::Demc, &widths);
+        let semc = semc_widths(&widths);
+        let got = demc::models::demc::parameters(Architecture::Semc, &semc);
+        let off = got as f64 / wanted as f64 - 1.0;
+        assert!(off.abs() < 0.01, "{widths:?}: {semc:?} has {got} parameters, not {wanted}");
+        assert!(semc.iter().sum::<usize>() > widths.iter().sum(), "{semc:?} for {widths:?}");
+    }
+}
+
+#[test]
+fn parameters_are_those_of_the_networks() {
+    for architecture in [Architecture::Demc, Architecture::DemcNofusion, Architecture::Semc] {
+        let widths = [4, 7, 9, 12, 17];
+        let mut network = Demc::new(architecture, &widths, 1);
+        let counted = demc::models::demc::parameters(architecture, &widths);
+        assert_eq!(parameters(&mut network), counted, "{architecture:?}");
+    }
+    let built = |name| parameters(&mut *models::build(&trainable(name), 1)) as f64;
+    assert!((built("semc") / built("demc") - 1.0).abs() < 0.01);
+}
+
 fn random_passes(width: usize, height: usize, seed: u64) -> PassSet {
     let mut rng = Rng::new(seed, 0);
     let mut passes = PassSet::new("random.exr", "ViewLayer", width, height);
@@ -52,9 +77,13 @@ fn random_passes(width: usize, height: usize, seed: u64) -> PassSet {
         Pass::TransmissionColor,
         Pass::DenoisingNormal,
         Pass::DenoisingAlbedo,
+        Pass::DenoisingDepth,
+        Pass::DiffuseDirect,
+        Pass::DiffuseIndirect,
+        Pass::Emission,
     ] {
-        let values = (0..3 * width * height).map(|_| rng.uniform()).collect();
-        passes.insert(pass, Planes::from_vec(3, width, height, values));
+        let values = (0..pass.channels() * width * height).map(|_| rng.uniform()).collect();
+        passes.insert(pass, Planes::from_vec(pass.channels(), width, height, values));
     }
     passes
 }
@@ -73,7 +102,7 @@ fn every_network_takes_every_size_from_one_pixel_up() {
 
 #[test]
 fn tiles_give_the_same_bits_as_the_whole_frame() {
-    for name in ["demc-s", "demc"] {
+    for name in ["demc-s", "demc", "kpcn", "kpcn-combined"] {
         let mut config =
             models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
         config.widths.fill(8);
@@ -104,22 +133,76 @@ fn a_missing_pass_is_named() {
 }
 
 #[test]
-fn the_kernel_predicting_network_scales_with_its_input() {
-    let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-s").expect("it is trainable").1;
-    let network = models::build(&config, 1);
+fn networks_that_filter_scale_with_their_input() {
     let passes = random_passes(40, 24, 9);
-    let base = run(&*network, &passes, None).expect("all passes are there");
-    for stops in [-8, -3, 5, 8] {
-        let factor = 2f32.powi(stops);
-        let mut scaled = passes.clone();
-        let mut radiance = passes.get(Pass::Combined).expect("it is there").clone();
-        radiance.data.iter_mut().for_each(|v| *v *= factor);
-        scaled.insert(Pass::Combined, radiance);
-        let image = run(&*network, &scaled, None).expect("all passes are there");
-        for (a, b) in image.data.iter().zip(&base.data) {
-            assert!((a / factor - b).abs() <= 0.01 * b.abs(), "2^{stops}: {a} for {b}");
+    for name in ["demc-s", "kpcn", "kpcn-combined"] {
+        let network = models::build(&trainable(name), 1);
+        let base = run(&*network, &passes, None).expect("all passes are there");
+        for stops in [-8, -3, 5, 8] {
+            let factor = 2f32.powi(stops);
+            let mut scaled = passes.clone();
+            for pass in [Pass::Combined, Pass::DiffuseDirect, Pass::DiffuseIndirect, Pass::Emission] {
+                let mut radiance = passes.get(pass).expect("it is there").clone();
+                radiance.data.iter_mut().for_each(|v| *v *= factor);
+                scaled.insert(pass, radiance);
+            }
+            let image = run(&*network, &scaled, None).expect("all passes are there");
+            for (a, b) in image.data.iter().zip(&base.data) {
+                assert!((a / factor - b).abs() <= 0.01 * b.abs(), "{name}, 2^{stops}: {a} for {b}");
+            }
         }
     }
+}
+
+fn trainable(name: &str) -> Config {
+    models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1
+}
+
+#[test]
+fn kpcn_has_its_published_size() {
+    let config = Config { architecture: Architecture::Kpcn, widths: vec![PUBLISHED_WIDTH] };
+    let mut network = models::build(&config, 1);
+    // By hand: nine 5x5 convolutions from 34 channels over 100 to 21 x 21 weights, twice.
+    let conv = |i: usize, o: usize| 25 * i * o + o;
+    let stream = conv(34, 100) + 7 * conv(100, 100) + conv(100, 441);
+    assert_eq!(parameters(&mut *network), 2 * stream);
+    assert_eq!(network.reach(), 9 * 2 + 10);
+}
+
+#[test]
+fn kpcn_keeps_what_is_constant_in_each_stream() {
+    // Kernels are convex combinations: whatever the weights, flat light comes out unchanged.
+    let mut passes = PassSet::new("flat.exr", "ViewLayer", 24, 20);
+    let mut flat = |pass: Pass, v: f32| {
+        let n = pass.channels();
+        passes.insert(pass, Planes::from_vec(n, 24, 20, vec![v; n * 24 * 20]));
+    };
+    for (pass, value) in [
+        (Pass::Combined, 2.0),
+        (Pass::DiffuseColor, 0.5),
+        (Pass::DiffuseDirect, 1.0),
+        (Pass::DiffuseIndirect, 0.6),
+        (Pass::DenoisingAlbedo, 0.4),
+        (Pass::DenoisingNormal, 0.5),
+        (Pass::DenoisingDepth, 3.0),
+    ] {
+        flat(pass, value);
+    }
+    for name in ["kpcn", "kpcn-combined"] {
+        let network = models::build(&trainable(name), 7);
+        let image = run(&*network, &passes, None).expect("all passes are there");
+        assert!(image.data.iter().all(|v| (v - 2.0).abs() < 1e-3), "{name}: {:?}", &image.data[..8]);
+    }
+}
+
+#[test]
+fn light_that_kpcn_does_not_filter_is_optional() {
+    let network = models::build(&trainable("kpcn"), 1);
+    let mut passes = random_passes(20, 20, 2);
+    let with = run(&*network, &passes, None).expect("all passes are there");
+    passes.remove(Pass::Emission);
+    let without = run(&*network, &passes, None).expect("emission may be missing");
+    assert!(with != without && without.non_finite() == 0);
 }
 
 #[test]

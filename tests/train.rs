@@ -23,9 +23,13 @@ fn train(out: &Path, steps: usize) -> Command {
 }
 
 fn train_with(model: &str, patch: &str, out: &Path, steps: usize) -> Command {
+    train_every(4, model, patch, out, steps)
+}
+
+fn train_every(every: usize, model: &str, patch: &str, out: &Path, steps: usize) -> Command {
     let mut command = Command::new(cargo_bin("demc"));
     command.args(["train", "--data", &data("s0000_room"), "--val", &data("s0010_outdoor"), "--batch", "2"]);
-    command.args(["--patch", patch, "--every", "4", "--model", model, "--seed", "5"]);
+    command.args(["--patch", patch, "--every", &every.to_string(), "--model", model, "--seed", "5"]);
     command.args(["--steps", &steps.to_string()]).arg("--out").arg(out);
     command
 }
@@ -169,4 +173,48 @@ fn denoise_refuses_a_file_that_holds_no_network() {
         denoise.args(["denoise", &input, "--model"]).arg(&wrong).arg("--out").arg(dir.path().join("out"));
         run(&mut denoise).failure().stderr(predicate::str::contains("not a demc weights file"));
     }
+}
+
+#[test]
+fn the_rivals_train_and_their_weights_denoise_and_are_scored() {
+    for (model, patch, steps, rates, note) in [("kpcn", "32", 160, "1e-3:3e-4", "trained on Combined")] {
+        let dir = tempfile::tempdir().expect("a folder");
+        let out = dir.path().join(model);
+        let mut command = train_every(steps / 2, model, patch, &out, steps);
+        command.args(["--loss", "smape", "--lr", rates]);
+        run(&mut command).success().stderr(predicate::str::contains(note));
+        let rows = log(&out);
+        let value = |row: usize, column: usize| -> f64 {
+            rows[row].split(',').nth(column).expect("a cell").parse().expect("a number")
+        };
+        assert!(value(2, 2) < value(1, 2), "{model}: the loss went from {} to {}", value(1, 2), value(2, 2));
+
+        let weights = out.join("best.safetensors");
+        let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+        let mut denoise = Command::new(cargo_bin("demc"));
+        denoise.args(["denoise", &input, "--out"]).arg(dir.path().join("images"));
+        run(denoise.arg("--model").arg(&weights)).success();
+
+        let scores = dir.path().join("scores");
+        let mut eval = Command::new(cargo_bin("demc"));
+        eval.args(["eval", "--repeats", "1", "--no-sheets", "--test-set", &data("s0010_outdoor")]);
+        eval.arg("--models").arg(&weights).arg("--out").arg(&scores);
+        run(&mut eval).success();
+        let text = fs::read_to_string(scores.join("scores.csv")).expect("scores");
+        let relmse: Vec<f64> = text
+            .lines()
+            .skip(1)
+            .map(|line| line.split(',').nth(5).expect("a cell").parse().expect("a number"))
+            .collect();
+        // The noisy input comes first.
+        assert!(relmse.len() == 2 && relmse[1] < 0.5 * relmse[0], "{model}: {text}");
+    }
+}
+
+#[test]
+fn a_method_without_weights_says_how_to_get_them() {
+    let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+    let mut denoise = Command::new(cargo_bin("demc"));
+    denoise.args(["denoise", &input, "--out", "/nonexistent", "--model", "kpcn-combined"]);
+    run(&mut denoise).code(2).stderr(predicate::str::contains("demc train --model kpcn-combined"));
 }

@@ -14,8 +14,11 @@ use std::{
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{
-    Error, Result, models,
+    Error, Result,
+    frame::Frame,
+    models::{self, network::Architecture},
     nn::Precision,
+    passes::{self, Pass},
     report,
     testset::{self, Pair},
     train::{self, Event, Loss, Options},
@@ -33,7 +36,8 @@ pub struct Args {
     /// Network to train
     #[arg(long, default_value = "demc")]
     model: String,
-    /// Channels at each level, finest first, instead of the model's own
+    /// Channels at each level, finest first, instead of the model's own; for semc those of the demc whose
+    /// parameter count it is to have; one number for kpcn and lbf
     #[arg(long, value_delimiter = ',')]
     widths: Option<Vec<usize>>,
     /// Optimiser steps
@@ -126,6 +130,15 @@ fn held_out(reference: &Path) -> bool {
     (hash >> 32) % HOLD_OUT == 0
 }
 
+/// Whether the noisy frame of a pair holds what KPCN's two streams read.
+fn has_light_passes(pair: &Pair) -> Result<bool> {
+    let frame = Frame::read(&pair.noisy)?;
+    let layers = passes::layers(&frame);
+    let layer = passes::choose(&frame, &layers, None)?;
+    let light = [Pass::DiffuseDirect, Pass::DiffuseIndirect, Pass::DiffuseColor];
+    Ok(light.iter().all(|pass| layer.passes.contains_key(pass)))
+}
+
 impl Args {
     fn options(&self) -> Result<Options> {
         let known = models::trainable();
@@ -135,7 +148,7 @@ impl Args {
                 usage(format!("cannot train '{}'; trainable: {}", self.model, names.join(", ")))
             })?;
         if let Some(widths) = &self.widths {
-            network.widths.clone_from(widths);
+            network.widths = models::widths(network.architecture, widths);
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
         let multiple = models::build(&network, 0).multiple();
@@ -166,6 +179,13 @@ impl Args {
             return Err(usage(
                 "nothing left to train on once one scene in ten is held out; add pairs or --val",
             ));
+        }
+        if network.architecture == Architecture::Kpcn && !has_light_passes(&training[0])? {
+            eprintln!(
+                "note: {} holds no diffuse light passes: kpcn is trained on Combined, as kpcn-combined",
+                training[0].noisy.display()
+            );
+            network.architecture = Architecture::KpcnCombined;
         }
         Ok(Options {
             network,

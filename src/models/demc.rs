@@ -28,6 +28,66 @@ const DETAIL: usize = 3;
 /// output that begins at or below zero would never learn.
 const OUTPUT_BIAS: f32 = 0.2;
 
+/// The trained parameters of a network of these widths.
+pub fn parameters(architecture: Architecture, widths: &[usize]) -> usize {
+    let conv = |taps: usize, inputs: usize, outputs: usize| (taps * inputs + 1) * outputs;
+    let encoder = |inputs: usize| {
+        let mut from = inputs;
+        let unit = |&width: &usize| {
+            let first = conv(9, std::mem::replace(&mut from, width), width);
+            first + 2 * conv(9, width, width)
+        };
+        widths.iter().map(unit).sum::<usize>()
+    };
+    let first = widths[0];
+    let fusion =
+        conv(9, PAPER_FEATURES, first) + 2 * (conv(9, first, first) + 2 * first) + conv(9, first, DETAIL);
+    let (encoders, sources) = match architecture {
+        Architecture::Semc => (fusion + encoder(DETAIL + 3), 2),
+        Architecture::DemcNofusion => (encoder(PAPER_FEATURES) + encoder(3), 3),
+        _ => (fusion + encoder(DETAIL) + encoder(3), 3),
+    };
+    let level = |(level, &width): (usize, &usize)| {
+        let below = *widths.get(level + 1).unwrap_or(&width);
+        conv(16, below, width) + conv(1, sources * width, width)
+    };
+    encoders + widths.iter().enumerate().map(level).sum::<usize>() + conv(1, first, 3)
+}
+
+/// The widths at which `semc` has as many parameters as `demc` of `widths`, within 1% (Section 4.4): all
+/// of them times one factor, rounded, then moved by single channels where rounding left too much or little.
+pub fn semc_widths(widths: &[usize]) -> Vec<usize> {
+    let wanted = parameters(Architecture::Demc, widths) as f64;
+    let scaled = |factor: f64| -> Vec<usize> {
+        widths.iter().map(|w| ((*w as f64 * factor).round() as usize).max(1)).collect()
+    };
+    let count = |widths: &[usize]| parameters(Architecture::Semc, widths) as f64;
+    // One encoder in place of two: between as wide and twice as wide.
+    let (mut low, mut high) = (1.0, 2.0);
+    for _ in 0..30 {
+        let factor = 0.5 * (low + high);
+        if count(&scaled(factor)) < wanted { low = factor } else { high = factor }
+    }
+    let mut best = scaled(high);
+    let off = |widths: &[usize]| (count(widths) / wanted - 1.0).abs();
+    loop {
+        // One or two levels wider or narrower by a channel.
+        let steps = || (0..best.len()).flat_map(|level| [(level, 1), (level, -1)]);
+        let changed = steps().flat_map(|one| steps().map(move |two| [one, two])).map(|steps| {
+            let mut changed = best.clone();
+            for (level, by) in steps {
+                changed[level] = changed[level].saturating_add_signed(by).max(1);
+            }
+            changed
+        });
+        let nearest = changed.min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are levels");
+        if off(&best) < 0.005 || off(&nearest) >= off(&best) {
+            return best;
+        }
+        best = nearest;
+    }
+}
+
 /// DEMC, DEMC without fusion, or SEMC.
 #[derive(Clone)]
 pub struct Demc {

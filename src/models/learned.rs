@@ -57,6 +57,14 @@ impl Denoiser for Learned {
         self.network.passes()
     }
 
+    fn optional_passes(&self) -> &[Pass] {
+        self.network.optional_passes()
+    }
+
+    fn notes(&self, _: &PassSet) -> Option<String> {
+        self.network.notes().map(|note| format!("{}: {note}", self.name))
+    }
+
     fn denoise(&self, passes: &PassSet) -> Result<Planes> {
         network::run(&*self.network, passes, None)
     }

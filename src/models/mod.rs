@@ -1,6 +1,7 @@
 //! Every denoising method behind one trait. A new method is one file here and one line in the catalogue.
 
 pub mod demc;
+pub mod kpcn;
 pub mod learned;
 pub mod network;
 pub mod nfor;
@@ -108,6 +109,10 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
         }
         other => match learned::Learned::built_in(other) {
             Some(model) => Ok(Box::new(model)),
+            None if trainable().iter().any(|(name, _)| *name == other) => Err(Error::Usage(format!(
+                "{other} comes without weights: `demc train --model {other} --data DIR --out RUN` makes them, \
+                 and RUN/best.safetensors then names the method"
+            ))),
             None => Err(Error::Usage(format!(
                 "no model '{other}': `demc models` lists the built-in ones; weights files end in .safetensors"
             ))),
@@ -115,13 +120,26 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     }
 }
 
+/// Widths of the paper's networks unless told otherwise: a quarter of the published at full resolution.
+const PAPER_NARROW: [usize; demc::PAPER_WIDTHS.len()] = [16, 32, 32, 48, 48];
+
+/// The widths of a network for those asked for: `semc` gets what makes it as large as `demc` of them,
+/// every other network gets them as they are.
+pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
+    match architecture {
+        Architecture::Semc if asked.len() == demc::PAPER_WIDTHS.len() => demc::semc_widths(asked),
+        _ => asked.to_vec(),
+    }
+}
+
 /// Names of the networks that can be trained, and the configuration each begins with.
 pub fn trainable() -> Vec<(&'static str, Config)> {
-    let paper = |architecture| Config { architecture, widths: vec![16, 32, 64, 96, 96] };
+    let paper = |architecture| Config { architecture, widths: widths(architecture, &PAPER_NARROW) };
     let pyramid = |widths: [usize; pyramid::LEVELS]| Config {
         architecture: Architecture::Pyramid,
         widths: widths.into(),
     };
+    let kpcn = |architecture| Config { architecture, widths: vec![32] };
     vec![
         ("demc-s", pyramid([32, 48, 64, 80])),
         ("demc-m", pyramid([64, 80, 96, 112])),
@@ -129,6 +147,8 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),
+        ("kpcn", kpcn(Architecture::Kpcn)),
+        ("kpcn-combined", kpcn(Architecture::KpcnCombined)),
     ]
 }
 
@@ -139,10 +159,11 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
 pub fn check(config: &Config) -> Result<(), String> {
     let levels = match config.architecture {
         Architecture::Pyramid => pyramid::LEVELS,
-        _ => demc::PAPER_WIDTHS.len(),
+        Architecture::Kpcn | Architecture::KpcnCombined => 1,
+        Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => demc::PAPER_WIDTHS.len(),
     };
     if config.widths.len() != levels {
-        return Err(format!("{} widths, but the network has {levels} levels", config.widths.len()));
+        return Err(format!("{} widths, but the network takes {levels}", config.widths.len()));
     }
     if let Some(width) = config.widths.iter().find(|w| !(1..=4096).contains(*w)) {
         return Err(format!("width {width} is out of range; use 1 to 4096"));
@@ -160,5 +181,6 @@ pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
             Box::new(demc::Demc::new(config.architecture, &config.widths, seed))
         }
         Architecture::Pyramid => Box::new(pyramid::Pyramid::new(config, seed)),
+        Architecture::Kpcn | Architecture::KpcnCombined => Box::new(kpcn::Kpcn::new(config, seed)),
     }
 }

@@ -43,6 +43,10 @@ pub enum Architecture {
     Semc,
     /// The built-in kernel-predicting dual encoder.
     Pyramid,
+    /// KPCN with its two streams, diffuse and specular.
+    Kpcn,
+    /// KPCN with a single stream over Combined.
+    KpcnCombined,
 }
 
 /// Inputs of several samples of one size: each network input as one (N, C, H, W) array.
@@ -75,6 +79,21 @@ pub trait Network: Send + Sync {
 
     /// The passes it needs.
     fn passes(&self) -> &'static [Pass];
+
+    /// Passes it makes use of where a file holds them.
+    fn optional_passes(&self) -> &'static [Pass] {
+        &[]
+    }
+
+    /// What the user should know about how it treats a frame.
+    fn notes(&self) -> Option<String> {
+        None
+    }
+
+    /// Frames of more pixels than this are worked on in tiles unless the user says otherwise.
+    fn whole_frame_pixels(&self) -> usize {
+        WHOLE_FRAME_PIXELS
+    }
 
     /// Rows and columns must be multiples of this.
     fn multiple(&self) -> usize;
@@ -112,12 +131,9 @@ pub trait Network: Send + Sync {
     fn duplicate(&self) -> Box<dyn Network>;
 }
 
-/// Frames of more pixels than this are worked on in tiles of [`DEFAULT_TILE`] unless told otherwise:
-/// activations of an 8K frame would take more memory than a workstation has.
+/// What [`Network::whole_frame_pixels`] is for most: activations of an 8K frame would take more memory
+/// than a workstation has.
 const WHOLE_FRAME_PIXELS: usize = 8 << 20;
-
-/// Rows and columns of a tile, without the border that its pixels see.
-const DEFAULT_TILE: usize = 2048;
 
 /// Denoised radiance of a frame, (3, H, W), at once or in tiles of `tile` rows and columns. Every tile
 /// sees as far beyond its edge as the network reaches, so the result is the same, bit for bit.
@@ -131,7 +147,9 @@ pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Resu
         *planes = pad_to_multiple(planes, multiple);
     }
     let (width, height) = (inputs.planes[0].width, inputs.planes[0].height);
-    let default = if width * height > WHOLE_FRAME_PIXELS { DEFAULT_TILE } else { width.max(height) };
+    let most = network.whole_frame_pixels();
+    // A tile is a square of half of what may be worked on at once: it sees beyond its edge as well.
+    let default = if width * height > most { (most / 2).isqrt() } else { width.max(height) };
     let tile = tile.unwrap_or(default).next_multiple_of(multiple);
     let reach = network.reach().next_multiple_of(multiple);
     let mut image = Planes::new(3, width, height);

@@ -20,6 +20,7 @@ use std::{
 use super::{Denoiser, Run};
 use crate::{
     Error, Result,
+    features::relative_depth,
     filters::{
         nl_means::{Comparison, Weights, filter},
         regression::{Fit, first_order},
@@ -108,22 +109,9 @@ impl Buffer {
         // Emitters write their radiance into albedo.
         features[0].data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
         features[1].data.iter_mut().for_each(|v| *v = v.clamp(-1.0, 1.0));
-        features.extend(passes.get(Pass::DenoisingDepth).or(passes.get(Pass::Depth)).map(depth));
+        features.extend(passes.get(Pass::DenoisingDepth).or(passes.get(Pass::Depth)).map(relative_depth));
         Ok(Self { colour, features })
     }
-}
-
-/// Distance as a feature between 0 (near, and where nothing is hit) and 1, one half at the median.
-fn depth(distance: &Planes) -> Planes {
-    /// Cycles writes 1e10 where a ray hits nothing.
-    const FAR: f32 = 1e9;
-    let valid = |v: f32| v > 0.0 && v < FAR;
-    let mut sorted: Vec<f32> = distance.data.iter().copied().filter(|v| valid(*v)).collect();
-    sorted.sort_unstable_by(f32::total_cmp);
-    let median = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
-    let mut out = distance.clone();
-    out.data.iter_mut().for_each(|v| *v = if valid(*v) { *v / (*v + median) } else { 0.0 });
-    out
 }
 
 /// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to
@@ -439,11 +427,5 @@ mod tests {
         set.remove(Pass::DenoisingNormal);
         let message = Nfor.denoise(&set).unwrap_err().to_string();
         assert!(message.contains("Denoising Normal") && message.contains(NAME), "{message}");
-    }
-
-    #[test]
-    fn depth_ends_at_one_and_misses_are_zero() {
-        let out = depth(&Planes::from_vec(1, 5, 1, vec![0.0, 1.0, 2.0, 8.0, 1e10]));
-        assert_eq!(out.data, [0.0, 1.0 / 3.0, 0.5, 0.8, 0.0]);
     }
 }

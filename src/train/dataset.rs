@@ -45,13 +45,16 @@ fn to_half(values: &[f32]) -> Vec<f16> {
 }
 
 impl Dataset {
-    /// Decodes what `wanted` names of every pair. Frames smaller than `patch` in either direction are
-    /// an error, since no crop fits them.
+    /// Decodes of every pair the passes that must be there and those that may. Frames smaller than
+    /// `patch` in either direction are an error, since no crop fits them.
     ///
     /// # Errors
     /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
-    pub fn load(pairs: &[Pair], wanted: &[Pass], patch: usize) -> Result<Self> {
-        let frames = pairs.par_iter().map(|pair| Stored::load(pair, wanted, patch)).collect::<Result<_>>()?;
+    pub fn load(pairs: &[Pair], (needed, optional): (&[Pass], &[Pass]), patch: usize) -> Result<Self> {
+        let frames = pairs
+            .par_iter()
+            .map(|pair| Stored::load(pair, needed, optional, patch))
+            .collect::<Result<_>>()?;
         Ok(Self { frames })
     }
 
@@ -83,10 +86,10 @@ impl Dataset {
 }
 
 impl Stored {
-    fn load(pair: &Pair, wanted: &[Pass], patch: usize) -> Result<Self> {
+    fn load(pair: &Pair, needed: &[Pass], optional: &[Pass], patch: usize) -> Result<Self> {
         let frame = Frame::read(&pair.noisy)?;
         let mut noisy = passes::read(&frame, None)?;
-        for &pass in wanted {
+        for &pass in needed {
             noisy.require(pass, "training")?;
         }
         noisy.sanitize();
@@ -115,7 +118,7 @@ impl Stored {
                 ),
             ));
         }
-        let kept = noisy.iter().filter(|(pass, _)| wanted.contains(pass));
+        let kept = noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
         Ok(Self {
             pair: pair.clone(),
             view_layer: noisy.view_layer.clone(),

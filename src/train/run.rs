@@ -105,8 +105,9 @@ pub fn run(
     if progress.step >= options.steps {
         return Ok(());
     }
-    let training = Dataset::load(&options.train, network.passes(), options.patch)?;
-    let validation = Dataset::load(&options.validation, network.passes(), 1)?;
+    let wanted = (network.passes(), network.optional_passes());
+    let training = Dataset::load(&options.train, wanted, options.patch)?;
+    let validation = Dataset::load(&options.validation, wanted, 1)?;
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
         let samples = draw(&training, options, progress.step);

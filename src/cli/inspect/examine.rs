@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::{
     Result,
     frame::{Frame, Window},
-    models,
+    models::{self, Denoiser, learned::Learned, nfor},
     passes::{self, Layer, POSITION_AOV, Pass},
     planes::Planes,
 };
@@ -80,10 +80,14 @@ pub struct Method {
 /// The networks, the classical methods and the peers, with the passes they need.
 pub fn methods() -> Vec<Method> {
     let networks = models::trainable().into_iter().map(|(name, config)| {
-        // The passes follow from the architecture alone: any seed will do.
-        Method { name: name.into(), passes: models::build(&config, 0).passes().to_vec() }
+        let passes = match Learned::built_in(name) {
+            Some(model) => model.passes().to_vec(),
+            // The passes follow from the architecture alone: any seed will do.
+            None => models::build(&config, 0).passes().to_vec(),
+        };
+        Method { name: name.into(), passes }
     });
-    let others = ["nfor", "lbf"].into_iter().chain(models::oidn::NAMES).filter_map(|name| {
+    let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES).filter_map(|name| {
         let model = models::open(name).ok()?;
         Some(Method { name: name.into(), passes: model.passes().to_vec() })
     });

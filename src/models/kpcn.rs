@@ -1,0 +1,209 @@
+//! KPCN: Bako, Vogels, McWilliams, Meyer, Novak, Harvill, Sen, DeRose, Rousselle 2017,
+//! "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings" (ACM TOG 36:4).
+//!
+//! In: `features::kpcn_streams` where a file holds Cycles' diffuse light passes, else
+//! `features::kpcn_combined`. Out: radiance. A stream is nine 5x5 convolutions that predict, for each
+//! pixel, a softmax kernel over 21x21 pixels (Section 4.2); diffuse light is filtered without its
+//! albedo, specular light as a logarithm (Section 4.3).
+//!
+//! Departures: (1) variance comes from neighbouring pixels, since Cycles writes none of its samples;
+//! (2) exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
+//! networks knew one studio's exposure; (3) both streams are trained at once, end to end, with any of
+//! `demc train`'s losses; (4) without light passes one stream filters Combined over Denoising Albedo,
+//! with a larger floor; (5) emission and environment are added back unfiltered, volumes count as
+//! specular; (6) the default width is 32; `--widths 100` is the published one.
+
+use dfdx::{
+    tensor::{Cpu, Merge, NoneTape, Tape},
+    tensor_ops::exp,
+};
+
+use super::network::{Architecture, Batch, Config, Network, Taped};
+use crate::{
+    Result,
+    features::{
+        Inputs, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
+        kpcn_streams,
+    },
+    kernels::Shape,
+    nn::{Activation, BatchNorm, Conv, Field, Images, Init, Param, Rng, Stats},
+    passes::{Pass, PassSet},
+};
+
+/// Channels of the hidden layers as published (Section 5.2).
+pub const PUBLISHED_WIDTH: usize = 100;
+
+/// Convolutions of a stream, and their taps in a row.
+const LAYERS: usize = 9;
+const TAPS: usize = 5;
+
+/// Rows and columns of the kernels.
+const KERNEL: usize = 21;
+
+/// The last layer begins this much smaller than Xavier: kernels start nearly flat.
+const HEAD_GAIN: f32 = 0.3;
+
+/// A frame is worked on in tiles beyond this many pixels: each has 441 kernel weights, held twice.
+const WHOLE_FRAME_PIXELS: usize = 1 << 19;
+
+/// Both streams, or the single one over Combined.
+#[derive(Clone)]
+pub struct Kpcn {
+    config: Config,
+    streams: Vec<Stream>,
+}
+
+/// One kernel-predicting network.
+#[derive(Clone)]
+struct Stream {
+    layers: Vec<Conv>,
+}
+
+impl Stream {
+    fn new(rng: &mut Rng, name: &str, width: usize) -> Self {
+        let mut from = KPCN_CHANNELS;
+        let mut hidden = |i: usize| {
+            let from = std::mem::replace(&mut from, width);
+            Conv::new(rng, &format!("{name}.{i}"), &[from], width, TAPS, Init::Xavier)
+        };
+        let mut layers: Vec<Conv> = (0..LAYERS - 1).map(&mut hidden).collect();
+        let last = format!("{name}.{}", LAYERS - 1);
+        layers.push(Conv::new(rng, &last, &[width], KERNEL * KERNEL, TAPS, Init::Scaled(HEAD_GAIN)).linear());
+        Self { layers }
+    }
+
+    /// The image (N, 3, H, W), filtered by the kernels that the network reads from `input`.
+    fn filter<T: Tape<f32, Cpu> + Merge<T>>(
+        &self,
+        image: &(Shape, Vec<f32>),
+        input: &(Shape, Vec<f32>),
+    ) -> Field<T> {
+        let shape = Shape { pad: TAPS / 2, ..input.0 };
+        let mut x = Activation::<T>::input(shape, &input.1);
+        for layer in &self.layers {
+            x = layer.forward(vec![x]); // (N, 34, H, W) -> (N, K, H, W) -> ... -> (N, 441, H, W)
+        }
+        let logits = Field::from_activation(x, 0, KERNEL * KERNEL, 1);
+        field(image).filter(KERNEL, logits, None) // Section 4.2
+    }
+}
+
+fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &(Shape, Vec<f32>)) -> Field<T> {
+    Field::input((shape.n, shape.c, shape.h, shape.w), values.clone())
+}
+
+impl Kpcn {
+    /// A network with fresh weights drawn from `seed`.
+    ///
+    /// # Panics
+    /// If `config` does not hold one width.
+    pub fn new(config: &Config, seed: u64) -> Self {
+        let [width] = config.widths[..] else { panic!("one width serves all layers") };
+        let rng = &mut Rng::new(seed, 0);
+        let names: &[&str] = match config.architecture {
+            Architecture::Kpcn => &["diffuse", "specular"],
+            _ => &["combined"],
+        };
+        let streams = names.iter().map(|name| Stream::new(rng, name, width)).collect();
+        Self { config: config.clone(), streams }
+    }
+
+    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
+        match (&self.streams[..], &batch[..]) {
+            ([stream], [irradiance, albedo, input]) => {
+                let filtered = stream.filter::<T>(irradiance, input);
+                filtered.into_images() * field::<NoneTape>(albedo).into_images()
+            }
+            ([of_diffuse, of_specular], [diffuse, colour, specular, unfiltered, input_d, input_s]) => {
+                let constant = |planes| field::<NoneTape>(planes).into_images();
+                let diffuse = of_diffuse.filter::<T>(diffuse, input_d).into_images() * constant(colour);
+                let specular = of_specular.filter::<T>(specular, input_s).into_images();
+                // Section 4.3: both halves of the decomposition are undone.
+                diffuse + (exp(specular) - 1.0) + constant(unfiltered)
+            }
+            _ => unreachable!("`inputs` makes the planes of these streams"),
+        }
+    }
+}
+
+impl Network for Kpcn {
+    fn config(&self) -> Config {
+        self.config.clone()
+    }
+
+    fn passes(&self) -> &'static [Pass] {
+        match self.config.architecture {
+            Architecture::Kpcn => &KPCN_PASSES,
+            _ => &KPCN_COMBINED_PASSES,
+        }
+    }
+
+    fn optional_passes(&self) -> &'static [Pass] {
+        match self.config.architecture {
+            Architecture::Kpcn => &KPCN_UNFILTERED,
+            _ => &[],
+        }
+    }
+
+    fn notes(&self) -> Option<String> {
+        let source = match self.config.architecture {
+            Architecture::Kpcn => "diffuse and specular light are filtered apart",
+            _ => "these weights filter Combined as one stream, without the light passes",
+        };
+        Some(format!("{source}; variance is estimated from neighbouring pixels"))
+    }
+
+    fn whole_frame_pixels(&self) -> usize {
+        WHOLE_FRAME_PIXELS
+    }
+
+    fn multiple(&self) -> usize {
+        1
+    }
+
+    fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
+        match self.config.architecture {
+            Architecture::Kpcn => kpcn_streams(passes, "kpcn"),
+            _ => kpcn_combined(passes, "kpcn"),
+        }
+    }
+
+    fn params(&mut self) -> Vec<&mut Param> {
+        self.streams.iter_mut().flat_map(|s| &mut s.layers).flat_map(|conv| conv.params()).collect()
+    }
+
+    fn convolutions(&mut self) -> Vec<&mut Conv> {
+        self.streams.iter_mut().flat_map(|s| &mut s.layers).collect()
+    }
+
+    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
+        Vec::new()
+    }
+
+    fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
+        self.run::<NoneTape>(batch)
+    }
+
+    fn forward_taped(&self, batch: &Batch, _: &mut Stats) -> Images<Taped> {
+        self.run::<Taped>(batch)
+    }
+
+    fn macs_per_pixel(&self) -> f64 {
+        // Three channels and the sum of weights.
+        let filter = 4 * KERNEL * KERNEL;
+        let stream = |s: &Stream| s.layers.iter().map(Conv::macs_per_output_pixel).sum::<usize>() + filter;
+        self.streams.iter().map(stream).sum::<usize>() as f64
+    }
+
+    fn reach(&self) -> usize {
+        LAYERS * (TAPS / 2) + KERNEL / 2
+    }
+
+    fn duplicate(&self) -> Box<dyn Network> {
+        let mut copy = self.clone();
+        for param in copy.params() {
+            *param = param.duplicate();
+        }
+        Box::new(copy)
+    }
+}
