@@ -15,6 +15,7 @@ from demc_blender.edits import Edits
 _PROBE = 160
 _DARKEST = 1e-5
 _LEAST_DETAIL = 0.05
+_LEAST_BUSY = 0.15
 # A crop of the sky alone teaches nothing: surfaces must cover this share of it.
 _COVERED = 0.4
 # Where light finds so few samples at 4 spp that more surface pixels than this stay black, no
@@ -184,15 +185,30 @@ def crops(rng, scene, guides, count, size):
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)
-        if detail > _LEAST_DETAIL:
-            found.append((detail, (x, y, *size)))
+        shows = busy(albedo[part], normal[part])
+        if detail > _LEAST_DETAIL and shows > _LEAST_BUSY:
+            found.append((shows, (x, y, *size)))
     chosen = []
     while found and len(chosen) < count:
-        pick = rng.choices(range(len(found)), [min(d, 0.5) ** 2 for d, _ in found])[0]
+        pick = rng.choices(range(len(found)), [min(b, 0.6) ** 2 for b, _ in found])[0]
         region = found.pop(pick)[1]
         if all(overlap(region, other) < 0.3 for other in chosen):
             chosen.append(region)
     return chosen
+
+
+def busy(albedo, normal):
+    """Share of a crop's small blocks that hold an edge of a texture or of a shape: two even halves
+    have much contrast and little to learn from."""
+    spread = lambda image: np.ptp(_blocks(image), axis=(1, 3)).max(-1)
+    return float(((spread(albedo) > 0.12) | (spread(normal) > 0.4)).mean())
+
+
+def _blocks(image, side=4):
+    height, width = (n // side * side for n in image.shape[:2])
+    if not height or not width:  # a crop smaller than a block of the probe is one block
+        return image[:, None, :, None].reshape(1, image.shape[0], 1, image.shape[1], -1)
+    return image[:height, :width].reshape(height // side, side, width // side, side, -1)
 
 
 def overlap(a, b):
