@@ -22,9 +22,10 @@ fn demc() -> Demc {
     Demc::cargo_bin("demc").unwrap()
 }
 
-/// Runs `demc eval` with one timed run, plus `more` arguments.
+/// Runs `demc eval` with one timed run unless told otherwise, plus `more` arguments.
 fn eval(set: &Path, out: &Path, more: &[&str]) -> Assert {
-    demc().args(["eval", "--repeats", "1", "--test-set"]).arg(set).arg("--out").arg(out).args(more).assert()
+    let once = if more.contains(&"--repeats") { &[][..] } else { &["--repeats", "1"] };
+    demc().arg("eval").args(once).arg("--test-set").arg(set).arg("--out").arg(out).args(more).assert()
 }
 
 type Row = HashMap<String, String>;
@@ -93,6 +94,23 @@ fn writes_tables_charts_and_sheets_for_methods_and_the_noisy_input() {
     assert!((summary[1]["relmse_geomean"].parse::<f64>().unwrap() / geomean - 1.0).abs() < 1e-5);
     assert_eq!(summary[1]["relmse_ratio"], "1");
 
+    for metric in ["relmse", "ssim", "relmse_trimmed", "smape", "flip", "ms_per_mpx"] {
+        for statistic in ["mean", "median", "geomean", "ratio"] {
+            let value: f64 = summary[1][&format!("{metric}_{statistic}")].parse().unwrap();
+            assert!(value > 0.0, "{metric}_{statistic}");
+        }
+    }
+    assert!(summary[1]["peak_mib_max"].parse::<f64>().unwrap() > 1.0);
+
+    for (name, texts) in [
+        ("bars_relmse", ["s0000_room", "s0010_outdoor", "geometric mean", "oidn-fast"]),
+        ("bars_ssim", ["s0000_room", "s0010_outdoor", "mean", "oidn-high-prefilter"]),
+    ] {
+        let bars = image::open(out.path().join(format!("{name}.png"))).unwrap();
+        assert_eq!(bars.width(), 1600);
+        let svg = fs::read_to_string(out.path().join(format!("{name}.svg"))).unwrap();
+        texts.iter().for_each(|text| assert!(svg.contains(text), "{name} names {text}"));
+    }
     let chart = image::open(out.path().join("speed_vs_accuracy.png")).unwrap();
     assert_eq!((chart.width(), chart.height()), (1600, 760));
     let svg = fs::read_to_string(out.path().join("speed_vs_accuracy.svg")).unwrap();
@@ -193,6 +211,49 @@ fn finished_rows_are_kept_and_missing_ones_run() {
         .success()
         .stderr(predicate::str::contains("already").not());
     assert_eq!(table(&scores).len(), 2);
+}
+
+#[test]
+fn a_killed_run_keeps_its_finished_rows_and_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let manifest = dir.path().join("set.csv");
+    let (noisy, reference) = (data("s0010_outdoor_0004spp.exr"), data("s0010_outdoor_ref.exr"));
+    let mut text = "scene,noisy,reference,spp\n".to_string();
+    for spp in 1..=40 {
+        // One file under many names would be one row: links make it many.
+        let link = dir.path().join(format!("meadow_{spp:04}spp.exr"));
+        fs::hard_link(&noisy, &link).or_else(|_| fs::copy(&noisy, &link).map(|_| ())).unwrap();
+        text += &format!("meadow,{},{},{spp}\n", link.display(), reference.display());
+    }
+    fs::write(&manifest, text).unwrap();
+    let out = dir.path().join("out");
+    let scores = out.join("scores.csv");
+    let lines = || fs::read_to_string(&scores).map_or(0, |text| text.lines().count());
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("demc"))
+        .args(["eval", "--models", "noisy", "--test-set"])
+        .args([&manifest, Path::new("--out"), &out])
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    while lines() < 4 {
+        assert!(child.try_wait().unwrap().is_none(), "it ended before it could be killed");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    assert!(!child.wait().unwrap().success());
+    let text = fs::read_to_string(&scores).unwrap();
+    let whole = text.rfind('\n').unwrap() + 1;
+    let kept = text[..whole].lines().count() - 1;
+    assert!((3..40).contains(&kept), "{kept} rows");
+    assert!(!out.join("summary.csv").exists());
+
+    eval(&manifest, &out, &["--models", "noisy", "--repeats", "3"])
+        .success()
+        .stderr(predicate::str::contains(format!("{kept} of 40 rows are there already")));
+    let again = fs::read_to_string(&scores).unwrap();
+    assert!(again.starts_with(&text[..whole]), "the rows of the killed run are untouched");
+    assert_eq!(table(&scores).len(), 40);
+    assert!(out.join("report.html").is_file());
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::{
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::SOME_FAILED;
+use super::{SOME_FAILED, peak_memory};
 use crate::{
     Error, Result,
     models::{self, Denoiser, oidn::Oidn},
@@ -27,7 +27,7 @@ pub struct Args {
     /// Methods: built-in names, oidn-fast, oidn-balanced, oidn-high, oidn-high-prefilter, weights files
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
     models: Vec<String>,
-    /// Folder for scores.csv, summary.csv, the charts and the comparison sheets
+    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Method that the summary's ratios refer to [default: the first of --models]
@@ -59,7 +59,11 @@ pub struct Args {
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: Args) -> Result<ExitCode> {
     let set = testset::read(&args.test_set)?;
-    let methods = methods(&args)?;
+    let threads = args
+        .threads
+        .map(usize::from)
+        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
+    let methods = methods(&args, threads)?;
     let baseline = baseline(&args, &methods)?;
     let mut failed = 0;
     for unmatched in &set.unmatched {
@@ -71,10 +75,6 @@ pub fn run(args: Args) -> Result<ExitCode> {
             Unmatched::Reference(_) => eprintln!("warning: {unmatched}"),
         }
     }
-    let threads = args
-        .threads
-        .map(usize::from)
-        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
     let options = Options {
         out: args.out,
         repeats: args.repeats.into(),
@@ -93,7 +93,9 @@ pub fn run(args: Args) -> Result<ExitCode> {
         .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
     progress.finish();
     failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
-    println!("{}", options.out.join("summary.csv").display());
+    for file in ["summary.csv", "report.html"] {
+        println!("{}", options.out.join(file).display());
+    }
     if failed > 0 {
         eprintln!("demc: {failed} failed; {} says why", options.out.join("scores.csv").display());
         return Ok(ExitCode::from(SOME_FAILED));
@@ -102,7 +104,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
 }
 
 /// The methods asked for, the noisy input first, each under a name of its own.
-fn methods(args: &Args) -> Result<Vec<Method>> {
+fn methods(args: &Args, threads: usize) -> Result<Vec<Method>> {
     // Built-in methods change with the program.
     let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
     let asked = args.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
@@ -115,7 +117,15 @@ fn methods(args: &Args) -> Result<Vec<Method>> {
             None => models::open(name)?,
         };
         let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
-        methods.push(Method { name: short_name(name, &asked), denoiser, stamp });
+        let (spec, view_layer) = (name.to_string(), args.view_layer.clone());
+        let peak_mib =
+            move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
+        methods.push(Method {
+            name: short_name(name, &asked),
+            denoiser,
+            peak_mib: Box::new(peak_mib),
+            stamp,
+        });
     }
     Ok(methods)
 }

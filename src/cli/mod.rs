@@ -6,6 +6,7 @@ mod eval;
 mod inputs;
 mod inspect;
 mod models;
+mod peak_memory;
 mod stop;
 mod train;
 
@@ -38,6 +39,8 @@ enum Command {
     /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
     Compare(compare::Args),
     Models(models::Args),
+    #[command(name = peak_memory::COMMAND, hide = true)]
+    PeakMemory(peak_memory::Args),
 }
 
 /// Exit status when some input failed, each named on stderr.
@@ -54,6 +57,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => inspect::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Models(args) => models::run(&args),
+        Command::PeakMemory(args) => peak_memory::run(&args),
     };
     done.unwrap_or_else(|error| {
         eprintln!("demc: {error}");

@@ -31,6 +31,12 @@ impl Scale {
         Self { low: low - margin, high: high + margin, logarithmic, pixels }
     }
 
+    /// Covers exactly what lies between two values.
+    pub fn exactly((low, high): (f64, f64), logarithmic: bool, pixels: (i32, i32)) -> Self {
+        let place = |v: f64| if logarithmic { v.log10() } else { v };
+        Self { low: place(low), high: place(high), logarithmic, pixels }
+    }
+
     /// How much it covers: in decades where it is logarithmic.
     pub fn span(&self) -> f64 {
         self.high - self.low
@@ -74,4 +80,27 @@ fn round_step(step: f64) -> f64 {
 pub fn tick_label(value: f64) -> String {
     let text = format!("{value:.6}");
     text.trim_end_matches('0').trim_end_matches('.').into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round_and_enough() {
+        for (values, logarithmic) in [
+            (vec![80.0, 5000.0], true),
+            (vec![300.0, 330.0], true),
+            (vec![1e-4, 30.0], true),
+            (vec![0.81, 0.83], false),
+            (vec![0.1, 0.95], false),
+            (vec![7.0], true),
+        ] {
+            let ticks = Scale::new(values.iter().copied(), logarithmic, (0, 100)).ticks();
+            assert!((2..=12).contains(&ticks.len()), "{values:?}: {ticks:?}");
+            assert!(ticks.iter().all(|t| tick_label(*t).len() <= 6), "{ticks:?}");
+        }
+        assert_eq!(tick_label(0.30000000000000004), "0.3");
+        assert_eq!(tick_label(1000.0), "1000");
+    }
 }

@@ -1,21 +1,28 @@
 //! Runs methods over a test set, times them, and writes what a reader needs to judge them.
 //!
 //! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
-//! `summary.csv`, `speed_vs_accuracy.png` and `.svg`, and `sheets/<pair>.png`. Rows are stored as
-//! they finish; the same command run again keeps those that still hold.
+//! `summary.csv`, the charts `speed_vs_accuracy`, `bars_relmse` and `bars_ssim` as PNG and SVG,
+//! `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish; the
+//! same command run again keeps those that still hold.
 
 mod axis;
+mod bars;
 mod canvas;
 mod chart;
+mod figure;
+mod labels;
 mod loss;
-mod memory;
+mod page;
+mod palette;
+mod picture;
+mod provenance;
 mod rows;
 mod run;
 mod settings;
 mod sheet;
 mod summary;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub use loss::loss_chart;
 pub use rows::{COLUMNS, Row, read_rows};
@@ -34,6 +41,8 @@ pub struct Method {
     pub name: String,
     /// What runs.
     pub denoiser: Box<dyn Denoiser>,
+    /// Memory in MiB that it takes for the frame in a file, at its peak; none where that is not known.
+    pub peak_mib: Box<dyn Fn(&Path) -> Option<f64> + Send + Sync>,
     /// Changes whenever the method might give other results: finished rows are kept while it stays.
     pub stamp: String,
 }

@@ -1,12 +1,18 @@
 //! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
 //!
 //! On a pair each method runs once to warm up (that output is scored), then all take turns for the
-//! timed runs: a machine that slows down slows them all.
+//! timed runs: a machine that slows down slows them all. Memory is measured apart, once for each
+//! method and size of frame.
 
-use std::{collections::HashMap, fs};
+use std::{collections::HashMap, fs, path::PathBuf};
 
 use super::{
-    Method, NOISY, Options, chart, memory,
+    Method, NOISY, Options,
+    bars::Bars,
+    chart::Chart,
+    figure::Figure,
+    page::Page,
+    provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
     settings::Settings,
     sheet::{self, Shown},
@@ -54,7 +60,8 @@ pub fn evaluate(
     let folder = if options.sheets { &sheets } else { out };
     fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
-    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options));
+    let provenance = Provenance::now();
+    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
     let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
     // A row that failed is tried again.
     kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
@@ -63,16 +70,17 @@ pub fn evaluate(
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
     let mut table = Table::create(scores, kept)?;
     now.write(&stored)?;
+    let mut peaks = Peaks::new();
     for pair in pairs {
         let finished: Vec<bool> =
             methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
-        let sheet = options.sheets.then(|| sheets.join(format!("{}.png", sheet_name(pairs, pair))));
+        let sheet = sheet_path(pairs, pair, options);
         let sheet = sheet.filter(|path| !(keep_sheets && finished.iter().all(|f| *f) && path.is_file()));
         if finished.iter().all(|f| *f) && sheet.is_none() {
             continue;
         }
         on(Event::Pair(pair));
-        let done = run_pair(pair, methods, &finished, sheet.is_some(), options);
+        let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
         done.notes.iter().for_each(|note| on(Event::Note(note)));
         for row in done.rows {
             on(Event::Row(&row));
@@ -92,18 +100,37 @@ pub fn evaluate(
     let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
     let summaries = summary::summarise(&rows, &names, &options.baseline);
     write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
-    chart::write(out, &summaries, options.threads)?;
+    let charts = [
+        ("Speed and accuracy", Chart::new(&summaries, options.threads).write(out, "speed_vs_accuracy")?),
+        ("RelMSE of every scene", Bars::relmse(&rows, &summaries).write(out, "bars_relmse")?),
+        ("SSIM of every scene", Bars::ssim(&rows, &summaries).write(out, "bars_ssim")?),
+    ];
+    let scenes: Vec<(&Pair, Option<PathBuf>)> = pairs
+        .iter()
+        .map(|pair| (pair, sheet_path(pairs, pair, options).filter(|path| path.is_file())))
+        .collect();
+    Page {
+        rows: &rows,
+        summaries: &summaries,
+        charts: &charts,
+        scenes: &scenes,
+        options,
+        provenance: &provenance,
+    }
+    .write()?;
     Ok(rows)
 }
 
-/// A file name for the pair's sheet, unique in the test set even where a manifest repeats a scene.
-fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
+/// Where the pair's sheet goes, if sheets are wanted: a name that is unique in the test set even where
+/// a manifest repeats a scene.
+fn sheet_path(pairs: &[Pair], pair: &Pair, options: &Options) -> Option<PathBuf> {
     let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
     let id = pair.id().replace(['/', '\\'], "_");
-    match twins.iter().position(|p| *p == pair) {
-        Some(at) if at > 0 => format!("{id}_{}", at + 1),
-        _ => id,
-    }
+    let name = match twins.iter().position(|p| *p == pair) {
+        Some(at) if at > 0 => format!("{id}_{}.png", at + 1),
+        _ => format!("{id}.png"),
+    };
+    options.sheets.then(|| options.out.join("sheets").join(name))
 }
 
 /// What running a pair gave.
@@ -148,7 +175,17 @@ fn load(pair: &Pair, options: &Options) -> Result<Loaded> {
     Ok(Loaded { noisy, passes, reference })
 }
 
-fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, options: &Options) -> Done {
+/// Memory peaks known so far, by method, width and height.
+type Peaks = HashMap<(String, usize, usize), Option<f64>>;
+
+fn run_pair(
+    pair: &Pair,
+    methods: &[Method],
+    finished: &[bool],
+    shown: bool,
+    options: &Options,
+    peaks: &mut Peaks,
+) -> Done {
     let open = || methods.iter().zip(finished).filter(|(_, finished)| !**finished).map(|(m, _)| m);
     let new_row = |method: &Method| {
         let mut row = Row::new(pair, &method.name);
@@ -162,7 +199,7 @@ fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, opt
             return Done { notes: Vec::new(), rows: open().map(fail).collect(), scene: None };
         }
     };
-    let pixels = loaded.noisy.pixels();
+    let (width, height) = (loaded.noisy.width, loaded.noisy.height);
     let mut rows: Vec<Option<Row>> = Vec::new();
     let mut images = Vec::new();
     for (method, &finished) in methods.iter().zip(finished) {
@@ -171,8 +208,12 @@ fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, opt
             continue;
         }
         let mut row = new_row(method);
-        (row.width, row.height) = (Some(loaded.noisy.width), Some(loaded.noisy.height));
+        (row.width, row.height) = (Some(width), Some(height));
         let image = first_run(method, &loaded, &mut row);
+        if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
+            let measure = || (method.peak_mib)(&pair.noisy);
+            row.peak_mib = *peaks.entry((method.name.clone(), width, height)).or_insert_with(measure);
+        }
         if shown && let Some(image) = &image {
             images.push(Shown::new(&method.name, image, &loaded.reference));
         }
@@ -193,7 +234,7 @@ fn run_pair(pair: &Pair, methods: &[Method], finished: &[bool], shown: bool, opt
     for (row, times) in rows.iter_mut().zip(&mut times) {
         if let Some(row) = row {
             row.repeats = times.len();
-            row.set_time(times, pixels);
+            row.set_time(times, width * height);
         }
     }
     Done {
@@ -208,10 +249,9 @@ fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> 
     let image = if method.name == NOISY {
         loaded.noisy.clone()
     } else {
-        let (run, grown) = memory::peak_mib(|| method.denoiser.denoise_timed(&loaded.passes));
-        match run {
+        match method.denoiser.denoise_timed(&loaded.passes) {
             Ok(run) => {
-                row.peak_mib = run.peak_mib.or(grown);
+                row.peak_mib = run.peak_mib;
                 run.image
             }
             Err(error) => {

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Method, Options,
+    provenance::Provenance,
     rows::{Row, write_file},
 };
 use crate::{Result, testset::Pair};
@@ -14,7 +15,7 @@ use crate::{Result, testset::Pair};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
-    version: String,
+    provenance: Provenance,
     threads: usize,
     repeats: usize,
     view_layer: Option<String>,
@@ -26,9 +27,9 @@ pub struct Settings {
 
 impl Settings {
     /// Those of a run about to start.
-    pub fn of(pairs: &[Pair], methods: &[Method], options: &Options) -> Self {
+    pub fn of(pairs: &[Pair], methods: &[Method], options: &Options, provenance: &Provenance) -> Self {
         Self {
-            version: env!("CARGO_PKG_VERSION").into(),
+            provenance: provenance.clone(),
             threads: options.threads,
             repeats: options.repeats,
             view_layer: options.view_layer.clone(),
@@ -57,8 +58,10 @@ impl Settings {
     /// Whether `row`, made with the settings `self`, would come out the same with `now`.
     pub fn still_holds(&self, row: &Row, now: &Self) -> bool {
         let pair = name(&row.noisy, &row.reference);
-        (&self.version, self.threads, self.repeats, &self.view_layer)
-            == (&now.version, now.threads, now.repeats, &now.view_layer)
+        let (before, after) = (&self.provenance, &now.provenance);
+        (&before.version, &before.cpu, &before.instructions)
+            == (&after.version, &after.cpu, &after.instructions)
+            && (self.threads, self.repeats, &self.view_layer) == (now.threads, now.repeats, &now.view_layer)
             && now.methods.contains_key(&row.model)
             && self.methods.get(&row.model) == now.methods.get(&row.model)
             && now.pairs.contains_key(&pair)

@@ -1,0 +1,348 @@
+//! `report.html`: everything of a run on one page that needs nothing but itself.
+//!
+//! In: rows, summaries, charts and sheets. Out: an HTML document with its style, script, charts (SVG)
+//! and sheets (JPEG) inside; its policy forbids the browser to fetch anything. Text is escaped by
+//! `maud`, whatever scenes and files are called.
+
+mod table;
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+use rayon::prelude::*;
+use table::{Better, Column, Line, ratio, score, share, table, whole};
+
+use super::{
+    NOISY, Options,
+    palette::colours,
+    picture::{self, Picture},
+    provenance::Provenance,
+    rows::{Row, write_file},
+    summary::{Method, Statistics},
+};
+use crate::{Result, testset::Pair};
+
+/// What the page shows.
+pub struct Page<'a> {
+    /// All rows.
+    pub rows: &'a [Row],
+    /// Their summaries.
+    pub summaries: &'a [Method],
+    /// Title and SVG of each chart.
+    pub charts: &'a [(&'a str, String)],
+    /// The pairs, each with its sheet where there is one.
+    pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
+    /// How it was run.
+    pub options: &'a Options,
+    /// What it was run with and on.
+    pub provenance: &'a Provenance,
+}
+
+/// Fetch nothing, whatever the page holds.
+const POLICY: &str =
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
+
+impl Page<'_> {
+    /// Writes `report.html` into the output folder.
+    ///
+    /// # Errors
+    /// A sheet cannot be read or the file not be written.
+    pub fn write(&self) -> Result<()> {
+        let count = self.scenes.iter().filter(|(_, sheet)| sheet.is_some()).count();
+        let scenes = self.scenes.par_iter().map(|(pair, sheet)| {
+            let picture = sheet.as_ref().map(|path| picture::embed(path, count)).transpose()?;
+            Ok(self.scene(pair, sheet.as_deref(), picture))
+        });
+        let scenes: Vec<Markup> = scenes.collect::<Result<_>>()?;
+        let path = self.options.out.join("report.html");
+        write_file(&path, self.document(&scenes).into_string().as_bytes())
+    }
+
+    fn document(&self, scenes: &[Markup]) -> Markup {
+        let title = format!("demc eval: {}", self.counted());
+        let p = self.provenance;
+        html! {
+            (DOCTYPE)
+            html lang="en" {
+                head {
+                    meta charset="utf-8";
+                    meta name="viewport" content="width=device-width, initial-scale=1";
+                    meta http-equiv="Content-Security-Policy" content=(POLICY);
+                    link rel="icon" href="data:,";
+                    title { (title) }
+                    style { (PreEscaped(include_str!("page.css"))) }
+                }
+                body {
+                    h1 { (title) }
+                    p.faint {
+                        (p.started) ", " (self.options.threads) " threads, " (p.cpu) ", demc " (p.version)
+                    }
+                    (self.best())
+                    (self.failures())
+                    h2 #summary { "Summary" }
+                    p.faint {
+                        "Over the renders that every method scored. A ratio is the geometric mean, scene by \
+                         scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
+                    }
+                    (self.summary())
+                    @for (title, svg) in self.charts {
+                        h2 { (title) }
+                        figure { (PreEscaped(svg)) }
+                    }
+                    h2 #scenes { "Scenes" }
+                    nav { @for (pair, _) in self.scenes { a href=(format!("#{}", anchor(pair))) { (pair.label()) } } }
+                    @for scene in scenes { (scene) }
+                    (self.how())
+                    script { (PreEscaped(include_str!("page.js"))) }
+                }
+            }
+        }
+    }
+
+    /// "10 renders, 6 methods".
+    fn counted(&self) -> String {
+        let methods = self.overall().count();
+        let plural = |n: usize| if n == 1 { "" } else { "s" };
+        let renders = self.scenes.len();
+        format!("{renders} render{}, {methods} method{}", plural(renders), plural(methods))
+    }
+
+    /// Summaries over all sample counts.
+    fn overall(&self) -> impl Iterator<Item = &Method> {
+        self.summaries.iter().filter(|s| s.spp.is_none())
+    }
+
+    /// Who wins, before any table.
+    fn best(&self) -> Markup {
+        let winner = |value: fn(&Method) -> Option<f64>, sign: f64| {
+            let scored = self.overall().filter(|s| s.model != NOISY);
+            let scored = scored.filter_map(|s| Some((s.model.as_str(), value(s)?)));
+            scored.min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))
+        };
+        let relmse = winner(|s| s.of("relmse").geomean, 1.0);
+        let ssim = winner(|s| s.of("ssim").mean, -1.0);
+        let fastest = winner(|s| s.of("ms_per_mpx").geomean, 1.0);
+        html! {
+            ul.best {
+                @if let Some((name, value)) = relmse {
+                    li { span { "lowest RelMSE" } b { (name) } (score(value)) " (geometric mean)" }
+                }
+                @if let Some((name, value)) = ssim {
+                    li { span { "highest SSIM" } b { (name) } (share(value)) " (mean)" }
+                }
+                @if let Some((name, value)) = fastest {
+                    li { span { "fastest" } b { (name) } (whole(value)) " ms per megapixel" }
+                }
+            }
+        }
+    }
+
+    fn failures(&self) -> Markup {
+        let mut scenes: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
+        let failed = self.rows.iter().filter(|r| !r.reason.is_empty());
+        let count = failed.clone().count();
+        for row in failed {
+            scenes.entry((&row.model, &row.reason)).or_default().push(&row.scene);
+        }
+        if count == 0 {
+            return html! {};
+        }
+        html! {
+            div.failed #failures {
+                h3 { (count) " of " (self.rows.len()) " rows failed" }
+                div.scroll { table {
+                    thead { tr { @for name in ["method", "reason", "scenes"] { th.text { (name) } } } }
+                    tbody { @for ((method, reason), scenes) in scenes {
+                        tr { td { (method) } td.text { (reason) } td.text { (scenes.join(", ")) } }
+                    } }
+                } }
+            }
+        }
+    }
+
+    fn summary(&self) -> Markup {
+        let mut counts: Vec<Option<u32>> = self.summaries.iter().map(|s| s.spp).collect();
+        counts.dedup();
+        html! {
+            @for spp in counts {
+                @let methods: Vec<&Method> = self.summaries.iter().filter(|s| s.spp == spp).collect();
+                @let names: Vec<&str> = methods.iter().map(|s| s.model.as_str()).collect();
+                @let lines: Vec<Line<Method>> = methods
+                    .iter()
+                    .zip(colours(&names))
+                    .map(|(&item, colour)| Line { method: &item.model, colour, item })
+                    .collect();
+                @let caption = spp.map(|n| format!("{n} samples per pixel")).unwrap_or_default();
+                (table(&SUMMARY, &lines, &caption))
+            }
+        }
+    }
+
+    fn scene(&self, pair: &Pair, sheet: Option<&Path>, picture: Option<Picture>) -> Markup {
+        let of_pair = |r: &&Row| r.noisy == pair.noisy && r.reference == pair.reference;
+        let rows: Vec<&Row> = self.rows.iter().filter(of_pair).collect();
+        let names: Vec<&str> = rows.iter().map(|r| r.model.as_str()).collect();
+        let lines: Vec<Line<Row>> = rows
+            .iter()
+            .zip(colours(&names))
+            .map(|(&item, colour)| Line { method: &item.model, colour, item })
+            .collect();
+        let size = rows.iter().find_map(|r| Some(format!("{}×{}", r.width?, r.height?)));
+        let file = sheet.and_then(Path::file_name).map(|name| format!("sheets/{}", name.to_string_lossy()));
+        html! {
+            section id=(anchor(pair)) {
+                h3 {
+                    (pair.label()) ", " (pair.spp) " samples per pixel"
+                    @if let Some(size) = size { ", " (size) }
+                }
+                @if let Some(Picture { address, size: (width, height) }) = picture {
+                    figure {
+                        img src=(address) width=(width) height=(height)
+                            alt=(format!("{}: every method, its error map and details", pair.label()));
+                        @if let Some(file) = file {
+                            figcaption.faint { "In full size beside this page: " code { (file) } }
+                        }
+                    }
+                }
+                (table(&SCENE, &lines, ""))
+            }
+        }
+    }
+
+    fn how(&self) -> Markup {
+        let p = self.provenance;
+        let commit = p.commit.as_ref().map(|c| format!(", commit {c}")).unwrap_or_default();
+        let facts = [
+            ("program", format!("demc {}{commit}", p.version)),
+            ("processor", format!("{}, {} logical cores, {}", p.cpu, p.cores, p.system)),
+            ("kernels", p.instructions.clone()),
+            ("threads", self.options.threads.to_string()),
+            (
+                "times",
+                format!(
+                    "denoising alone, without file traffic; after a run that warms up, the median of {} \
+                     run{} in which all methods took turns",
+                    self.options.repeats,
+                    if self.options.repeats == 1 { "" } else { "s" }
+                ),
+            ),
+            (
+                "memory",
+                "what denoising adds at its peak, in a process of its own; largest of all renders".into(),
+            ),
+            ("RelMSE", "mean of (x - r)² / (r² + 0.001) over pixels and channels of linear radiance".into()),
+            ("trimmed RelMSE", "the same without the worst 0.1 % of pixels".into()),
+            ("SMAPE", "mean of |x - r| / (|x| + |r| + 0.01)".into()),
+            ("SSIM", "on the image exposed for display, Gaussian window of sigma 1.5".into()),
+            ("FLIP", "HDR-FLIP (Andersson et al. 2021): 0 is no visible difference".into()),
+        ];
+        html! {
+            h2 #how { "How it was made" }
+            dl {
+                dt { "command" } dd { code { (p.command) } }
+                @for (name, text) in &facts { dt { (name) } dd { (text) } }
+            }
+        }
+    }
+}
+
+/// Where the page holds a pair: letters, digits, `-`, `_` and `.` of its name, the rest as hex.
+fn anchor(pair: &Pair) -> String {
+    let id = pair.id();
+    let letter = |c: char| match c {
+        c if c.is_alphanumeric() || "-_.".contains(c) => c.to_string(),
+        c => format!("~{:x}", u32::from(c)),
+    };
+    format!("scene-{}", id.chars().map(letter).collect::<String>())
+}
+
+/// A statistic of a metric of the summary.
+macro_rules! statistic {
+    ($heading:literal, $hint:literal, $better:ident, $show:ident, $metric:literal, $field:ident) => {
+        Column {
+            heading: $heading,
+            hint: $hint,
+            better: Better::$better,
+            show: $show,
+            value: |m: &Method| -> Option<f64> {
+                let Statistics { $field: value, .. } = m.of($metric);
+                value
+            },
+        }
+    };
+}
+
+const SUMMARY: [Column<Method>; 12] = [
+    statistic!("RelMSE", "geometric mean over scenes", Low, score, "relmse", geomean),
+    statistic!("× baseline", "RelMSE against the baseline, scene by scene", Low, ratio, "relmse", ratio),
+    statistic!("mean RelMSE", "arithmetic mean: the worst scene rules it", Low, score, "relmse", mean),
+    statistic!(
+        "trimmed",
+        "RelMSE without the worst 0.1 % of pixels, geometric mean",
+        Low,
+        score,
+        "relmse_trimmed",
+        geomean
+    ),
+    statistic!("SMAPE", "mean", Low, share, "smape", mean),
+    statistic!("SSIM", "mean", High, share, "ssim", mean),
+    statistic!("FLIP", "mean", Low, share, "flip", mean),
+    statistic!("ms/Mpx", "milliseconds per megapixel, geometric mean", Low, whole, "ms_per_mpx", geomean),
+    statistic!("× time", "time against the baseline, scene by scene", Low, ratio, "ms_per_mpx", ratio),
+    Column {
+        heading: "MiB",
+        hint: "memory at the peak",
+        better: Better::Low,
+        show: whole,
+        value: |m| m.peak_mib,
+    },
+    Column {
+        heading: "renders",
+        hint: "scored by every method",
+        better: Better::Neither,
+        show: whole,
+        value: |m| Some(m.scenes as f64),
+    },
+    Column {
+        heading: "failed",
+        hint: "renders without a score of this method",
+        better: Better::Neither,
+        show: whole,
+        value: |m| Some(m.failed as f64),
+    },
+];
+
+/// A column of a scene's table, named like the field of the row.
+macro_rules! cell {
+    ($heading:literal, $better:ident, $show:ident, $field:ident) => {
+        Column {
+            heading: $heading,
+            hint: "",
+            better: Better::$better,
+            show: $show,
+            value: |r: &Row| r.$field,
+        }
+    };
+}
+
+const SCENE: [Column<Row>; 10] = [
+    cell!("RelMSE", Low, score, relmse),
+    cell!("trimmed", Low, score, relmse_trimmed),
+    cell!("SMAPE", Low, share, smape),
+    cell!("SSIM", High, share, ssim),
+    cell!("FLIP", Low, share, flip),
+    cell!("RMSE", Low, score, rmse),
+    cell!("max error", Low, score, max_error),
+    Column {
+        heading: "ms",
+        hint: "median",
+        better: Better::Low,
+        show: whole,
+        value: |r| r.seconds.map(|s| s * 1e3),
+    },
+    cell!("ms/Mpx", Low, whole, ms_per_mpx),
+    cell!("MiB", Low, whole, peak_mib),
+];

@@ -1,0 +1,93 @@
+//! Comparison sheets small enough to travel inside the page: JPEG in a `data:` address.
+
+use std::path::Path;
+
+use base64::{Engine, engine::general_purpose::STANDARD};
+use image::{DynamicImage, ImageReader, codecs::jpeg::JpegEncoder, imageops::FilterType};
+
+use crate::{Error, Result};
+
+/// Widths in pixels and JPEG qualities, best first.
+const SIZES: [(u32, u8); 5] = [(1800, 80), (1600, 70), (1400, 65), (1200, 60), (900, 55)];
+/// Bytes for all sheets of a page and for one; base64 adds a third.
+const ALL: usize = 3_300_000;
+const ONE: usize = 450_000;
+/// However many there are, a sheet this small still shows something.
+const LEAST: usize = 60_000;
+
+/// An image inside the page.
+pub struct Picture {
+    /// `data:image/jpeg;base64,...`
+    pub address: String,
+    /// Width and height in pixels.
+    pub size: (u32, u32),
+}
+
+/// The sheet in `path`, as large as a page of `count` such sheets can carry.
+///
+/// # Errors
+/// The file is unreadable.
+pub fn embed(path: &Path, count: usize) -> Result<Picture> {
+    let image = ImageReader::open(path)
+        .map_err(Error::io("read", path))?
+        .decode()
+        .map_err(|e| Error::invalid(path, format!("{e}; remove it and run again")))?;
+    let budget = (ALL / count.max(1)).clamp(LEAST, ONE);
+    let (mut jpeg, mut size) = (Vec::new(), (0, 0));
+    let mut last = None;
+    for (at, (width, quality)) in SIZES.into_iter().enumerate() {
+        // Bytes go about with the pixels to the power 0.8 and with the quality: skip what cannot fit.
+        let hopeless = last.is_some_and(|(bytes, w, q): (usize, u32, u8)| {
+            let fewer = (f64::from(width) / f64::from(w)).powf(1.6) * f64::from(quality) / f64::from(q);
+            bytes as f64 * fewer > 1.2 * budget as f64
+        });
+        if hopeless && at + 1 < SIZES.len() {
+            continue;
+        }
+        let small = shrink(&image, width);
+        jpeg.clear();
+        small
+            .write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, quality))
+            .map_err(|e| Error::invalid(path, format!("cannot be encoded: {e}")))?;
+        size = (small.width(), small.height());
+        last = Some((jpeg.len(), width, quality));
+        if jpeg.len() <= budget {
+            break;
+        }
+    }
+    Ok(Picture { address: format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg)), size })
+}
+
+fn shrink(image: &DynamicImage, width: u32) -> DynamicImage {
+    if image.width() <= width {
+        return image.clone();
+    }
+    image.resize(width, u32::MAX, FilterType::Triangle)
+}
+
+#[cfg(test)]
+mod tests {
+    use image::RgbImage;
+
+    use super::*;
+
+    #[test]
+    fn even_noise_fits_the_budget_of_ten_scenes() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("sheet.png");
+        let mut state = 1u32;
+        let noise = RgbImage::from_fn(2148, 1006, |_, _| {
+            image::Rgb([0; 3].map(|_: u8| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 24) as u8
+            }))
+        });
+        noise.save(&path).unwrap();
+        let picture = embed(&path, 10).unwrap();
+        assert!(picture.address.len() < 460_000, "{}", picture.address.len());
+        let bytes = STANDARD.decode(picture.address.rsplit_once(',').unwrap().1).unwrap();
+        let shown = image::load_from_memory(&bytes).unwrap();
+        assert_eq!((shown.width(), shown.height()), picture.size);
+        assert_eq!(picture.size.1, (picture.size.0 as f32 * 1006.0 / 2148.0).round() as u32);
+    }
+}
