@@ -5,7 +5,8 @@ use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     bf16::{self, Engine},
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
-    pool::{from_blocked, max_pool, max_pool_gradient, to_blocked},
+    layout::{from_blocked, to_blocked},
+    pool::{max_pool, max_pool_gradient},
     simd::Tier,
     weight_grad::{bias_gradient, weight_gradient},
 };
@@ -124,7 +125,7 @@ impl Arithmetic {
             Self::F32(tier) => weight_gradient(tier, x, g, geometry, place, dw),
             Self::Bf16(engine) => {
                 let channels = bf16::weight_grad::Channels::new(engine, x);
-                let pairs = bf16::weight_grad::Pairs::new(g, geometry);
+                let pairs = bf16::weight_grad::Pairs::new(engine, g, geometry);
                 bf16::weight_grad::weight_gradient(engine, &channels, &pairs, place, dw);
             }
         }

@@ -220,7 +220,7 @@ fn filtering_by_predicted_kernels() {
         // The radiance of the network's input takes no gradient; that of coarser levels does.
         for is_input in [false, true] {
             let field = match is_input {
-                true => Field::input((n, 3, h, w), image.as_vec()),
+                true => Field::input((n, 3, h, w), &image.as_vec()),
                 false => traced_field(&image),
             };
             let trust = confidence.as_ref().map(traced_field);
@@ -243,7 +243,7 @@ fn reducing_by_confidence() {
     let (image, confidence) = (case.images("image"), case.images("confidence"));
     for is_input in [false, true] {
         let field = match is_input {
-            true => Field::input(*image.shape(), image.as_vec()),
+            true => Field::input(*image.shape(), &image.as_vec()),
             false => traced_field(&image),
         };
         let gradients = case.project(field.reduce(traced_field(&confidence)).into_images());

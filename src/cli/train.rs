@@ -207,10 +207,10 @@ impl Args {
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    if let Some(threads) = args.threads {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
-        pool.map_err(|e| usage(format!("--threads {threads}: {e}")))?;
-    }
+    // This thread works too: a step is hundreds of short parallel loops, and handing each over costs more
+    // than many of them last.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).use_current_thread();
+    pool.build_global().map_err(|e| usage(format!("--threads: {e}")))?;
     let config = args.out.join("config.json");
     let options = if args.resume {
         let text = fs::read_to_string(&config).map_err(Error::io("read", &config))?;

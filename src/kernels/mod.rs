@@ -15,6 +15,7 @@ pub mod bf16;
 pub mod blend;
 pub mod conv;
 pub mod filter;
+pub mod layout;
 pub mod peak;
 pub mod pool;
 pub mod simd;

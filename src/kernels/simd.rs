@@ -40,6 +40,27 @@ pub trait Simd: Copy {
     /// # Safety
     /// See [`Simd::splat`].
     unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
+    /// Lane `j` of vector `i` becomes lane `i` of vector `j`.
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    #[inline(always)]
+    unsafe fn transpose(rows: [Self::V; LANES]) -> [Self::V; LANES] {
+        let mut from = [Block::default(); LANES];
+        let mut to = [Block::default(); LANES];
+        // SAFETY: the blocks are the function's own.
+        unsafe {
+            for (row, block) in rows.iter().zip(&mut from) {
+                Self::store(block, *row);
+            }
+            for i in 0..LANES {
+                for j in 0..LANES {
+                    to[j].0[i] = from[i].0[j];
+                }
+            }
+            std::array::from_fn(|j| Self::load(&to[j]))
+        }
+    }
     /// Lane-wise maximum; 0 where `a` is NaN and `b` is 0.
     ///
     /// # Safety
@@ -159,10 +180,13 @@ impl Simd for Portable {
 }
 
 #[cfg(target_arch = "x86_64")]
+pub(super) use x86::Avx512;
+
+#[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{Block, Kernel, Simd};
+    use super::{Block, Kernel, LANES, Simd};
 
     /// # Safety
     /// The processor has AVX2 and FMA.
@@ -259,6 +283,40 @@ mod x86 {
         unsafe fn add(a: Self::V, b: Self::V) -> Self::V {
             // SAFETY: the caller's promise.
             unsafe { _mm512_add_ps(a, b) }
+        }
+        #[inline(always)]
+        unsafe fn transpose(mut r: [Self::V; LANES]) -> [Self::V; LANES] {
+            const EVEN: i32 = 0x88;
+            const ODD: i32 = 0xdd;
+            // SAFETY: the caller's promise. 2x2, then 4x4 inside 128-bit lanes, then the lanes themselves.
+            unsafe {
+                let pd = |v| _mm512_castps_pd(v);
+                let ps = |v| _mm512_castpd_ps(v);
+                let mut t = r;
+                for i in 0..8 {
+                    t[2 * i] = _mm512_unpacklo_ps(r[2 * i], r[2 * i + 1]);
+                    t[2 * i + 1] = _mm512_unpackhi_ps(r[2 * i], r[2 * i + 1]);
+                }
+                for i in (0..16).step_by(4) {
+                    r[i] = ps(_mm512_unpacklo_pd(pd(t[i]), pd(t[i + 2])));
+                    r[i + 1] = ps(_mm512_unpackhi_pd(pd(t[i]), pd(t[i + 2])));
+                    r[i + 2] = ps(_mm512_unpacklo_pd(pd(t[i + 1]), pd(t[i + 3])));
+                    r[i + 3] = ps(_mm512_unpackhi_pd(pd(t[i + 1]), pd(t[i + 3])));
+                }
+                for j in 0..4 {
+                    t[j] = _mm512_shuffle_f32x4::<EVEN>(r[j], r[4 + j]);
+                    t[4 + j] = _mm512_shuffle_f32x4::<ODD>(r[j], r[4 + j]);
+                    t[8 + j] = _mm512_shuffle_f32x4::<EVEN>(r[8 + j], r[12 + j]);
+                    t[12 + j] = _mm512_shuffle_f32x4::<ODD>(r[8 + j], r[12 + j]);
+                }
+                for j in 0..4 {
+                    r[j] = _mm512_shuffle_f32x4::<EVEN>(t[j], t[8 + j]);
+                    r[8 + j] = _mm512_shuffle_f32x4::<ODD>(t[j], t[8 + j]);
+                    r[4 + j] = _mm512_shuffle_f32x4::<EVEN>(t[4 + j], t[12 + j]);
+                    r[12 + j] = _mm512_shuffle_f32x4::<ODD>(t[4 + j], t[12 + j]);
+                }
+            }
+            r
         }
         #[inline(always)]
         unsafe fn max(a: Self::V, b: Self::V) -> Self::V {

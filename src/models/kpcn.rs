@@ -89,7 +89,7 @@ impl Stream {
 }
 
 fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &(Shape, Vec<f32>)) -> Field<T> {
-    Field::input((shape.n, shape.c, shape.h, shape.w), values.clone())
+    Field::input((shape.n, shape.c, shape.h, shape.w), values)
 }
 
 impl Kpcn {

@@ -150,7 +150,7 @@ impl Pyramid {
             unreachable!("`inputs` makes four planes")
         };
         let field = |(shape, values): &(crate::kernels::Shape, Vec<f32>)| {
-            Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values.clone())
+            Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values)
         };
         let mut skips = [(radiance_input, 0), (guide_input, 1)]
             .map(|(input, e)| self.encoders[e].forward(Activation::<T>::input_halved(input.0, &input.1)));

@@ -7,7 +7,7 @@ use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 use super::{Images, pool::Buffer};
 use crate::kernels::{
     Block, Shape,
-    pool::{from_blocked, to_blocked, to_blocked_shuffled},
+    layout::{from_blocked, to_blocked, to_blocked_shuffled},
 };
 
 /// The gradient of one activation while the tape runs backward; `None` until something flows in.

@@ -66,7 +66,7 @@ impl Arithmetic {
         let total = self.inputs.iter().sum();
         let engine = Engine::detect();
         let pairs = (self.precision == Precision::Bf16)
-            .then(|| bf16::weight_grad::Pairs::new(gradient, self.geometry));
+            .then(|| bf16::weight_grad::Pairs::new(engine, gradient, self.geometry));
         let mut first = 0;
         for source in sources {
             match &pairs {

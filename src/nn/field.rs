@@ -9,7 +9,7 @@ use super::{Activation, Images, pool::PlaneBuffer};
 use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
-    pool::{from_blocked_shuffled, to_blocked_shuffled},
+    layout::{from_blocked_shuffled, to_blocked_shuffled},
     simd::Tier,
 };
 
@@ -81,9 +81,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     ///
     /// # Panics
     /// If the length of `values` is not what `extent` demands.
-    pub fn input(extent: Extent, values: Vec<f32>) -> Self {
+    pub fn input(extent: Extent, values: &[f32]) -> Self {
         assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
-        let values = Values { extent, data: Arc::new(values.into()) };
+        let mut data = PlaneBuffer::new(values.len());
+        data.copy_from_slice(values);
+        let values = Values { extent, data: Arc::new(data) };
         Self { saved: Saved { values, gradient: None }, tape: T::default() }
     }
 

@@ -87,12 +87,6 @@ impl PlaneBuffer {
     }
 }
 
-impl From<Vec<f32>> for PlaneBuffer {
-    fn from(values: Vec<f32>) -> Self {
-        Self(values)
-    }
-}
-
 impl Deref for PlaneBuffer {
     type Target = [f32];
     fn deref(&self) -> &[f32] {

@@ -144,6 +144,17 @@ impl Engine {
         }
     }
 
+    /// Rounds pairs of blocks to bfloat16 and interleaves them: channel `c` of block `2i + j` becomes value
+    /// `2c + j` of `out[i]`.
+    pub(super) fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
+        match self.0 {
+            Unit::Portable => portable::interleave(pairs, out),
+            // SAFETY: an engine is only made after its instructions were detected.
+            #[cfg(target_arch = "x86_64")]
+            _ => unsafe { avx512::interleave(pairs, out) },
+        }
+    }
+
     /// Rounds up to 16 blocks to bfloat16 and lays each of their 16 channels out as a row: channel `c` of
     /// block `i` becomes `rows[c * stride + i]`. All 16 places of a row are written.
     ///
@@ -225,6 +236,15 @@ mod portable {
         }
     }
 
+    pub fn interleave(pairs: &[[Block; 2]], out: &mut [Wide]) {
+        for (pair, out) in pairs.iter().zip(out) {
+            for l in 0..LANES {
+                out.0[2 * l] = bf16::from_f32(pair[0].0[l]);
+                out.0[2 * l + 1] = bf16::from_f32(pair[1].0[l]);
+            }
+        }
+    }
+
     pub unsafe fn transpose(blocks: &[Block], rows: *mut bf16, stride: usize) {
         for c in 0..LANES {
             for i in 0..LANES {
@@ -241,6 +261,7 @@ mod avx512 {
     use std::arch::x86_64::*;
 
     use super::{Block, CHUNK, LANES, Sums, Term, Wide, bf16};
+    use crate::kernels::simd::{Avx512, Simd};
 
     /// Positions whose sums stay in registers: 2 planes x 8 of them, beside 2 registers of weights.
     const TILE: usize = 8;
@@ -315,40 +336,29 @@ mod avx512 {
     }
 
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    pub unsafe fn interleave(pairs: &[[Block; 2]], out: &mut [Wide]) {
+        for (pair, out) in pairs.iter().zip(out) {
+            // SAFETY: blocks and wides are 64 bytes, aligned to as many.
+            unsafe {
+                let [a, b] = [0, 1].map(|i| {
+                    let half: __m256i = std::mem::transmute(_mm512_cvtneps_pbh(_mm512_load_ps(pair[i].0.as_ptr())));
+                    _mm512_cvtepu16_epi32(half)
+                });
+                let both = _mm512_or_si512(a, _mm512_slli_epi32::<16>(b));
+                _mm512_store_si512(out.0.as_mut_ptr().cast(), both);
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     pub unsafe fn transpose(blocks: &[Block], rows: *mut bf16, stride: usize) {
         let mut r: [__m512; LANES] = [_mm512_setzero_ps(); LANES];
         for (r, block) in r.iter_mut().zip(blocks) {
             // SAFETY: a block is 64 bytes, aligned to as many.
             *r = unsafe { _mm512_load_ps(block.0.as_ptr()) };
         }
-        let pd = |v| _mm512_castps_pd(v);
-        let ps = |v| _mm512_castpd_ps(v);
-        // 2x2, then 4x4 inside 128-bit lanes, then the lanes themselves.
-        let mut t = r;
-        for i in 0..8 {
-            t[2 * i] = _mm512_unpacklo_ps(r[2 * i], r[2 * i + 1]);
-            t[2 * i + 1] = _mm512_unpackhi_ps(r[2 * i], r[2 * i + 1]);
-        }
-        for i in (0..16).step_by(4) {
-            r[i] = ps(_mm512_unpacklo_pd(pd(t[i]), pd(t[i + 2])));
-            r[i + 1] = ps(_mm512_unpackhi_pd(pd(t[i]), pd(t[i + 2])));
-            r[i + 2] = ps(_mm512_unpacklo_pd(pd(t[i + 1]), pd(t[i + 3])));
-            r[i + 3] = ps(_mm512_unpackhi_pd(pd(t[i + 1]), pd(t[i + 3])));
-        }
-        const EVEN: i32 = 0x88;
-        const ODD: i32 = 0xdd;
-        for j in 0..4 {
-            t[j] = _mm512_shuffle_f32x4::<EVEN>(r[j], r[4 + j]);
-            t[4 + j] = _mm512_shuffle_f32x4::<ODD>(r[j], r[4 + j]);
-            t[8 + j] = _mm512_shuffle_f32x4::<EVEN>(r[8 + j], r[12 + j]);
-            t[12 + j] = _mm512_shuffle_f32x4::<ODD>(r[8 + j], r[12 + j]);
-        }
-        for j in 0..4 {
-            r[j] = _mm512_shuffle_f32x4::<EVEN>(t[j], t[8 + j]);
-            r[8 + j] = _mm512_shuffle_f32x4::<ODD>(t[j], t[8 + j]);
-            r[4 + j] = _mm512_shuffle_f32x4::<EVEN>(t[4 + j], t[12 + j]);
-            r[12 + j] = _mm512_shuffle_f32x4::<ODD>(t[4 + j], t[12 + j]);
-        }
+        // SAFETY: these instructions are among this function's.
+        let r = unsafe { Avx512::transpose(r) };
         for (c, r) in r.iter().enumerate() {
             // SAFETY: the caller's promise.
             unsafe {

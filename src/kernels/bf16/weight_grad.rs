@@ -69,7 +69,7 @@ pub struct Pairs {
 
 impl Pairs {
     /// Rounds and interleaves the output gradient of a convolution of `geometry`.
-    pub fn new(gradient: View, geometry: Geometry) -> Self {
+    pub fn new(engine: Engine, gradient: View, geometry: Geometry) -> Self {
         let g = gradient.shape;
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
@@ -90,27 +90,15 @@ impl Pairs {
                 let positions = grid.h * grid.stride();
                 let (pairs, rest) = blocks[origin..][..positions].as_chunks::<2>();
                 let (whole, tail) = out.split_at_mut(pairs.len());
-                for (out, pair) in whole.iter_mut().zip(pairs) {
-                    *out = interleave(&pair[0], &pair[1]);
-                }
+                engine.interleave(pairs, whole);
                 tail.fill(Wide::ZERO);
-                if let (Some(out), Some(last)) = (tail.first_mut(), rest.first()) {
-                    *out = interleave(last, &Block::default());
+                if let Some(last) = rest.first() {
+                    engine.interleave(&[[*last, Block::default()]], tail);
                 }
             }
         });
         Self { data, rows, grid, shape: g, geometry }
     }
-}
-
-/// Two blocks as pairs.
-fn interleave(a: &Block, b: &Block) -> Wide {
-    let mut out = Wide::ZERO;
-    for l in 0..LANES {
-        out.0[2 * l] = bf16::from_f32(a.0[l]);
-        out.0[2 * l + 1] = bf16::from_f32(b.0[l]);
-    }
-    out
 }
 
 /// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
