@@ -9,6 +9,7 @@ use super::{
 };
 use crate::{
     Result,
+    nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -30,7 +31,7 @@ impl Learned {
         let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
         let (network, metadata) = weights_file::parse(bytes, Path::new(name))
             .expect("built-in weights are sound; a test reads them");
-        Some(Self { name: name.to_string(), network, metadata })
+        Some(Self { name: name.to_string(), network, metadata }.with_precision(Precision::for_inference()))
     }
 
     /// The model in a weights file, named like the file.
@@ -39,7 +40,17 @@ impl Learned {
     /// See [`weights_file::read`].
     pub fn from_file(path: &Path) -> Result<Self> {
         let (network, metadata) = weights_file::read(path)?;
-        Ok(Self { name: path.display().to_string(), network, metadata })
+        let model = Self { name: path.display().to_string(), network, metadata };
+        Ok(model.with_precision(Precision::for_inference()))
+    }
+
+    /// The model with its weights packed for an arithmetic.
+    pub fn with_precision(mut self, precision: Precision) -> Self {
+        for conv in self.network.convolutions() {
+            conv.set_precision(precision);
+            conv.freeze();
+        }
+        self
     }
 
     /// The network.

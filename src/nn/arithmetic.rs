@@ -21,10 +21,22 @@ pub enum Precision {
 }
 
 impl Precision {
+    /// The faster one for inference on this processor.
+    pub fn for_inference() -> Self {
+        if Engine::detect().is_native() { Self::Bf16 } else { Self::F32 }
+    }
+
     /// The faster one for training on this processor.
     pub fn for_training() -> Self {
         if Engine::detect().trains() { Self::Bf16 } else { Self::F32 }
     }
+}
+
+/// Forward weights in one precision.
+#[derive(Debug)]
+pub(super) enum Packed {
+    F32(Vec<Block>),
+    Bf16(bf16::conv::Weights),
 }
 
 /// What a convolution is, apart from its weights.
@@ -41,28 +53,46 @@ pub struct Arithmetic {
 }
 
 impl Arithmetic {
-    /// `output = relu(bias + conv(sources, weights))`, the ReLU only where asked for.
-    pub fn forward(&self, sources: &[View], weights: &[f32], bias: &[Block], relu: bool, output: ViewMut) {
+    /// Weights as [`Arithmetic::forward`] wants them.
+    pub(super) fn pack(&self, weights: &[f32]) -> Packed {
         let Self { inputs, outputs, geometry, .. } = self;
-        let epilogue = Epilogue { relu, accumulate: false };
         match self.precision {
             Precision::F32 => {
                 let mut packed = vec![Block::default(); conv::packed_len(inputs, *outputs, *geometry)];
                 conv::pack(weights, inputs, *outputs, *geometry, Direction::Forward, 0, &mut packed);
-                conv::convolve(Tier::detect(), sources, &packed, bias, *geometry, epilogue, output);
+                Packed::F32(packed)
             }
             Precision::Bf16 => {
+                let forward = Direction::Forward;
+                Packed::Bf16(bf16::conv::Weights::pack(weights, inputs, *outputs, *geometry, forward, 0))
+            }
+        }
+    }
+
+    /// `output = relu(bias + conv(sources, weights))`, the ReLU only where asked for.
+    pub(super) fn forward(
+        &self,
+        sources: &[View],
+        weights: &Packed,
+        bias: &[Block],
+        relu: bool,
+        output: ViewMut,
+    ) {
+        let epilogue = Epilogue { relu, accumulate: false };
+        match weights {
+            Packed::F32(weights) => {
+                conv::convolve(Tier::detect(), sources, weights, bias, self.geometry, epilogue, output);
+            }
+            Packed::Bf16(weights) => {
                 let engine = Engine::detect();
-                let packed =
-                    bf16::conv::Weights::pack(weights, inputs, *outputs, *geometry, Direction::Forward, 0);
-                let input = bf16::Operand::new(engine, sources, *geometry);
-                bf16::conv::convolve(engine, &input, &packed, bias, epilogue, output);
+                let input = bf16::Operand::new(engine, sources, self.geometry);
+                bf16::conv::convolve(engine, &input, weights, bias, epilogue, output);
             }
         }
     }
 
     /// Adds the gradient of the weights to `into`.
-    pub fn weight_gradient(&self, sources: &[View], gradient: View, into: &mut [f32]) {
+    pub(super) fn weight_gradient(&self, sources: &[View], gradient: View, into: &mut [f32]) {
         let total = self.inputs.iter().sum();
         let engine = Engine::detect();
         let pairs = (self.precision == Precision::Bf16)
@@ -89,7 +119,7 @@ impl Arithmetic {
 
     /// The gradient of each source from that of the output: a function of the source's index, where to
     /// write, and whether to add to what is there.
-    pub fn input_gradient(&self, gradient: View, weights: &[f32]) -> impl Fn(usize, ViewMut, bool) {
+    pub(super) fn input_gradient(&self, gradient: View, weights: &[f32]) -> impl Fn(usize, ViewMut, bool) {
         let back = if self.geometry == Geometry::Transposed { Geometry::Strided } else { self.geometry };
         let engine = Engine::detect();
         let operand =

@@ -3,10 +3,14 @@
 //! Each splits the tape off its input, computes, and pushes one backward operation, as dfdx's own
 //! operations do.
 
+use std::sync::Arc;
+
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::{
-    Activation, Init, Param, Precision, Rng, activation::Saved, arithmetic::Arithmetic, pool::Buffer,
+    Activation, Init, Param, Precision, Rng, activation::Saved,
+    arithmetic::{Arithmetic, Packed},
+    pool::Buffer,
 };
 use crate::kernels::{
     Block, LANES,
@@ -24,6 +28,8 @@ pub struct Conv {
     pub bias: Param,
     arithmetic: Arithmetic,
     relu: bool,
+    /// The packed weights of a frozen layer.
+    frozen: Option<Arc<Packed>>,
 }
 
 impl Conv {
@@ -57,6 +63,7 @@ impl Conv {
             bias: Param::new(&device, format!("{name}.bias"), &[outputs], vec![0.0; outputs]),
             arithmetic: Arithmetic { inputs: inputs.into(), outputs, geometry, precision: Precision::F32 },
             relu: true,
+            frozen: None,
         }
     }
 
@@ -102,6 +109,7 @@ impl Conv {
         biases[..bias.len()].copy_from_slice(bias);
         self.weight.set(&weights);
         self.bias.set(&biases);
+        self.frozen = None;
         true
     }
 
@@ -113,6 +121,12 @@ impl Conv {
     /// Chooses the arithmetic of the layer and of its gradients.
     pub fn set_precision(&mut self, precision: Precision) {
         self.arithmetic.precision = precision;
+        self.frozen = None;
+    }
+
+    /// Packs the weights once for all forward passes to come, until the layer is changed again.
+    pub fn freeze(&mut self) {
+        self.frozen = Some(Arc::new(self.arithmetic.pack(&self.weight.values())));
     }
 
     /// Multiply-accumulates for one pixel of the layer's output.
@@ -123,8 +137,9 @@ impl Conv {
         inputs.iter().sum::<usize>() * outputs * taps
     }
 
-    /// Its parameters, in a fixed order.
+    /// Its parameters, in a fixed order. They may change, so the layer is no longer frozen.
     pub fn params(&mut self) -> [&mut Param; 2] {
+        self.frozen = None;
         [&mut self.weight, &mut self.bias]
     }
 
@@ -141,7 +156,10 @@ impl Conv {
         let (h, w) = geometry.output(shape.h, shape.w);
         let mut output = Buffer::new(shape.with_channels(*outputs).with_size(h, w));
 
-        let weights = self.weight.tensor.as_vec();
+        let weights = match &self.frozen {
+            Some(packed) => packed.clone(),
+            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec())),
+        };
         let bias = to_blocks(&self.bias.tensor.as_vec());
         let views: Vec<_> = sources.iter().map(|s| s.saved.data.view()).collect();
         self.arithmetic.forward(&views, &weights, &bias, self.relu, output.view_mut());
