@@ -2,11 +2,13 @@
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 
 mod kpcn;
+mod lbf;
 
 pub use kpcn::{
     DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
     kpcn_streams,
 };
+pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
 
 use rayon::prelude::*;
 

@@ -5,12 +5,13 @@
 //! random direction of all inputs and parameters must equal `(L(+h) - L(-h)) / 2h`.
 
 use demc::{
+    features::LBF_CHANNELS,
     kernels::Shape,
     models::{
         self,
         network::{Batch, Network, Taped},
     },
-    nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
+    nn::{Activation, BatchNorm, Conv, Guides, Images, Init, MaxPool, Param, Rng, Stats, cross_bilateral},
 };
 use dfdx::{
     shapes::HasShape,
@@ -266,4 +267,30 @@ fn kpcn() {
         let batch = planes.iter().map(|&c| (Shape::new(2, c, 12, 15), plane(c))).collect();
         check_network(name, &mut *network, &batch);
     }
+}
+
+#[test]
+fn lbf() {
+    let mut network = models::build(&trainable("lbf"), 3);
+    let mut rng = Rng::new(17, 0);
+    let mut plane = |c: usize| (0..2 * c * 14 * 23).map(|_| 0.1 + rng.uniform()).collect();
+    let batch = [3, 1, 12, 6, LBF_CHANNELS].map(|c| (Shape::new(2, c, 14, 23), plane(c))).into();
+    check_network("lbf", &mut *network, &batch);
+}
+
+#[test]
+fn cross_bilateral_filter() {
+    let (n, h, w) = (2, 6, 9);
+    let mut rng = Rng::new(4, 0);
+    let mut plane = |c: usize| -> Vec<f32> { (0..n * c * h * w).map(|_| 0.1 + rng.uniform()).collect() };
+    let guides =
+        Guides { radius: 3, image: plane(3), noise: plane(1), features: plane(5), groups: vec![2, 3] };
+    let values = plane(4);
+    let precision = images(values.clone(), (n, 4, h, w));
+    let filtered = cross_bilateral(guides.clone(), precision.leaky_trace());
+    let gradient = projected(filtered).get(&precision).as_vec();
+    check("cross-bilateral", &[values], &[gradient], H, 3e-3, |v| {
+        let precision = images(v[0].clone(), (n, 4, h, w));
+        project(&cross_bilateral(guides.clone(), precision).as_vec())
+    });
 }

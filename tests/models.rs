@@ -102,7 +102,7 @@ fn every_network_takes_every_size_from_one_pixel_up() {
 
 #[test]
 fn tiles_give_the_same_bits_as_the_whole_frame() {
-    for name in ["demc-s", "demc", "kpcn", "kpcn-combined"] {
+    for name in ["demc-s", "demc", "kpcn", "kpcn-combined", "lbf"] {
         let mut config =
             models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
         config.widths.fill(8);
@@ -135,7 +135,7 @@ fn a_missing_pass_is_named() {
 #[test]
 fn networks_that_filter_scale_with_their_input() {
     let passes = random_passes(40, 24, 9);
-    for name in ["demc-s", "kpcn", "kpcn-combined"] {
+    for name in ["demc-s", "kpcn", "kpcn-combined", "lbf"] {
         let network = models::build(&trainable(name), 1);
         let base = run(&*network, &passes, None).expect("all passes are there");
         for stops in [-8, -3, 5, 8] {

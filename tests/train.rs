@@ -177,7 +177,9 @@ fn denoise_refuses_a_file_that_holds_no_network() {
 
 #[test]
 fn the_rivals_train_and_their_weights_denoise_and_are_scored() {
-    for (model, patch, steps, rates, note) in [("kpcn", "32", 160, "1e-3:3e-4", "trained on Combined")] {
+    for (model, patch, steps, rates, note) in
+        [("kpcn", "32", 160, "1e-3:3e-4", "trained on Combined"), ("lbf", "48", 40, "3e-2:1e-2", "")]
+    {
         let dir = tempfile::tempdir().expect("a folder");
         let out = dir.path().join(model);
         let mut command = train_every(steps / 2, model, patch, &out, steps);

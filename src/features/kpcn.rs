@@ -210,8 +210,11 @@ mod tests {
         let ramp = Planes::from_vec(1, 3, 2, vec![0.0, 1.0, 2.0, 10.0, 11.0, 12.0]);
         let mut out = Vec::new();
         describe(&ramp, &mut out);
-        assert_eq!(out[6..12], [0.0; 6]);
         assert_eq!(out[12..18], [1.0, 1.0, 0.0, 1.0, 1.0, 0.0]);
         assert_eq!(out[18..], [10.0, 10.0, 10.0, 0.0, 0.0, 0.0]);
+        let plane = Planes::from_vec(1, 7, 7, (0..49).map(|i| (i % 7 + i / 7) as f32).collect());
+        out.clear();
+        describe(&plane, &mut out);
+        assert_eq!(out[49 + 24], 0.0);
     }
 }

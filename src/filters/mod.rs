@@ -6,6 +6,7 @@
 //! loops run over consecutive pixels so that the compiler can vectorise them. Results do not depend on
 //! the number of threads.
 
+pub mod blocks;
 pub mod nl_means;
 mod padded;
 pub mod regression;

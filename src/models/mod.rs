@@ -2,6 +2,7 @@
 
 pub mod demc;
 pub mod kpcn;
+pub mod lbf;
 pub mod learned;
 pub mod network;
 pub mod nfor;
@@ -149,6 +150,7 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
         ("semc", paper(Architecture::Semc)),
         ("kpcn", kpcn(Architecture::Kpcn)),
         ("kpcn-combined", kpcn(Architecture::KpcnCombined)),
+        ("lbf", Config { architecture: Architecture::Lbf, widths: vec![lbf::PUBLISHED_WIDTH] }),
     ]
 }
 
@@ -159,7 +161,7 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
 pub fn check(config: &Config) -> Result<(), String> {
     let levels = match config.architecture {
         Architecture::Pyramid => pyramid::LEVELS,
-        Architecture::Kpcn | Architecture::KpcnCombined => 1,
+        Architecture::Kpcn | Architecture::KpcnCombined | Architecture::Lbf => 1,
         Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => demc::PAPER_WIDTHS.len(),
     };
     if config.widths.len() != levels {
@@ -182,5 +184,6 @@ pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
         }
         Architecture::Pyramid => Box::new(pyramid::Pyramid::new(config, seed)),
         Architecture::Kpcn | Architecture::KpcnCombined => Box::new(kpcn::Kpcn::new(config, seed)),
+        Architecture::Lbf => Box::new(lbf::Lbf::new(config, seed)),
     }
 }

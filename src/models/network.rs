@@ -47,6 +47,8 @@ pub enum Architecture {
     Kpcn,
     /// KPCN with a single stream over Combined.
     KpcnCombined,
+    /// A perceptron that chooses the parameters of a cross-bilateral filter.
+    Lbf,
 }
 
 /// Inputs of several samples of one size: each network input as one (N, C, H, W) array.

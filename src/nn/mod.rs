@@ -6,6 +6,7 @@
 
 mod activation;
 mod arithmetic;
+mod cross_bilateral;
 mod field;
 mod layers;
 mod param;
@@ -14,6 +15,7 @@ pub mod weights;
 
 pub use activation::Activation;
 pub use arithmetic::{Arithmetic, Precision};
+pub use cross_bilateral::{Guides, cross_bilateral};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use param::{Init, Param, Rng};
