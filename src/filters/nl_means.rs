@@ -8,7 +8,10 @@
 use rayon::prelude::*;
 
 use super::padded::{Padded, TILE_H, TILE_W, inside, pad, tiles};
-use crate::planes::Planes;
+use crate::{
+    kernels::vectorised::{self, Vectorised},
+    planes::Planes,
+};
 
 /// Keeps the distance of noise-free pixels finite. Guides are to be of the order of 1.
 const EPSILON: f32 = 1e-7;
@@ -91,6 +94,7 @@ impl Weights {
 
     /// The weight that each pixel p of the tile at (x, y) gives to `p + (dx, dy)`, into
     /// [`TILE_H`] rows of [`TILE_W`]; 0 where one of them is outside the frame.
+    #[inline(always)]
     pub fn of_tile(
         &self,
         (x, y): (usize, usize),
@@ -114,6 +118,7 @@ impl Weights {
 }
 
 impl Patches {
+    #[inline(always)]
     fn of_tile(
         &self,
         (x, y): (isize, isize),
@@ -160,6 +165,7 @@ impl Patches {
 }
 
 /// `exp(min(x, 0))` to 1e-6 relative, without a branch or call so that loops over it vectorise.
+#[inline(always)]
 fn exp_of_negative(x: f32) -> f32 {
     /// Adding it leaves a number rounded to an integer in the low bits.
     const ROUND: f32 = 12_582_912.0;
@@ -171,6 +177,43 @@ fn exp_of_negative(x: f32) -> f32 {
     let f = (t - (rounded - ROUND)) * std::f32::consts::LN_2;
     let fraction = 1.0 + f * (1.0 + f * (0.5 + f * (1.0 / 6.0 + f * (1.0 / 24.0 + f * (1.0 / 120.0)))));
     f32::from_bits(fraction.to_bits().wrapping_add(rounded.to_bits() << 23))
+}
+
+/// Pixels of a tile.
+const TILE: usize = TILE_W * TILE_H;
+
+/// The means of one tile, compiled for the processor at hand.
+struct FilterTile<'a> {
+    sources: &'a [Padded],
+    weights: &'a Weights,
+    tile: (usize, usize),
+    scratch: &'a mut Scratch,
+    sums: &'a mut [f32],
+}
+
+impl Vectorised for FilterTile<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { sources, weights, tile: (x, y), scratch, sums } = self;
+        let mut total = vec![0.0; TILE];
+        let mut w = vec![0.0; TILE];
+        for (dx, dy) in weights.steps() {
+            weights.of_tile((x, y), (dx, dy), scratch, &mut w);
+            total.iter_mut().zip(&w).for_each(|(t, w)| *t += w);
+            for (sums, source) in sums.chunks_exact_mut(TILE).zip(sources) {
+                for (i, (sums, w)) in sums.chunks_exact_mut(TILE_W).zip(w.chunks_exact(TILE_W)).enumerate() {
+                    let q = source.row(x as isize + dx, y as isize + dy + i as isize, TILE_W);
+                    for ((sum, w), q) in sums.iter_mut().zip(w).zip(q) {
+                        *sum += w * q;
+                    }
+                }
+            }
+        }
+        // A pixel of the frame has weight 1 for itself; those outside are cut off by the caller.
+        for sums in sums.chunks_exact_mut(TILE) {
+            sums.iter_mut().zip(&total).for_each(|(sum, t)| *sum /= t.max(f32::MIN_POSITIVE));
+        }
+    }
 }
 
 /// The mean of `image` over each pixel's window by `weights`: cross NL-means where their guide is
@@ -185,29 +228,10 @@ pub fn filter(image: &Planes, weights: &Weights) -> Planes {
     let tiles = tiles(width, height);
     let filtered: Vec<Vec<f32>> = tiles
         .par_iter()
-        .map_init(Scratch::default, |scratch, &(x, y)| {
-            const TILE: usize = TILE_W * TILE_H;
+        .map_init(Scratch::default, |scratch, &tile| {
             let mut sums = vec![0.0; sources.len() * TILE];
-            let mut total = vec![0.0; TILE];
-            let mut w = vec![0.0; TILE];
-            for (dx, dy) in weights.steps() {
-                weights.of_tile((x, y), (dx, dy), scratch, &mut w);
-                total.iter_mut().zip(&w).for_each(|(t, w)| *t += w);
-                for (sums, source) in sums.chunks_exact_mut(TILE).zip(&sources) {
-                    for (i, (sums, w)) in
-                        sums.chunks_exact_mut(TILE_W).zip(w.chunks_exact(TILE_W)).enumerate()
-                    {
-                        let q = source.row(x as isize + dx, y as isize + dy + i as isize, TILE_W);
-                        for ((sum, w), q) in sums.iter_mut().zip(w).zip(q) {
-                            *sum += w * q;
-                        }
-                    }
-                }
-            }
-            // A pixel of the frame has weight 1 for itself; those outside are cut off below.
-            for sums in sums.chunks_exact_mut(TILE) {
-                sums.iter_mut().zip(&total).for_each(|(sum, t)| *sum /= t.max(f32::MIN_POSITIVE));
-            }
+            let sources = &sources;
+            vectorised::run(FilterTile { sources, weights, tile, scratch, sums: &mut sums });
             sums
         })
         .collect();

@@ -49,6 +49,7 @@ impl Padded {
     }
 
     /// `len` values from (x, y) on, in coordinates of the frame.
+    #[inline(always)]
     pub fn row(&self, x: isize, y: isize, len: usize) -> &[f32] {
         let at = |v: isize| {
             usize::try_from(v + self.margin as isize).expect("windows and patches stay within the margin")

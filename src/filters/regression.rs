@@ -13,7 +13,10 @@ use super::{
     padded::{Padded, TILE_H, TILE_W, pad, tiles},
     solve::{LANES, Lanes, Symmetric},
 };
-use crate::planes::Planes;
+use crate::{
+    kernels::vectorised::{self, Vectorised},
+    planes::Planes,
+};
 
 /// A constant and two screen coordinates come before the features.
 const BEFORE_FEATURES: usize = 3;
@@ -49,7 +52,7 @@ pub fn first_order(colour: &Planes, features: &Planes, weights: &Weights, influe
     let mut sums = Planes::new(colour.channels + 1 + usize::from(influence), width, height);
     for group in tiles.chunks(8 * rayon::current_num_threads()) {
         let results: Vec<Vec<f32>> =
-            group.par_iter().map_init(Work::default, |work, &tile| input.fit_tile(tile, work)).collect();
+            group.par_iter().map_init(Work::default, |work, &tile| input.fit(tile, work)).collect();
         for (&tile, result) in group.iter().zip(&results) {
             add_tile(&mut sums, result, tile, window);
         }
@@ -95,14 +98,37 @@ struct Work {
     weights: Vec<f32>,
 }
 
+/// The fits of one tile, compiled for the processor at hand.
+struct FitTile<'a> {
+    input: &'a Input<'a>,
+    tile: (usize, usize),
+    work: &'a mut Work,
+    out: &'a mut Vec<f32>,
+}
+
+impl Vectorised for FitTile<'_> {
+    #[inline(always)]
+    fn run(self) {
+        *self.out = self.input.fit_tile(self.tile, self.work);
+    }
+}
+
 /// Sixteen consecutive values from `start` on.
+#[inline(always)]
 fn lanes(row: &[f32], start: usize) -> &Lanes {
     row[start..start + LANES].try_into().expect("the slice has that length")
 }
 
 impl Input<'_> {
+    fn fit(&self, tile: (usize, usize), work: &mut Work) -> Vec<f32> {
+        let mut out = Vec::new();
+        vectorised::run(FitTile { input: self, tile, work, out: &mut out });
+        out
+    }
+
     /// Sums over the windows around the tile's pixels: prediction by weight for each colour channel,
     /// weight and, where asked for, influence by weight; over the tile and the window around it.
+    #[inline(always)]
     fn fit_tile(&self, tile: (usize, usize), work: &mut Work) -> Vec<f32> {
         const TILE: usize = TILE_W * TILE_H;
         let window = self.weights.window();
@@ -190,6 +216,7 @@ impl Input<'_> {
     }
 
     /// The unknowns' factors at `p + step`, relative to p, for p and the pixels right of it.
+    #[inline(always)]
     fn basis(&self, p: (isize, isize), (dx, dy): (isize, isize), basis: &mut [Lanes]) {
         let window = self.weights.window().max(1) as f32;
         basis[1] = [dx as f32 / window; LANES];

@@ -29,11 +29,13 @@ impl Symmetric {
     }
 
     /// Makes them zero again.
+    #[inline(always)]
     pub fn clear(&mut self) {
         self.values.fill([0.0; LANES]);
     }
 
     /// Adds `weight * v v^T`; `weighted` is `weight * v`.
+    #[inline(always)]
     pub fn add_outer(&mut self, weighted: &[Lanes], v: &[Lanes]) {
         let mut values = self.values.iter_mut();
         for (row, a) in weighted.iter().enumerate() {
@@ -47,6 +49,7 @@ impl Symmetric {
 
     /// Adds to each diagonal value but the first `relative` times itself and `absolute` times the
     /// first: a prior that slopes are small, in units of the sum of weights.
+    #[inline(always)]
     pub fn ridge(&mut self, relative: f32, absolute: f32) {
         let first = self.values[0];
         for i in 1..self.size {
@@ -59,6 +62,7 @@ impl Symmetric {
 
     /// Turns the matrices into their Cholesky factors L, with the inverse of the diagonal on it. A zero
     /// matrix gives zero solutions.
+    #[inline(always)]
     pub fn factor(&mut self) {
         for i in 0..self.size {
             for j in 0..=i {
@@ -87,6 +91,7 @@ impl Symmetric {
     }
 
     /// `L^-1 v` in place, after [`Symmetric::factor`].
+    #[inline(always)]
     pub fn forward(&self, v: &mut [Lanes]) {
         for i in 0..self.size {
             let mut sum = v[i];
@@ -105,6 +110,7 @@ impl Symmetric {
     }
 
     /// `L^-T v` in place.
+    #[inline(always)]
     fn backward(&self, v: &mut [Lanes]) {
         for i in (0..self.size).rev() {
             let mut sum = v[i];
@@ -123,6 +129,7 @@ impl Symmetric {
     }
 
     /// The solutions for the right-hand sides `v`, in place, after [`Symmetric::factor`].
+    #[inline(always)]
     pub fn solve(&self, v: &mut [Lanes]) {
         self.forward(v);
         self.backward(v);

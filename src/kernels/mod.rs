@@ -20,6 +20,7 @@ pub mod layout;
 pub mod peak;
 pub mod pool;
 pub mod simd;
+pub mod vectorised;
 pub mod weight_grad;
 
 /// Channels in a [`Block`].

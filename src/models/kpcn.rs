@@ -44,7 +44,7 @@ const KERNEL: usize = 21;
 const HEAD_GAIN: f32 = 0.3;
 
 /// A frame is worked on in tiles beyond this many pixels: each has 441 kernel weights, held twice.
-const WHOLE_FRAME_PIXELS: usize = 1 << 19;
+const WHOLE_FRAME_PIXELS: usize = 1 << 18;
 
 /// Both streams, or the single one over Combined.
 #[derive(Clone)]
