@@ -114,8 +114,27 @@ impl Arithmetic {
             }
             Self::Bf16(engine) => {
                 let packed = bf16::conv::Weights::pack(weights, inputs, outputs, geometry, direction, source);
-                let input = bf16::Operand::new(engine, sources, used);
-                bf16::conv::convolve(engine, &input, &packed, bias, epilogue, output);
+                let operands: Vec<_> =
+                    sources.iter().map(|s| bf16::Operand::narrow(engine, *s, used)).collect();
+                let operands: Vec<_> = operands.iter().collect();
+                if !epilogue.accumulate {
+                    // What it writes in bfloat16 is what it writes in f32, rounded.
+                    let mut rounded = bf16::Operand::new(output.shape);
+                    let to = bf16::conv::Output::Bf16(&mut rounded);
+                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                    let to = bf16::conv::Output::F32(ViewMut::new(output.shape, output.data));
+                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                    let mut widened = vec![Block::default(); output.data.len()];
+                    rounded.widen(ViewMut::new(output.shape, &mut widened));
+                    for (rounded, full) in widened.iter().zip(output.data.iter()) {
+                        for (rounded, full) in rounded.0.iter().zip(full.0) {
+                            assert_eq!(*rounded, half::bf16::from_f32(full).to_f32());
+                        }
+                    }
+                } else {
+                    let to = bf16::conv::Output::F32(output);
+                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                }
             }
         }
     }

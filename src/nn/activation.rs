@@ -6,17 +6,47 @@ use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 
 use super::{Images, pool::Buffer};
 use crate::kernels::{
-    Block, Shape,
+    Block, Shape, View,
+    bf16::Operand,
     layout::{from_blocked, to_blocked, to_blocked_shuffled},
 };
 
 /// The gradient of one activation while the tape runs backward; `None` until something flows in.
 pub(super) type Gradient = Rc<RefCell<Option<Buffer>>>;
 
+/// The values of an activation. On a tape they are always f32; without one, layers that compute in
+/// bfloat16 leave them so.
+#[derive(Debug)]
+pub(super) enum Data {
+    F32(Buffer),
+    Bf16(Operand),
+}
+
+impl Data {
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        match self {
+            Data::F32(buffer) => buffer.shape(),
+            Data::Bf16(operand) => operand.shape(),
+        }
+    }
+
+    /// The values, to read.
+    ///
+    /// # Panics
+    /// If they are bfloat16; see [`Activation::into_f32`].
+    pub fn view(&self) -> View<'_> {
+        match self {
+            Data::F32(buffer) => buffer.view(),
+            Data::Bf16(_) => unreachable!("operations that read f32 ask for it"),
+        }
+    }
+}
+
 /// What an operation remembers of an activation: its values, and where its gradient goes.
 #[derive(Clone, Debug)]
 pub(super) struct Saved {
-    pub data: Arc<Buffer>,
+    pub data: Arc<Data>,
     /// `None` for network inputs, whose gradient nobody asks for.
     pub gradient: Option<Gradient>,
 }
@@ -39,7 +69,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     pub fn input(shape: Shape, values: &[f32]) -> Self {
         let mut data = Buffer::new(shape);
         to_blocked(values, data.view_mut());
-        Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
+        Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
     }
 
     /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each 2x2 square
@@ -52,7 +82,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         let mut data = Buffer::new(shape.with_channels(4 * shape.c).with_size(shape.h / 2, shape.w / 2));
         data.fill(Block::default());
         to_blocked_shuffled(values, 0, 2, data.view_mut());
-        Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
+        Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
     }
 
     /// A network input from a dfdx tensor, whose gradient is written to the tensor's.
@@ -75,7 +105,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
                 Ok(())
             });
         }
-        Self { saved: Saved { data: Arc::new(data), gradient: Some(gradient) }, tape }
+        Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: Some(gradient) }, tape }
     }
 
     /// A second handle on the same activation, with an empty tape: the other branch of a skip.
@@ -90,13 +120,14 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
 
     /// The values as a dfdx tensor, (N, C, H, W), with the tape.
     pub fn into_images(self) -> Images<T> {
-        let Shape { n, c, h, w, .. } = self.shape();
+        let this = self.into_f32();
+        let Shape { n, c, h, w, .. } = this.shape();
         let mut values = vec![0.0; n * c * h * w];
-        from_blocked(self.saved.data.view(), &mut values);
+        from_blocked(this.saved.data.view(), &mut values);
         let images: Images = Cpu::default().tensor_from_vec(values, (n, c, h, w));
-        let mut tape = self.tape;
+        let mut tape = this.tape;
         if T::OWNS_TAPE {
-            let (of_tensor, saved) = (images.clone(), self.saved);
+            let (of_tensor, saved) = (images.clone(), this.saved);
             tape.add_backward_op(move |gradients| {
                 let values = std::mem::take(&mut **gradients.get_or_alloc_mut(&of_tensor)?);
                 saved.accumulate(|gradient, fresh| {
@@ -114,8 +145,20 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         images.put_tape(tape)
     }
 
+    /// The same values, in f32.
+    pub(super) fn into_f32(self) -> Self {
+        match &*self.saved.data {
+            Data::F32(_) => self,
+            Data::Bf16(operand) => {
+                let mut buffer = Buffer::new(operand.shape());
+                operand.widen(buffer.view_mut());
+                Self { saved: Saved { data: Arc::new(Data::F32(buffer)), ..self.saved }, tape: self.tape }
+            }
+        }
+    }
+
     /// Wraps the output of an operation.
-    pub(super) fn output(data: Buffer, tape: T) -> (Self, Saved) {
+    pub(super) fn output(data: Data, tape: T) -> (Self, Saved) {
         let saved = Saved { data: Arc::new(data), gradient: Some(Gradient::default()) };
         (Self { saved: saved.clone(), tape }, saved)
     }

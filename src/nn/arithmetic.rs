@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::{activation::Data, pool::Buffer};
 use crate::kernels::{
-    Block, View, ViewMut,
-    bf16::{self, Engine},
+    Block, Shape, View, ViewMut,
+    bf16::{self, Engine, Operand},
     conv::{self, Direction, Epilogue, Geometry},
     simd::Tier,
     weight_grad,
@@ -69,24 +70,51 @@ impl Arithmetic {
         }
     }
 
-    /// `output = relu(bias + conv(sources, weights))`, the ReLU only where asked for.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for; an output that is to be rounded
+    /// stays bfloat16 where the arithmetic is.
     pub(super) fn forward(
         &self,
-        sources: &[View],
+        sources: &[&Data],
         weights: &Packed,
         bias: &[Block],
         relu: bool,
-        output: ViewMut,
-    ) {
+        (shape, round): (Shape, bool),
+    ) -> Data {
         let epilogue = Epilogue { relu, accumulate: false };
         match weights {
             Packed::F32(weights) => {
-                conv::convolve(Tier::detect(), sources, weights, bias, self.geometry, epilogue, output);
+                let mut output = Buffer::new(shape);
+                let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
+                let (tier, geometry) = (Tier::detect(), self.geometry);
+                conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
+                Data::F32(output)
             }
             Packed::Bf16(weights) => {
                 let engine = Engine::detect();
-                let input = bf16::Operand::new(engine, sources, self.geometry);
-                bf16::conv::convolve(engine, &input, weights, bias, epilogue, output);
+                let narrowed: Vec<Option<Operand>> = sources
+                    .iter()
+                    .map(|source| match source {
+                        Data::F32(buffer) => Some(Operand::narrow(engine, buffer.view(), self.geometry)),
+                        Data::Bf16(_) => None,
+                    })
+                    .collect();
+                let operands: Vec<&Operand> = (sources.iter().zip(&narrowed))
+                    .map(|(source, narrowed)| match source {
+                        Data::Bf16(operand) => operand,
+                        Data::F32(_) => narrowed.as_ref().expect("f32 sources were narrowed"),
+                    })
+                    .collect();
+                if round {
+                    let mut output = Operand::new(shape);
+                    let to = bf16::conv::Output::Bf16(&mut output);
+                    bf16::conv::convolve(engine, &operands, weights, bias, epilogue, to);
+                    Data::Bf16(output)
+                } else {
+                    let mut output = Buffer::new(shape);
+                    let to = bf16::conv::Output::F32(output.view_mut());
+                    bf16::conv::convolve(engine, &operands, weights, bias, epilogue, to);
+                    Data::F32(output)
+                }
             }
         }
     }
@@ -123,7 +151,7 @@ impl Arithmetic {
         let back = if self.geometry == Geometry::Transposed { Geometry::Strided } else { self.geometry };
         let engine = Engine::detect();
         let operand =
-            (self.precision == Precision::Bf16).then(|| bf16::Operand::new(engine, &[gradient], back));
+            (self.precision == Precision::Bf16).then(|| bf16::Operand::narrow(engine, gradient, back));
         move |index, into, accumulate| {
             let Self { inputs, outputs, geometry, .. } = self;
             let epilogue = Epilogue { relu: false, accumulate };
@@ -144,7 +172,8 @@ impl Arithmetic {
                         Direction::Backward,
                         index,
                     );
-                    bf16::conv::convolve(engine, operand, &packed, &zero, epilogue, into);
+                    let into = bf16::conv::Output::F32(into);
+                    bf16::conv::convolve(engine, &[operand], &packed, &zero, epilogue, into);
                 }
             }
         }

@@ -109,6 +109,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a 2x2 square.
     /// (N, K, H, W) -> (N, channels / factor^2, factor * H, factor * W)
     pub fn from_activation(activation: Activation<T>, first: usize, channels: usize, factor: usize) -> Self {
+        let activation = activation.into_f32();
         let shape = activation.shape();
         let planes = channels / (factor * factor);
         let extent = (shape.n, planes, factor * shape.h, factor * shape.w);

@@ -8,12 +8,12 @@ use std::sync::Arc;
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::{
-    Activation, Init, Param, Precision, Rng, activation::Saved,
+    Activation, Init, Param, Precision, Rng, activation::{Data, Saved},
     arithmetic::{Arithmetic, Packed},
     pool::Buffer,
 };
 use crate::kernels::{
-    Block, LANES,
+    Block, LANES, bf16,
     conv::{Geometry, weight_index},
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
     weight_grad::bias_gradient,
@@ -154,15 +154,17 @@ impl Conv {
         assert_eq!(&channels, inputs, "{} reads {inputs:?} channels", self.weight.name);
         let shape = sources[0].shape();
         let (h, w) = geometry.output(shape.h, shape.w);
-        let mut output = Buffer::new(shape.with_channels(*outputs).with_size(h, w));
+        let shape_out = shape.with_channels(*outputs).with_size(h, w);
 
         let weights = match &self.frozen {
             Some(packed) => packed.clone(),
             None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec())),
         };
         let bias = to_blocks(&self.bias.tensor.as_vec());
-        let views: Vec<_> = sources.iter().map(|s| s.saved.data.view()).collect();
-        self.arithmetic.forward(&views, &weights, &bias, self.relu, output.view_mut());
+        let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
+        // Without a tape, what the next convolution would round anyway is rounded here.
+        let round = !T::OWNS_TAPE && self.relu;
+        let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, (shape_out, round));
 
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();
@@ -217,8 +219,15 @@ impl MaxPool {
     /// If rows or columns are odd in number.
     pub fn forward<T: Tape<f32, Cpu>>(self, input: Activation<T>) -> Activation<T> {
         let shape = input.shape();
-        let mut output = Buffer::new(shape.with_size(shape.h / 2, shape.w / 2));
-        max_pool(input.saved.data.view(), output.view_mut());
+        let output = match &*input.saved.data {
+            // Only ReLUs leave bfloat16, so nothing in it is negative.
+            Data::Bf16(operand) => Data::Bf16(bf16::max_pool(operand)),
+            Data::F32(buffer) => {
+                let mut output = Buffer::new(shape.with_size(shape.h / 2, shape.w / 2));
+                max_pool(buffer.view(), output.view_mut());
+                Data::F32(output)
+            }
+        };
         let (mut activation, out) = Activation::output(output, input.tape);
         if T::OWNS_TAPE {
             let source = input.saved;
@@ -305,6 +314,7 @@ impl BatchNorm {
 
     /// Normalises, scales, shifts, rectifies. (N, C, H, W) -> (N, C, H, W)
     pub fn forward<T: Tape<f32, Cpu>>(&self, input: Activation<T>, stats: &mut Stats) -> Activation<T> {
+        let input = input.into_f32();
         let shape = input.shape();
         let count = (shape.n * shape.h * shape.w) as f64;
         let moments: Vec<(f32, f32)> = match stats {
@@ -329,7 +339,7 @@ impl BatchNorm {
         scale_shift(input.saved.data.view(), &scale, &shift, true, output.view_mut());
 
         let batch = matches!(stats, Stats::Batch(_));
-        let (mut activation, out) = Activation::output(output, input.tape);
+        let (mut activation, out) = Activation::output(Data::F32(output), input.tape);
         if T::OWNS_TAPE {
             let source = input.saved;
             let (scale_tensor, shift_tensor) = (self.scale.tensor.clone(), self.shift.tensor.clone());
@@ -339,7 +349,7 @@ impl BatchNorm {
                 // Sums of g and of g * normalised input, each channel.
                 let mut sums = vec![(0.0f64, 0.0f64); shape.c];
                 each_row(shape, |c0, row| {
-                    for (x, g) in source.data[row.clone()].iter().zip(&gradient[row]) {
+                    for (x, g) in source.data.view().data[row.clone()].iter().zip(&gradient[row]) {
                         for (l, sum) in sums[c0..].iter_mut().take(LANES).enumerate() {
                             let normal = (x.0[l] - moments[c0 + l].0) * inverse[c0 + l];
                             sum.0 += f64::from(g.0[l]);
@@ -355,7 +365,7 @@ impl BatchNorm {
                     each_row(shape, |c0, row| {
                         let lanes = (shape.c - c0).min(LANES);
                         for at in row {
-                            let (x, g) = (source.data[at].0, gradient[at].0);
+                            let (x, g) = (source.data.view().data[at].0, gradient[at].0);
                             for l in 0..lanes {
                                 let c = c0 + l;
                                 let normal = (x[l] - moments[c].0) * inverse[c];

@@ -89,13 +89,14 @@ pub fn run(args: Args) -> Result<ExitCode> {
     check_layer_name(&args.layer)?;
     let files = inputs::expand(&args.inputs)?;
     let jobs = plan(files, &args.out)?;
-    let model = models::open(&args.model)?;
+    // Before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads.into())
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
+    let model = models::open(&args.model)?;
     prepare(&args.out)?;
 
     let options = Options {

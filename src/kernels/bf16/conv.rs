@@ -1,7 +1,7 @@
 //! Convolutions and input gradients in bfloat16, the geometries of [`crate::kernels::conv`].
 //!
 //! Packed weights are `[output plane][phase][term][16 pairs of input channels]`, each row holding the two
-//! channels' weights of 16 outputs side by side; terms follow the planes of an [`Operand`], then taps.
+//! channels' weights of 16 outputs side by side; terms follow the planes of the operands, then taps.
 
 use half::bf16;
 use rayon::prelude::*;
@@ -150,69 +150,117 @@ impl Weights {
     }
 }
 
-/// `output = epilogue(bias + conv(input, weights))`, or `output += ...` when accumulating; `bias` is one
+/// Where a convolution writes.
+pub enum Output<'a> {
+    /// To an f32 activation.
+    F32(ViewMut<'a>),
+    /// To a bfloat16 one, without adding to it; its upper half-plane becomes zero where it has no channels.
+    Bf16(&'a mut Operand),
+}
+
+impl Output<'_> {
+    fn shape(&self) -> Shape {
+        match self {
+            Output::F32(view) => view.shape,
+            Output::Bf16(operand) => operand.shape,
+        }
+    }
+}
+
+/// `output = epilogue(bias + conv(sources, weights))`, or `output += ...` when accumulating; `bias` is one
 /// block an output plane (ignored when accumulating).
 ///
 /// # Panics
 /// If sizes, borders or lengths do not fit together.
 pub fn convolve(
     engine: Engine,
-    input: &Operand,
+    sources: &[&Operand],
     weights: &Weights,
     bias: &[Block],
     epilogue: Epilogue,
-    output: ViewMut,
+    output: Output,
 ) {
-    let (grid, out) = (input.grid, output.shape);
+    let (grid, out) = (sources[0].grid, output.shape());
     let geometry = weights.geometry;
     let spread = spread(geometry);
-    assert_eq!(input.channels, weights.inputs);
+    assert!(sources.iter().all(|s| s.grid == grid && s.shape.n == out.n), "sources differ in size");
+    assert!(sources.iter().map(|s| s.shape.c).eq(weights.inputs.iter().copied()), "sources differ in channels");
     assert_eq!(grid.split, geometry == Geometry::Strided);
-    assert_eq!((out.n, out.h, out.w), (input.images, spread * grid.h, spread * grid.w));
-    assert_eq!((out.c, output.data.len()), (weights.outputs, out.blocks()));
+    assert_eq!((out.h, out.w, out.c), (spread * grid.h, spread * grid.w, weights.outputs));
     assert!(epilogue.accumulate || bias.len() == out.planes());
     let reach = if let Geometry::Same(k) = geometry { k / 2 } else { 1 };
     assert!(grid.pad >= reach, "border too small for {geometry:?}");
 
-    let sources = input.planes() / grid.phases();
-    let phases: Vec<Vec<Term>> = (0..spread * spread)
-        .map(|phase| {
-            let terms = terms(geometry, sources, (phase / spread, phase % spread));
-            let place = |(i, (plane, tap)): (usize, (usize, Tap))| {
-                let signed = |v: usize| isize::try_from(v).expect("buffers fit in memory");
-                let plane = signed((plane * grid.phases() + tap.phase) * grid.positions());
-                let row = plane + tap.dy * signed(grid.stride()) + tap.dx;
-                Term { input: row * signed(size_of::<Wide>()), weights: i * LANES * size_of::<Wide>() }
-            };
-            terms.into_iter().enumerate().map(place).collect()
+    // Every plane of every source: its first position in image 0, and planes from one image to the next.
+    let planes: Vec<(*const Wide, usize)> = sources
+        .iter()
+        .flat_map(|source| {
+            let first = source.data.0.as_ptr();
+            let step = grid.phases() * grid.positions();
+            (0..source.planes() / grid.phases()).map(move |p| (first.wrapping_add(p * step), source.planes()))
         })
         .collect();
+    let terms = |n: usize, phase: usize| -> Vec<Term> {
+        let signed = |v: usize| isize::try_from(v).expect("buffers fit in memory");
+        let place = |(i, (plane, tap)): (usize, (usize, Tap))| {
+            let (first, step): (*const Wide, usize) = planes[plane];
+            let at = signed((n * step + tap.phase) * grid.positions()) + tap.dy * signed(grid.stride()) + tap.dx;
+            Term { input: first.wrapping_offset(at), weights: i * LANES * size_of::<Wide>() }
+        };
+        terms(geometry, planes.len(), (phase / spread, phase % spread)).into_iter().enumerate().map(place).collect()
+    };
+    let phases: Vec<Vec<Vec<Term>>> =
+        (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();
     // Bands of rows keep every thread busy and their input in the second-level cache.
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands);
     let bands = grid.h.div_ceil(band);
-    let pointer = Shared(output.data.as_mut_ptr());
+    let target = match output {
+        Output::F32(view) => {
+            assert_eq!(view.data.len(), out.blocks());
+            Target::F32(Shared(view.data.as_mut_ptr()))
+        }
+        Output::Bf16(operand) => {
+            assert!(!epilogue.accumulate && !operand.grid.split);
+            Target::Bf16(SharedWide(operand.data.0.as_mut_ptr()), operand.grid)
+        }
+    };
     let tier = Tier::detect();
     (0..out.n * bands).into_par_iter().for_each(|task| {
         let y0 = task % bands * band;
         let rows = (y0, grid.h.min(y0 + band));
         let n = task / bands;
         engine.ready(|| {
-            tier.run(Band { engine, input, weights, bias, epilogue, phases: &phases, out, pointer, n, rows });
+            tier.run(Band { engine, grid, weights, bias, epilogue, phases: &phases[n], out, target, n, rows });
         });
     });
+}
+
+/// A pointer that tasks share to write disjoint rows of one operand.
+#[derive(Clone, Copy)]
+struct SharedWide(*mut Wide);
+
+// SAFETY: every task writes its own rows, so no two ever touch the same value.
+unsafe impl Send for SharedWide {}
+// SAFETY: as above.
+unsafe impl Sync for SharedWide {}
+
+#[derive(Clone, Copy)]
+enum Target {
+    F32(Shared),
+    Bf16(SharedWide, Grid),
 }
 
 /// The work of one task: some rows of all output planes of one image.
 struct Band<'a> {
     engine: Engine,
-    input: &'a Operand,
+    grid: Grid,
     weights: &'a Weights,
     bias: &'a [Block],
     epilogue: Epilogue,
     phases: &'a [Vec<Term>],
     out: Shape,
-    pointer: Shared,
+    target: Target,
     n: usize,
     rows: (usize, usize),
 }
@@ -220,8 +268,7 @@ struct Band<'a> {
 impl Kernel for Band<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let grid = self.input.grid;
-        let image = self.n * self.input.planes() * grid.positions();
+        let grid = self.grid;
         let (first, end) = (grid.row(self.rows.0), grid.row(self.rows.1 - 1) + grid.w);
         let phase_rows = self.phases[0].len() * LANES;
         let plane_rows = self.phases.len() * phase_rows;
@@ -231,13 +278,11 @@ impl Kernel for Band<'_> {
             for (phase, terms) in self.phases.iter().enumerate() {
                 let weights = self.weights.rows[plane * plane_rows + phase * phase_rows..].as_ptr();
                 for position in (first..end).step_by(CHUNK) {
-                    // SAFETY: `convolve` made the terms for this operand, whose borders and slack cover
-                    // their reach, and runs this inside `ready`; tasks own disjoint rows.
+                    // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
+                    // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
-                        let input = self.input.data.0.as_ptr().add(image + position);
-                        self.engine.multiply(terms, input, weights, (outputs, plane_rows), &mut sums);
-                        let chunk = (position, end.min(position + CHUNK));
-                        self.store::<S>(&sums, (plane, outputs), phase, chunk, grid);
+                        self.engine.multiply(terms, position, weights, (outputs, plane_rows), &mut sums);
+                        self.store::<S>(&mut sums, (plane, outputs), phase, (position, end.min(position + CHUNK)));
                     }
                 }
             }
@@ -250,32 +295,59 @@ impl Band<'_> {
     #[inline(always)]
     unsafe fn store<S: Simd>(
         &self,
-        sums: &Sums,
+        sums: &mut Sums,
         (plane, outputs): (usize, usize),
         phase: usize,
         (from, end): (usize, usize),
-        grid: Grid,
     ) {
-        let spread = spread(self.weights.geometry);
+        let (grid, spread) = (self.grid, spread(self.weights.geometry));
+        let Epilogue { relu, accumulate } = self.epilogue;
         let mut position = from;
         while position < end {
             let (y, x) = (position / grid.stride() - grid.pad, position % grid.stride());
             // Positions run from the left border, over the pixels, to the right border.
             let skip = grid.pad.saturating_sub(x);
             let run = (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
+            let (first, column) = (position + skip - from, x + skip - grid.pad);
+            let row = y * spread + phase / spread;
             for o in 0..outputs {
-                let row = self.out.row(self.n, plane + o, y * spread + phase / spread) + phase % spread;
-                // SAFETY: the pixels lie inside the row; vectors are the tier's.
-                unsafe {
-                    let accumulate = self.epilogue.accumulate;
-                    let bias = if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane + o]) };
-                    for i in 0..run {
-                        let sum = S::load(&sums.0[o][position + skip - from + i]);
-                        let block = self.pointer.at(row + (x + skip - grid.pad + i) * spread);
-                        let value = S::add(sum, if accumulate { S::load(block) } else { bias });
-                        let value = if self.epilogue.relu { S::max(value, S::splat(0.0)) } else { value };
-                        S::store(block, value);
+                // SAFETY: vectors are the tier's.
+                let bias = unsafe { if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane + o]) } };
+                let finish = |sum: &Block, old: S::V| {
+                    // SAFETY: vectors are the tier's.
+                    unsafe {
+                        let value = S::add(S::load(sum), old);
+                        if relu { S::max(value, S::splat(0.0)) } else { value }
                     }
+                };
+                match self.target {
+                    // SAFETY: the pixels lie inside the row, which is this task's.
+                    Target::F32(blocks) => unsafe {
+                        let row = self.out.row(self.n, plane + o, row) + phase % spread;
+                        for i in 0..run {
+                            let block = blocks.at(row + (column + i) * spread);
+                            let old = if accumulate { S::load(block) } else { bias };
+                            S::store(block, finish(&sums.0[o][first + i], old));
+                        }
+                    },
+                    // SAFETY: a sum is a block of its own.
+                    Target::Bf16(..) => unsafe {
+                        for sum in &mut sums.0[o][first..first + run] {
+                            let value = finish(sum, bias);
+                            S::store(sum, value);
+                        }
+                    },
+                }
+            }
+            if let Target::Bf16(wides, grid) = self.target {
+                let [low, high] = &sums.0;
+                let high = (outputs == 2).then(|| &high[first..first + run]);
+                let plane = self.n * self.out.c.div_ceil(WIDE) + plane / 2;
+                let start = plane * grid.positions() + grid.row(row) + phase % spread;
+                // SAFETY: as above.
+                unsafe {
+                    let at = wides.0.add(start + column * spread);
+                    self.engine.narrow_spread(&low[first..first + run], high, at, spread);
                 }
             }
             position += (skip + run).max(1);

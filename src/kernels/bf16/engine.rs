@@ -84,7 +84,7 @@ impl Engine {
         }
     }
 
-    /// `sums[o][p] = sum over terms of input[p + term.input] * weights[o][term.weights]` for 32 positions
+    /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]` for 32 positions
     /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart.
     ///
     /// # Safety
@@ -92,7 +92,7 @@ impl Engine {
     pub(super) unsafe fn multiply(
         self,
         terms: &[Term],
-        input: *const Wide,
+        position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
         sums: &mut Sums,
@@ -100,11 +100,11 @@ impl Engine {
         // SAFETY: an engine is only made after its instructions were detected; the rest is the caller's.
         unsafe {
             match self.0 {
-                Unit::Portable => portable::multiply(terms, input, weights, (outputs, plane), sums),
+                Unit::Portable => portable::multiply(terms, position, weights, (outputs, plane), sums),
                 #[cfg(target_arch = "x86_64")]
-                Unit::Avx512 => avx512::multiply(terms, input, weights, (outputs, plane), sums),
+                Unit::Avx512 => avx512::multiply(terms, position, weights, (outputs, plane), sums),
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-                Unit::Amx => amx::multiply(terms, input, weights, (outputs, plane), sums),
+                Unit::Amx => amx::multiply(terms, position, weights, (outputs, plane), sums),
             }
         }
     }
@@ -144,6 +144,23 @@ impl Engine {
         }
     }
 
+    /// [`Engine::narrow`], writing every `step`th value from `out` on.
+    ///
+    /// # Safety
+    /// `out` is valid for as many writes.
+    pub(super) unsafe fn narrow_spread(self, low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            if step == 1 {
+                return self.narrow(low, high, std::slice::from_raw_parts_mut(out, low.len()));
+            }
+            for (i, block) in low.iter().enumerate() {
+                let high = high.map(|h| &h[i..=i]);
+                self.narrow(std::slice::from_ref(block), high, std::slice::from_mut(&mut *out.add(i * step)));
+            }
+        }
+    }
+
     /// Rounds pairs of blocks to bfloat16 and interleaves them: channel `c` of block `2i + j` becomes value
     /// `2c + j` of `out[i]`.
     pub(super) fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
@@ -178,7 +195,7 @@ mod portable {
 
     pub unsafe fn multiply(
         terms: &[Term],
-        input: *const Wide,
+        position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
         sums: &mut Sums,
@@ -190,7 +207,7 @@ mod portable {
                     // SAFETY: the caller's promise.
                     let (x, w) = unsafe {
                         let w = weights.byte_add(term.weights).add(o * plane);
-                        (&*input.byte_offset(term.input).add(p), std::slice::from_raw_parts(w, LANES))
+                        (&*term.input.add(position + p), std::slice::from_raw_parts(w, LANES))
                     };
                     for (pair, w) in w.iter().enumerate() {
                         let (a, b) = (x.0[2 * pair].to_f32(), x.0[2 * pair + 1].to_f32());
@@ -269,7 +286,7 @@ mod avx512 {
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     pub unsafe fn multiply(
         terms: &[Term],
-        input: *const Wide,
+        position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
         sums: &mut Sums,
@@ -277,9 +294,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<2>(terms, input, weights, plane, sums);
+                tiles::<2>(terms, position, weights, plane, sums);
             } else {
-                tiles::<1>(terms, input, weights, plane, sums);
+                tiles::<1>(terms, position, weights, plane, sums);
             }
         }
     }
@@ -288,7 +305,7 @@ mod avx512 {
     #[inline]
     unsafe fn tiles<const OUT: usize>(
         terms: &[Term],
-        input: *const Wide,
+        position: usize,
         weights: *const Wide,
         plane: usize,
         sums: &mut Sums,
@@ -298,7 +315,7 @@ mod avx512 {
             for term in terms {
                 // SAFETY: the caller's promise.
                 unsafe {
-                    let x = input.byte_offset(term.input).add(first).cast::<i32>();
+                    let x = term.input.add(position + first).cast::<i32>();
                     let w = weights.byte_add(term.weights);
                     for pair in 0..LANES {
                         let w: [__m512bh; OUT] = std::array::from_fn(|o| {
@@ -435,7 +452,7 @@ mod amx {
 
     pub unsafe fn multiply(
         terms: &[Term],
-        input: *const Wide,
+        position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
         sums: &mut Sums,
@@ -475,7 +492,7 @@ mod amx {
                     w = out(reg) _,
                     term = inout(reg) terms.as_ptr() => _,
                     end = in(reg) terms.as_ptr_range().end,
-                    input = in(reg) input,
+                    input = in(reg) position * ROW,
                     weights = in(reg) weights,
                     plane = in(reg) plane * ROW,
                     row = in(reg) ROW,
@@ -505,7 +522,7 @@ mod amx {
                     w = out(reg) _,
                     term = inout(reg) terms.as_ptr() => _,
                     end = in(reg) terms.as_ptr_range().end,
-                    input = in(reg) input,
+                    input = in(reg) position * ROW,
                     weights = in(reg) weights,
                     row = in(reg) ROW,
                     sums = in(reg) sums,

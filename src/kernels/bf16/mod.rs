@@ -19,7 +19,7 @@ use std::sync::{Mutex, PoisonError};
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{Block, LANES, Shape, View, conv::Geometry};
+use super::{Block, LANES, Shape, View, ViewMut, conv::Geometry};
 
 /// Channels in a [`Wide`].
 pub const WIDE: usize = 2 * LANES;
@@ -37,14 +37,19 @@ impl Wide {
     const ZERO: Wide = Wide([bf16::ZERO; WIDE]);
 }
 
-/// One contribution to a sum: where its factors lie, in bytes from the chunk's position and from the
-/// output plane's weights.
+/// One contribution to a sum: the input at position 0, and where its weights lie, in bytes from the output
+/// plane's.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 struct Term {
-    input: isize,
+    input: *const Wide,
     weights: usize,
 }
+
+// SAFETY: a term only reads, from an operand that outlives the convolution that made it.
+unsafe impl Sync for Term {}
+// SAFETY: as above.
+unsafe impl Send for Term {}
 
 /// The sums of a chunk for two output planes.
 #[repr(C, align(64))]
@@ -127,56 +132,121 @@ impl Grid {
     }
 }
 
-/// One or several activations as the left factor of [`conv::convolve`].
+/// An activation in bfloat16: the left factor of [`conv::convolve`], and what it can write.
 #[derive(Debug)]
 pub struct Operand {
-    /// `[image][source plane, 32 channels][phase][position]`, then slack.
+    /// `[image][plane of 32 channels][phase][position]`, then slack.
     data: Buffer,
     grid: Grid,
-    images: usize,
-    channels: Vec<usize>,
+    shape: Shape,
 }
 
 impl Operand {
-    /// Rounds the activations `sources`, taken as concatenated, to bfloat16. `geometry` is that of the
-    /// convolution to follow.
-    ///
-    /// # Panics
-    /// If the sources differ in size.
-    pub fn new(engine: Engine, sources: &[View], geometry: Geometry) -> Self {
-        let first = sources[0].shape;
-        let same = |s: Shape| (s.n, s.h, s.w, s.pad) == (first.n, first.h, first.w, first.pad);
-        assert!(sources.iter().all(|s| same(s.shape)), "sources differ in size");
-        let grid = Grid::new(first, geometry == Geometry::Strided);
-        let channels: Vec<usize> = sources.iter().map(|s| s.shape.c).collect();
-        let planes: Vec<(usize, usize)> = channels
-            .iter()
-            .enumerate()
-            .flat_map(|(source, c)| (0..c.div_ceil(WIDE)).map(move |plane| (source, plane)))
-            .collect();
-        let count = first.n * planes.len() * grid.phases();
-        let mut data = Buffer::new(count * grid.positions() + grid.slack());
-        let body = &mut data.0[..count * grid.positions()];
+    /// An activation with zero borders and arbitrary pixels.
+    pub fn new(shape: Shape) -> Self {
+        let grid = Grid::new(shape, false);
+        let mut operand = Self::allocate(shape, grid);
+        let (len, stride) = (operand.planes() * shape.n * grid.positions(), grid.stride());
+        operand.data.0[..len].par_chunks_mut(grid.positions()).for_each(|plane| {
+            let (above, below) = (grid.pad * stride, (grid.pad + grid.h) * stride);
+            plane[..above].fill(Wide::ZERO);
+            plane[below..].fill(Wide::ZERO);
+            for row in plane[above..below].chunks_mut(stride) {
+                row[..grid.pad].fill(Wide::ZERO);
+                row[grid.pad + grid.w..].fill(Wide::ZERO);
+            }
+        });
+        operand
+    }
+
+    fn allocate(shape: Shape, grid: Grid) -> Self {
+        let planes = shape.c.div_ceil(WIDE) * grid.phases();
+        Self { data: Buffer::new(shape.n * planes * grid.positions() + grid.slack()), grid, shape }
+    }
+
+    /// An activation rounded to bfloat16. `geometry` is that of the convolution that reads it.
+    pub fn narrow(engine: Engine, source: View, geometry: Geometry) -> Self {
+        let shape = source.shape;
+        let grid = Grid::new(shape, geometry == Geometry::Strided);
+        let mut operand = Self::allocate(shape, grid);
+        let planes = operand.planes();
+        let body = &mut operand.data.0[..shape.n * planes * grid.positions()];
+        // Parts of planes, so that few planes still keep every thread busy.
+        let part = if grid.split { grid.positions() } else { PART.min(grid.positions()) };
         body.par_chunks_mut(grid.positions()).enumerate().for_each(|(i, out)| {
-            let (phase, i) = (i % grid.phases(), i / grid.phases());
-            let (n, (source, plane)) = (i / planes.len(), planes[i % planes.len()]);
-            let (low, high) = halves(sources[source], n, plane);
+            let (phase, plane) = (i % grid.phases(), i / grid.phases());
+            let (low, high) = halves(source, plane * grid.phases() / planes, plane % (planes / grid.phases()));
             if grid.split {
                 out.fill(Wide::ZERO);
-                grid.pixels(first, phase, |to, from| {
+                grid.pixels(shape, phase, |to, from| {
                     engine.narrow(&low[from..=from], high.map(|h| &h[from..=from]), &mut out[to..=to]);
                 });
             } else {
-                engine.narrow(low, high, out);
+                out.par_chunks_mut(part).enumerate().for_each(|(i, out)| {
+                    let range = i * part..i * part + out.len();
+                    engine.narrow(&low[range.clone()], high.map(|h| &h[range.clone()]), out);
+                });
             }
         });
-        Self { data, grid, images: first.n, channels }
+        operand
     }
 
-    /// Planes of 32 channels over all sources, times phases.
-    fn planes(&self) -> usize {
-        self.channels.iter().map(|c| c.div_ceil(WIDE)).sum::<usize>() * self.grid.phases()
+    /// The values as f32, into an activation of the same shape. Borders are written too.
+    ///
+    /// # Panics
+    /// If shapes differ.
+    pub fn widen(&self, output: ViewMut) {
+        assert_eq!(output.shape, self.shape);
+        let (s, stride) = (self.shape, self.shape.plane_stride());
+        output.data.par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
+            let (n, plane) = (i / s.planes(), i % s.planes());
+            let from = &self.data.0[(n * self.planes() + plane / 2) * stride..][..stride];
+            for (out, wide) in out.iter_mut().zip(from) {
+                let half = &wide.0[plane % 2 * LANES..][..LANES];
+                out.0.iter_mut().zip(half).for_each(|(o, h)| *o = h.to_f32());
+            }
+        });
     }
+
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Planes of an image, phases included.
+    fn planes(&self) -> usize {
+        self.shape.c.div_ceil(WIDE) * self.grid.phases()
+    }
+}
+
+/// Positions that one task narrows.
+const PART: usize = 16384;
+
+/// 2x2 maximum, stride 2, of an activation without negative values, such as a ReLU's output.
+///
+/// # Panics
+/// If rows or columns are odd.
+pub fn max_pool(input: &Operand) -> Operand {
+    let s = input.shape;
+    assert!(s.h.is_multiple_of(2) && s.w.is_multiple_of(2), "only even sizes halve");
+    let mut output = Operand::new(s.with_size(s.h / 2, s.w / 2));
+    let (from, to) = (input.grid, output.grid);
+    let len = output.planes() * s.n * to.positions();
+    output.data.0[..len].par_chunks_mut(to.positions()).enumerate().for_each(|(i, out)| {
+        let plane = &input.data.0[i * from.positions()..][..from.positions()];
+        for y in 0..to.h {
+            let top = &plane[from.row(2 * y)..][..from.w];
+            let bottom = &plane[from.row(2 * y + 1)..][..from.w];
+            let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+            for (out, (top, bottom)) in out[to.row(y)..].iter_mut().zip(squares) {
+                // The bits of non-negative values are ordered as the values are.
+                let bits = |w: &Wide| w.0.map(bf16::to_bits);
+                let [a, b, c, d] = [&top[0], &top[1], &bottom[0], &bottom[1]].map(bits);
+                out.0 = std::array::from_fn(|l| bf16::from_bits(a[l].max(b[l]).max(c[l].max(d[l]))));
+            }
+        }
+    });
+    output
 }
 
 /// The two planes of 16 channels that make up plane `plane` of 32; the second may be absent.
