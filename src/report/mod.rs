@@ -35,6 +35,9 @@ use crate::models::Denoiser;
 /// Name of the method that every report has: the input itself.
 pub const NOISY: &str = "noisy";
 
+/// Finds the memory in MiB that a method takes for the frame in a file.
+pub type MemoryProbe = Box<dyn Fn(&Path) -> Option<f64> + Send + Sync>;
+
 /// A method under test.
 pub struct Method {
     /// Its name in tables and charts, unique in a run.
@@ -42,7 +45,7 @@ pub struct Method {
     /// What runs.
     pub denoiser: Box<dyn Denoiser>,
     /// Memory in MiB that it takes for the frame in a file, at its peak; none where that is not known.
-    pub peak_mib: Box<dyn Fn(&Path) -> Option<f64> + Send + Sync>,
+    pub peak_mib: MemoryProbe,
     /// Changes whenever the method might give other results: finished rows are kept while it stays.
     pub stamp: String,
 }
