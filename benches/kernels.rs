@@ -81,6 +81,7 @@ fn fma_peak(bencher: Bencher) {
     const STEPS: usize = 1_000_000;
     let threads = rayon::current_num_threads();
     bencher.counter(ItemsCount::new(threads * peak::flops(STEPS))).bench_local(|| {
-        rayon::broadcast(|_| peak::run(Tier::detect(), STEPS));
+        // Unless its result is used and its length unknown, the compiler drops it.
+        rayon::broadcast(|_| peak::run(Tier::detect(), divan::black_box(STEPS)))
     });
 }

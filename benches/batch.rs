@@ -1,0 +1,225 @@
+//! What a user waits for, and what it takes: a sequence of frames from disk to disk beside its pure
+//! denoising time, and the memory of an 8K frame with all its passes.
+//!
+//! ```text
+//! cargo bench --bench batch                      both
+//! cargo bench --bench batch -- --only overlap    32 frames of 1920x1080
+//! cargo bench --bench batch -- --only memory     one frame of 7680x4320
+//! ```
+//! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
+//! repeated, each time at another brightness, until the frame is full (by default the example of this
+//! repository), so that noise and compression are those of a render.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use demc::{
+    frame::{Frame, NewChannel},
+    models, passes,
+};
+use exr::prelude::*;
+use half::f16;
+use rayon::prelude::*;
+
+struct Options {
+    only: Option<String>,
+    frames: usize,
+    size: Option<(usize, usize)>,
+    model: String,
+    source: PathBuf,
+}
+
+fn main() {
+    let mut options = Options {
+        only: None,
+        frames: 32,
+        size: None,
+        model: "demc-m".into(),
+        source: Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example/house_0004spp.exr"),
+    };
+    let mut args = std::env::args().skip(1).filter(|a| a != "--bench");
+    while let Some(arg) = args.next() {
+        let value = args.next().unwrap_or_else(|| panic!("{arg} wants a value"));
+        match arg.as_str() {
+            "--only" => options.only = Some(value),
+            "--frames" => options.frames = value.parse().expect("--frames wants a number"),
+            "--size" => {
+                let (width, height) = value.split_once('x').expect("--size wants WxH");
+                let number = |text: &str| text.parse().expect("--size wants numbers");
+                options.size = Some((number(width), number(height)));
+            }
+            "--model" => options.model = value,
+            "--source" => options.source = value.into(),
+            _ => panic!("{arg}: unknown; see the top of benches/batch.rs"),
+        }
+    }
+    let wants = |what: &str| options.only.as_deref().is_none_or(|only| only == what);
+    if wants("overlap") {
+        overlap(&options);
+    }
+    if wants("memory") {
+        memory(&options);
+    }
+}
+
+/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one.
+fn enlarge(source: &Path, (width, height): (usize, usize), to: &Path) {
+    let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
+    for layer in &mut image.layer_data {
+        let (w, h) = (layer.size.width(), layer.size.height());
+        layer.size = Vec2(width, height);
+        for channel in &mut layer.channel_data.list {
+            // Copies look alike only to a person: the factor changes every mantissa.
+            let factor = |x: usize, y: usize| 0.7 + 0.6 * (((y / h) * 131 + (x / w) * 71) % 97) as f32 / 97.0;
+            let at = |i: usize| (i / width % h) * w + i % width % w;
+            let scale = |i: usize| factor(i % width, i / width);
+            channel.sample_data = match &channel.sample_data {
+                FlatSamples::F16(old) => FlatSamples::F16(
+                    (0..width * height)
+                        .into_par_iter()
+                        .map(|i| f16::from_f32(old[at(i)].to_f32() * scale(i)))
+                        .collect(),
+                ),
+                FlatSamples::F32(old) => FlatSamples::F32(
+                    (0..width * height).into_par_iter().map(|i| old[at(i)] * scale(i)).collect(),
+                ),
+                FlatSamples::U32(old) => {
+                    FlatSamples::U32((0..width * height).into_par_iter().map(|i| old[at(i)]).collect())
+                }
+            };
+        }
+    }
+    image.attributes.display_window.size = Vec2(width, height);
+    image.write().to_file(to).expect("the temporary folder has room");
+}
+
+/// Runs `demc denoise` on a folder; seconds, and the process's peak memory in MiB where it can be told.
+fn denoise(folder: &Path, out: &Path, model: &str) -> (f64, Option<f64>) {
+    let start = Instant::now();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_demc"))
+        .args(["denoise", "--overwrite", "--model", model])
+        .arg(folder)
+        .arg("--out")
+        .arg(out)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("demc starts");
+    let status_file = format!("/proc/{}/status", child.id());
+    let mut peak = None;
+    let status = loop {
+        if let Some(status) = child.try_wait().expect("a child can be waited for") {
+            break status;
+        }
+        let text = fs::read_to_string(&status_file).unwrap_or_default();
+        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kib = line.and_then(|rest| rest.split_whitespace().next()?.parse::<f64>().ok());
+        peak = kib.map(|kib| kib / 1024.0).or(peak);
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    assert!(status.success(), "demc denoise: {status}");
+    (start.elapsed().as_secs_f64(), peak)
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+fn timed<T>(work: impl FnOnce() -> T) -> (T, f64) {
+    let start = Instant::now();
+    let result = work();
+    (result, start.elapsed().as_secs_f64())
+}
+
+fn overlap(options: &Options) {
+    let size = options.size.unwrap_or((1920, 1080));
+    let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let (input, out) = (folder.path().join("in"), folder.path().join("out"));
+    fs::create_dir(&input).expect("the temporary folder is writable");
+    let first = input.join("shot.0001.exr");
+    enlarge(&options.source, size, &first);
+    for i in 2..=options.frames {
+        fs::copy(&first, input.join(format!("shot.{i:04}.exr"))).expect("the temporary folder has room");
+    }
+
+    // Each stage alone, with all threads.
+    let model = models::open(&options.model).expect("a model by that name");
+    let (mut reads, mut denoises, mut writes) = (Vec::new(), Vec::new(), Vec::new());
+    for round in 0..=5 {
+        let ((frame, mut set), read) = timed(|| {
+            let frame = Frame::read(&first).expect("just written");
+            let set = passes::read(&frame, None).expect("its passes are known");
+            (frame, set)
+        });
+        set.sanitize();
+        let (image, denoise) = timed(|| model.denoise(&set).expect("the passes are there"));
+        let ((), write) = timed(|| store(frame, &image, &folder.path().join("alone.exr")));
+        if round > 0 {
+            reads.push(read);
+            denoises.push(denoise);
+            writes.push(write);
+        }
+    }
+    let pure = median(denoises) * options.frames as f64;
+    let (wall, peak) = denoise(&input, &out, &options.model);
+    println!(
+        "{} frames of {}x{}, {} threads, {}",
+        options.frames,
+        size.0,
+        size.1,
+        rayon::current_num_threads(),
+        options.model
+    );
+    println!(
+        "one frame alone: read {:.3} s, denoise {:.3} s, write {:.3} s",
+        median(reads),
+        pure / options.frames as f64,
+        median(writes)
+    );
+    println!("batch {wall:.2} s, pure denoising {pure:.2} s: {:.3} times (target 1.2)", wall / pure);
+    if let Some(peak) = peak {
+        println!("memory at the peak of the batch: {peak:.0} MiB");
+    }
+}
+
+/// Adds the layer as `demc denoise` does.
+fn store(mut frame: Frame, image: &demc::planes::Planes, to: &Path) {
+    let combined = frame
+        .parts()
+        .iter()
+        .position(|part| part.channels.iter().any(|c| c.name.ends_with("Combined.R")))
+        .expect("a render has Combined");
+    let kind = frame.parts()[combined].channels[0].kind;
+    let channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
+        .iter()
+        .enumerate()
+        .map(|(c, component)| NewChannel { component, kind, values: image.channel(c) })
+        .collect();
+    frame.set_layer(combined, "ViewLayer.Denoised", None, &channels).expect("the part can be encoded");
+    frame.write(to).expect("the temporary folder has room");
+}
+
+fn memory(options: &Options) {
+    let size = options.size.unwrap_or((7680, 4320));
+    let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let (input, out) = (folder.path().join("huge.exr"), folder.path().join("out"));
+    enlarge(&options.source, size, &input);
+    let bytes = fs::metadata(&input).expect("just written").len();
+    let (seconds, peak) = denoise(&input, &out, &options.model);
+    let file = bytes as f64 / f64::from(1 << 20);
+    println!(
+        "{}x{} with the passes of {}: a file of {file:.0} MiB, {seconds:.1} s",
+        size.0,
+        size.1,
+        options.source.display()
+    );
+    match peak {
+        Some(peak) => println!("memory at the peak: {peak:.0} MiB (target 3072)"),
+        None => println!("memory at the peak: this system does not tell"),
+    }
+}
