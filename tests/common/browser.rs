@@ -252,6 +252,15 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
+        // Asked, it ends all its processes; killed, a wrapper script would leave them behind.
+        let close = json!({ "id": u32::MAX, "method": "Browser.close" });
+        let _ = self.socket.send(Message::text(close.to_string()));
+        for _ in 0..200 {
+            if !matches!(self.child.try_wait(), Ok(None)) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
