@@ -44,16 +44,19 @@ def main():
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--program", required=True)
     args = parser.parse_args()
-    version = subprocess.run([args.program, "--version"], capture_output=True, text=True).stdout.strip()
     with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        write_pfm(folder / "version.pfm", 16, 16, 0)
+        log = subprocess.run([args.program, "--hdr", folder / "version.pfm"], capture_output=True, text=True).stdout
+        version = re.search(r"version=([0-9.]+)", log)
         jobs = {
             f"oidn-{quality} {width}x{height}": lambda q=quality, w=width, h=height: filter_(
-                args.program, q, w, h, args.threads, Path(folder)
+                args.program, q, w, h, args.threads, folder
             )
             for width, height in ([(160, 96)] if args.small else [(1280, 720), (1920, 1080)])
             for quality in ("fast", "balanced", "high")
         }
-        serve(jobs, {"program": f"oidnDenoise {version}".strip()})
+        serve(jobs, {"program": f"oidnDenoise {version[1] if version else ''}".strip()})
 
 
 if __name__ == "__main__":
