@@ -191,10 +191,10 @@ pub struct Inputs {
 
 /// Grows planes to a multiple of `multiple` in both directions by repeating the last row and column:
 /// what a network that halves its input `log2(multiple)` times needs.
-pub fn pad_to_multiple(planes: &Planes, multiple: usize) -> Planes {
+pub fn pad_to_multiple(planes: Planes, multiple: usize) -> Planes {
     let (width, height) = (planes.width.next_multiple_of(multiple), planes.height.next_multiple_of(multiple));
     if (width, height) == (planes.width, planes.height) {
-        return planes.clone();
+        return planes;
     }
     let mut out = Planes::new(planes.channels, width, height);
     for c in 0..planes.channels {
@@ -256,7 +256,7 @@ mod tests {
     #[test]
     fn padding_repeats_the_edge_and_a_window_undoes_it() {
         let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        let padded = pad_to_multiple(&planes, 4);
+        let padded = pad_to_multiple(planes.clone(), 4);
         assert_eq!((padded.width, padded.height), (4, 4));
         assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
         assert_eq!(window(&padded, (0, 0), (3, 1)), planes);

@@ -1,7 +1,7 @@
 //! Planar f32 images: what passes, features, models and metrics hand to one another.
 
 /// `channels` planes of `height` x `width` f32, channel after channel, rows top to bottom.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planes {
     /// Number of channels.
     pub channels: usize,

@@ -8,7 +8,10 @@
 
 use rayon::prelude::*;
 
-use super::filter::{Size, exp};
+use super::{
+    filter::{Size, exp},
+    simd::{Kernel, Simd, Tier},
+};
 
 /// Coarse pixels around a fine one.
 pub const CORNERS: usize = 4;
@@ -84,18 +87,64 @@ pub fn blend(
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
     rows.enumerate().for_each(|(y, ((red, green), blue))| {
-        let mut out = [red, green, blue];
-        for x in 0..size.w {
-            let at = y * size.w + x;
-            let share = sigmoid(masks.alpha[at]);
-            let (corners, weights) = (corners(size, y, x), weights(masks.corners, n, at));
-            for (c, out) in out.iter_mut().enumerate() {
-                let difference = &difference[c * h * w..][..h * w];
-                let up: f32 = (0..CORNERS).map(|i| weights[i] * difference[corners[i]]).sum();
-                out[x] = fine[c * n + at] + share * up;
+        Tier::detect().run(Row { size, y, fine, difference, masks, output: [red, green, blue] });
+    });
+}
+
+/// One row of a blend.
+struct Row<'a> {
+    size: Size,
+    y: usize,
+    fine: &'a [f32],
+    difference: &'a [f32],
+    masks: Masks<'a>,
+    output: [&'a mut [f32]; 3],
+}
+
+impl Kernel for Row<'_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let Self { size, y, fine, difference, masks, output } = self;
+        let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
+        let (own, other) = near(y, h);
+        let row = |values: &'_ [f32], plane: usize| -> std::ops::Range<usize> {
+            debug_assert!(values.len() >= (plane + 1) * n);
+            plane * n + y * size.w..plane * n + (y + 1) * size.w
+        };
+        // Plain loops over whole rows, which the compiler vectorises with the tier's instructions.
+        let alpha = &masks.alpha[row(masks.alpha, 0)];
+        let corners: [&[f32]; CORNERS] = std::array::from_fn(|i| &masks.corners[row(masks.corners, i)]);
+        let mut weights: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
+        for i in 0..CORNERS {
+            for (weight, logit) in weights[i].iter_mut().zip(corners[i]) {
+                *weight = BILINEAR[i] * exp(*logit);
             }
         }
-    });
+        let [w0, w1, w2, w3] = weights.each_ref().map(|w| &w[..size.w]);
+        let mut share = vec![0.0; size.w];
+        for (x, share) in share[..size.w].iter_mut().enumerate() {
+            *share = sigmoid(alpha[x]) / (w0[x] + w1[x] + w2[x] + w3[x]);
+        }
+        // Each corner's difference, drawn out to the fine row.
+        let mut drawn: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
+        for (c, output) in output.into_iter().enumerate() {
+            for (pair, coarse) in [own, other].into_iter().enumerate() {
+                let coarse = &difference[(c * h + coarse) * w..][..w];
+                for x in 0..w {
+                    let (left, right) = (coarse[x.saturating_sub(1)], coarse[(x + 1).min(w - 1)]);
+                    drawn[2 * pair][2 * x..2 * x + 2].fill(coarse[x]);
+                    drawn[2 * pair + 1][2 * x] = left;
+                    drawn[2 * pair + 1][2 * x + 1] = right;
+                }
+            }
+            let [d0, d1, d2, d3] = drawn.each_ref().map(|d| &d[..size.w]);
+            let (fine, share) = (&fine[row(fine, c)][..size.w], &share[..size.w]);
+            for (x, out) in output[..size.w].iter_mut().enumerate() {
+                let up = w0[x] * d0[x] + w1[x] * d1[x] + w2[x] * d2[x] + w3[x] * d3[x];
+                *out = fine[x] + share[x] * up;
+            }
+        }
+    }
 }
 
 /// Where the gradients of a blend go, each added to.

@@ -31,7 +31,7 @@ impl Learned {
         let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
         let (network, metadata) = weights_file::parse(bytes, Path::new(name))
             .expect("built-in weights are sound; a test reads them");
-        Some(Self { name: name.to_string(), network, metadata }.with_precision(Precision::for_inference()))
+        Some(Self { name: name.to_string(), network, metadata })
     }
 
     /// The model in a weights file, named like the file.
@@ -40,12 +40,12 @@ impl Learned {
     /// See [`weights_file::read`].
     pub fn from_file(path: &Path) -> Result<Self> {
         let (network, metadata) = weights_file::read(path)?;
-        let model = Self { name: path.display().to_string(), network, metadata };
-        Ok(model.with_precision(Precision::for_inference()))
+        Ok(Self { name: path.display().to_string(), network, metadata })
     }
 
-    /// The model with its weights packed for an arithmetic.
-    pub fn with_precision(mut self, precision: Precision) -> Self {
+    /// The model under another name, with its weights packed for an arithmetic.
+    pub fn with_precision(mut self, name: &str, precision: Precision) -> Self {
+        self.name = name.to_string();
         for conv in self.network.convolutions() {
             conv.set_precision(precision);
             conv.freeze();

@@ -16,6 +16,7 @@ use network::{Architecture, Config, Network};
 
 use crate::{
     Error, Result,
+    nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -94,22 +95,29 @@ impl Denoiser for Noisy {
     }
 }
 
-/// A method by its built-in name, or from a weights file.
+/// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32` or
+/// `:bf16`, which chooses its arithmetic; without it, the faster one that the processor has.
 ///
 /// # Errors
 /// No built-in method or readable weights file goes by that name.
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
-    match name_or_file {
+    let (plain, precision) = match name_or_file.rsplit_once(':') {
+        Some((plain, "f32")) => (plain, Precision::F32),
+        Some((plain, "bf16")) => (plain, Precision::Bf16),
+        _ => (name_or_file, Precision::for_inference()),
+    };
+    let learned = |model: learned::Learned| Box::new(model.with_precision(name_or_file, precision));
+    match plain {
         "noisy" => Ok(Box::new(Noisy)),
         nfor::NAME => Ok(Box::new(nfor::Nfor)),
         name if oidn::NAMES.contains(&name) => {
             Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
         }
         other if Path::new(other).extension().is_some_and(|e| e == "safetensors") => {
-            Ok(Box::new(learned::Learned::from_file(Path::new(other))?))
+            Ok(learned(learned::Learned::from_file(Path::new(other))?))
         }
         other => match learned::Learned::built_in(other) {
-            Some(model) => Ok(Box::new(model)),
+            Some(model) => Ok(learned(model)),
             None if trainable().iter().any(|(name, _)| *name == other) => Err(Error::Usage(format!(
                 "{other} comes without weights: `demc train --model {other} --data DIR --out RUN` makes them, \
                  and RUN/best.safetensors then names the method"

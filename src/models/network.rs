@@ -145,9 +145,7 @@ const WHOLE_FRAME_PIXELS: usize = 8 << 20;
 pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
     let multiple = network.multiple();
     let mut inputs = network.inputs(passes)?;
-    for planes in &mut inputs.planes {
-        *planes = pad_to_multiple(planes, multiple);
-    }
+    inputs.planes = inputs.planes.into_iter().map(|planes| pad_to_multiple(planes, multiple)).collect();
     let (width, height) = (inputs.planes[0].width, inputs.planes[0].height);
     let most = network.whole_frame_pixels();
     // A tile is a square of half of what may be worked on at once: it sees beyond its edge as well.
@@ -166,8 +164,16 @@ pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Resu
             if last_seen.replace(seen).is_some_and(|last| last != seen) {
                 clear_buffers();
             }
-            let part = inputs.planes.iter().map(|planes| window(planes, (x0, y0), seen)).collect::<Vec<_>>();
-            let batch = stack(&[Inputs { planes: part, scale: inputs.scale }]);
+            let batch: Batch = inputs
+                .planes
+                .iter_mut()
+                .map(|planes| {
+                    // A frame in one piece is not needed again.
+                    let whole = seen == (width, height);
+                    let seen = if whole { std::mem::take(planes) } else { window(planes, (x0, y0), seen) };
+                    (Shape::new(1, seen.channels, seen.height, seen.width), seen.data)
+                })
+                .collect();
             let output = network.forward(&batch, &mut Stats::Running).as_vec();
             let output = Planes::from_vec(3, seen.0, seen.1, output);
             for c in 0..3 {

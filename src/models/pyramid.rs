@@ -201,7 +201,7 @@ impl Pyramid {
         while let Some((fine, (mask, corners))) = filtered.pop() {
             out = fine.blend(out, mask, corners); // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
         }
-        out.into_images() * field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None).into_images()
+        out.product(field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None)).into_images()
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.

@@ -225,6 +225,32 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
+    /// The product with a field of the same extent.
+    ///
+    /// # Panics
+    /// If extents differ.
+    pub fn product(self, other: Self) -> Self {
+        assert_eq!(self.extent(), other.extent());
+        let (a, b) = (self.saved, other.saved);
+        let mut output = PlaneBuffer::new(a.values.data.len());
+        multiply(&mut output, &a.values.data, &b.values.data, |out, product| *out = product);
+        let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                for (into, other) in [(&a, &b), (&b, &a)] {
+                    into.accumulate(|into| {
+                        if let Some(into) = into {
+                            multiply(into, &gradient, &other.values.data, |sum, product| *sum += product);
+                        }
+                    });
+                }
+                Ok(())
+            });
+        }
+        field
+    }
+
     /// Blends a coarse level, (N, 3, H/2, W/2), into this one, (N, 3, H, W): its share before the
     /// logistic is `alpha`, (N, 1, H, W), the logits of its upsampling `corners`, (N, 4, H, W). See
     /// [`crate::kernels::blend`].
@@ -298,6 +324,14 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         }
         images.put_tape(tape)
     }
+}
+
+/// Calls `put(out, a * b)` value by value.
+fn multiply(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32) + Sync) {
+    const CHUNK: usize = 16384;
+    out.par_chunks_mut(CHUNK).zip(a.par_chunks(CHUNK)).zip(b.par_chunks(CHUNK)).for_each(|((out, a), b)| {
+        out.iter_mut().zip(a.iter().zip(b)).for_each(|(out, (a, b))| put(out, a * b));
+    });
 }
 
 /// What was predicted for the blend of image `n`.

@@ -111,4 +111,5 @@ impl Drop for PlaneBuffer {
 pub fn clear() {
     FREE.lock().unwrap_or_else(PoisonError::into_inner).clear();
     FREE_PLANES.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    crate::kernels::bf16::clear();
 }

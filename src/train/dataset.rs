@@ -16,6 +16,8 @@ use crate::{
 /// Frames and references, decoded once and held as half floats (the precision they mostly come in).
 pub struct Dataset {
     frames: Vec<Stored>,
+    /// Pixels of all frames up to and with each.
+    pixels: Vec<usize>,
 }
 
 struct Stored {
@@ -51,11 +53,14 @@ impl Dataset {
     /// # Errors
     /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
     pub fn load(pairs: &[Pair], (needed, optional): (&[Pass], &[Pass]), patch: usize) -> Result<Self> {
-        let frames = pairs
-            .par_iter()
-            .map(|pair| Stored::load(pair, needed, optional, patch))
-            .collect::<Result<_>>()?;
-        Ok(Self { frames })
+        let frames: Vec<Stored> =
+            pairs.par_iter().map(|pair| Stored::load(pair, needed, optional, patch)).collect::<Result<_>>()?;
+        let mut total = 0;
+        let pixels = frames.iter().map(|f| {
+            total += f.width * f.height;
+            total
+        });
+        Ok(Self { pixels: pixels.collect(), frames })
     }
 
     /// Frames held.
@@ -74,9 +79,11 @@ impl Dataset {
         (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
-    /// A random square crop of `patch` pixels from a random frame, augmented; all of it decided by `rng`.
+    /// A random square crop of `patch` pixels, augmented; all of it decided by `rng`. A frame is drawn as
+    /// often as it is large.
     pub fn draw(&self, patch: usize, rng: &mut Rng) -> Sample {
-        let stored = &self.frames[rng.below(self.frames.len())];
+        let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
+        let stored = &self.frames[self.pixels.partition_point(|&end| end <= pixel)];
         let x = rng.below(stored.width - patch + 1);
         let y = rng.below(stored.height - patch + 1);
         let mut sample = stored.crop(x, y, patch, patch);

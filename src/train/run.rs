@@ -138,6 +138,7 @@ pub fn run(
             rows.push(row.clone());
             log::write(&log_path, &rows)?;
             // Without validation frames the latest weights are the best known.
+            weights_file::write(&out.join("last.safetensors"), &mut *average, &facts(options, &row))?;
             if row.val_relmse.is_none_or(|v| progress.best.is_none_or(|best| v < best)) {
                 progress.best = row.val_relmse;
                 weights_file::write(&out.join("best.safetensors"), &mut *average, &facts(options, &row))?;
