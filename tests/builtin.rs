@@ -251,6 +251,19 @@ fn the_number_of_threads_does_not_change_a_bit() {
 }
 
 #[test]
+fn arithmetic_can_be_chosen_and_changes_little() {
+    let passes = window(130, 70);
+    let image = |name: &str| models::open(name).unwrap().denoise(&passes).unwrap().data;
+    let (exact, rounded) = (image("demc-m:f32"), image("demc-m:bf16"));
+    let energy: f32 = exact.iter().map(|v| v * v).sum();
+    let difference: f32 = exact.iter().zip(&rounded).map(|(a, b)| (a - b).powi(2)).sum();
+    assert!(difference > 0.0, "bfloat16 rounds nothing?");
+    assert!(difference < 1e-4 * energy, "rounding changed the image by {}", (difference / energy).sqrt());
+    let own = image("demc-m");
+    assert!(own == exact || own == rounded, "without a choice, one of the two");
+}
+
+#[test]
 fn every_built_in_weights_file_is_sound_and_small() {
     assert!(learned::BUILT_IN.iter().any(|(name, _)| *name == "demc-m"), "the default model");
     for (name, bytes) in learned::BUILT_IN {

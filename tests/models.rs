@@ -7,6 +7,7 @@ use demc::{
         demc::{Demc, PAPER_WIDTHS, semc_widths},
         kpcn::PUBLISHED_WIDTH,
         network::{Architecture, Config, Network, run},
+        weights_file::{self, Facts},
     },
     nn::Rng,
     passes::{Pass, PassSet},
@@ -220,4 +221,43 @@ fn a_constant_image_stays_as_it_is() {
     assert_eq!(planes.len(), 4);
     let image = run(&*network, &passes, None).expect("all passes are there");
     assert!(image.data.iter().all(|v| (v - 0.7).abs() < 1e-4), "{:?}", &image.data[..8]);
+}
+
+#[test]
+fn a_wider_network_begins_as_the_narrower_one() {
+    let config = |widths: [usize; 4]| Config { architecture: Architecture::Pyramid, widths: widths.into() };
+    let (narrow, wide) = (config([3, 5, 4, 6]), config([4, 5, 9, 17]));
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("narrow.safetensors");
+    let mut network = models::build(&narrow, 5);
+    let facts = Facts {
+        frames: 1,
+        steps: 1,
+        batch: 1,
+        patch: 16,
+        lr: (1.0, 1.0),
+        loss: "both".into(),
+        seed: 5,
+        init: None,
+        seconds: 0.0,
+        validation_frames: 0,
+        validation_relmse: None,
+        validation_ssim: None,
+    };
+    weights_file::write(&path, &mut *network, &facts).unwrap();
+    let mut passes = PassSet::new(std::path::Path::new("x"), "ViewLayer", 40, 24);
+    let mut rng = Rng::new(3, 0);
+    for pass in [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo] {
+        let data = (0..3 * 40 * 24).map(|_| rng.uniform()).collect();
+        passes.insert(pass, Planes::from_vec(3, 40, 24, data));
+    }
+    let held = weights_file::read_as(&path, &narrow, 1).unwrap();
+    let wider = weights_file::read_as(&path, &wide, 1).unwrap();
+    assert_eq!(wider.config(), wide);
+    let (a, b) = (run(&*held, &passes, None).unwrap(), run(&*wider, &passes, None).unwrap());
+    for (a, b) in a.data.iter().zip(&b.data) {
+        assert!((a - b).abs() <= 1e-4 * a.abs(), "{a} became {b}");
+    }
+    let error = weights_file::read_as(&path, &config([2, 5, 9, 17]), 1).err().unwrap().to_string();
+    assert!(error.contains("neither") && error.contains("--widths"), "{error}");
 }
