@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::{
     nl_means::{Scratch, Weights},
     padded::{Padded, TILE_H, TILE_W, pad, tiles},
-    solve::{LANES, Lanes, Symmetric},
+    solve::{LANES, Lanes, Symmetric, difference, plus_product, product},
 };
 use crate::{
     kernels::vectorised::{self, Vectorised},
@@ -160,17 +160,13 @@ impl Input<'_> {
             for (step, weight) in used() {
                 self.basis(p, step, &mut basis);
                 for (to, from) in weighted.iter_mut().zip(&basis) {
-                    for l in 0..LANES {
-                        to[l] = from[l] * weight[l];
-                    }
+                    *to = product(*from, *weight);
                 }
                 matrix.add_outer(&weighted, &basis);
                 for (colour, right) in self.colour.iter().zip(right.chunks_exact_mut(unknowns)) {
-                    let colour = lanes(colour.row(p.0 + step.0, p.1 + step.1, LANES), 0);
+                    let colour = *lanes(colour.row(p.0 + step.0, p.1 + step.1, LANES), 0);
                     for (sum, b) in right.iter_mut().zip(&weighted) {
-                        for l in 0..LANES {
-                            sum[l] += b[l] * colour[l];
-                        }
+                        *sum = plus_product(*sum, *b, colour);
                     }
                 }
             }
@@ -184,16 +180,12 @@ impl Input<'_> {
                     + (j as isize + window as isize + step.0) as usize;
                 let mut add = |plane: usize, values: &Lanes| {
                     let sums = &mut out[plane * w * h + to..][..LANES];
-                    for l in 0..LANES {
-                        sums[l] += weight[l] * values[l];
-                    }
+                    sums.copy_from_slice(&plus_product(*lanes(sums, 0), *weight, *values));
                 };
                 for (c, slopes) in right.chunks_exact(unknowns).enumerate() {
                     let mut value = [0.0; LANES];
                     for (slope, b) in slopes.iter().zip(&basis) {
-                        for l in 0..LANES {
-                            value[l] += slope[l] * b[l];
-                        }
+                        value = plus_product(value, *slope, *b);
                     }
                     add(c, &value);
                 }
@@ -203,9 +195,7 @@ impl Input<'_> {
                     matrix.forward(&mut basis);
                     let mut value = [0.0; LANES];
                     for b in &basis {
-                        for l in 0..LANES {
-                            value[l] += weight[l] * b[l] * b[l];
-                        }
+                        value = plus_product(value, product(*weight, *b), *b);
                     }
                     add(channels + 1, &value);
                     basis[0] = [1.0; LANES];
@@ -224,9 +214,7 @@ impl Input<'_> {
         for (feature, b) in self.features.iter().zip(&mut basis[BEFORE_FEATURES..]) {
             let here = lanes(feature.row(p.0, p.1, LANES), 0);
             let there = lanes(feature.row(p.0 + dx, p.1 + dy, LANES), 0);
-            for l in 0..LANES {
-                b[l] = there[l] - here[l];
-            }
+            *b = difference(*there, *here);
         }
     }
 }

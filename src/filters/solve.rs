@@ -7,6 +7,43 @@ pub const LANES: usize = 16;
 /// One value of each of the systems.
 pub type Lanes = [f32; LANES];
 
+/// `sum + a * b` in each lane. Whole values go in and out, so that compilers see one vector, where loops
+/// over memory became gathers.
+#[inline(always)]
+pub fn plus_product(mut sum: Lanes, a: Lanes, b: Lanes) -> Lanes {
+    for l in 0..LANES {
+        sum[l] += a[l] * b[l];
+    }
+    sum
+}
+
+/// `sum - a * b` in each lane.
+#[inline(always)]
+fn minus_product(mut sum: Lanes, a: Lanes, b: Lanes) -> Lanes {
+    for l in 0..LANES {
+        sum[l] -= a[l] * b[l];
+    }
+    sum
+}
+
+/// `a * b` in each lane.
+#[inline(always)]
+pub fn product(mut a: Lanes, b: Lanes) -> Lanes {
+    for l in 0..LANES {
+        a[l] *= b[l];
+    }
+    a
+}
+
+/// `a - b` in each lane.
+#[inline(always)]
+pub fn difference(mut a: Lanes, b: Lanes) -> Lanes {
+    for l in 0..LANES {
+        a[l] -= b[l];
+    }
+    a
+}
+
 /// Smallest pivot as a part of the diagonal it came from: below it the unknown is what others say
 /// already, up to rounding.
 const MIN_PIVOT: f32 = 1e-5;
@@ -40,9 +77,7 @@ impl Symmetric {
         let mut values = self.values.iter_mut();
         for (row, a) in weighted.iter().enumerate() {
             for (b, sum) in v[..=row].iter().zip(&mut values) {
-                for l in 0..LANES {
-                    sum[l] += a[l] * b[l];
-                }
+                *sum = plus_product(*sum, *a, *b);
             }
         }
     }
@@ -69,10 +104,7 @@ impl Symmetric {
                 let mut sum = self.values[at(i, j)];
                 let before = sum;
                 for k in 0..j {
-                    let (a, b) = (self.values[at(i, k)], self.values[at(j, k)]);
-                    for l in 0..LANES {
-                        sum[l] -= a[l] * b[l];
-                    }
+                    sum = minus_product(sum, self.values[at(i, k)], self.values[at(j, k)]);
                 }
                 if i == j {
                     for l in 0..LANES {
@@ -80,10 +112,7 @@ impl Symmetric {
                         sum[l] = if pivot > f32::MIN_POSITIVE { pivot.sqrt().recip() } else { 0.0 };
                     }
                 } else {
-                    let inverse = self.values[at(j, j)];
-                    for l in 0..LANES {
-                        sum[l] *= inverse[l];
-                    }
+                    sum = product(sum, self.values[at(j, j)]);
                 }
                 self.values[at(i, j)] = sum;
             }
@@ -96,16 +125,9 @@ impl Symmetric {
         for i in 0..self.size {
             let mut sum = v[i];
             for (k, b) in v[..i].iter().enumerate() {
-                let a = self.values[at(i, k)];
-                for l in 0..LANES {
-                    sum[l] -= a[l] * b[l];
-                }
+                sum = minus_product(sum, self.values[at(i, k)], *b);
             }
-            let inverse = self.values[at(i, i)];
-            for l in 0..LANES {
-                sum[l] *= inverse[l];
-            }
-            v[i] = sum;
+            v[i] = product(sum, self.values[at(i, i)]);
         }
     }
 
@@ -115,16 +137,9 @@ impl Symmetric {
         for i in (0..self.size).rev() {
             let mut sum = v[i];
             for (k, b) in v[..self.size].iter().enumerate().skip(i + 1) {
-                let a = self.values[at(k, i)];
-                for l in 0..LANES {
-                    sum[l] -= a[l] * b[l];
-                }
+                sum = minus_product(sum, self.values[at(k, i)], *b);
             }
-            let inverse = self.values[at(i, i)];
-            for l in 0..LANES {
-                sum[l] *= inverse[l];
-            }
-            v[i] = sum;
+            v[i] = product(sum, self.values[at(i, i)]);
         }
     }
 
