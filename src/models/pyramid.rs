@@ -187,7 +187,7 @@ impl Pyramid {
 
         // Radiance pyramid: each level filtered, then blended from the coarsest up.
         let mut image = field(irradiance);
-        let mut filtered: Vec<(Field<T>, (Field<T>, Field<T>))> = Vec::with_capacity(levels.len());
+        let mut filtered = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
         for (level, (kernel, confidence, masks)) in levels.into_iter().enumerate() {
             let below = (level < last).then(|| image.fork().reduce(confidence.fork()));
@@ -245,11 +245,7 @@ impl Network for Pyramid {
         let encoders = self.encoders.iter_mut().flat_map(|e| e.levels.iter_mut().flatten());
         let decoder =
             self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
-        encoders
-            .chain(decoder)
-            .chain([&mut self.full])
-            .chain(&mut self.heads)
-            .collect()
+        encoders.chain(decoder).chain([&mut self.full]).chain(&mut self.heads).collect()
     }
 
     fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {

@@ -107,7 +107,9 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
     if !fits {
         return Err(Error::invalid(
             path,
-            format!("holds {held}, which is neither {config} nor narrower; choose --model and --widths alike"),
+            format!(
+                "holds {held}, which is neither {config} nor narrower; choose --model and --widths alike"
+            ),
         ));
     }
     Ok(network)

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::{
-    Activation, Init, Param, Precision, Rng, activation::{Data, Saved},
+    Activation, Init, Param, Precision, Rng,
+    activation::{Data, Saved},
     arithmetic::{Arithmetic, Packed},
     pool::Buffer,
 };
@@ -98,9 +99,9 @@ impl Conv {
         let place = |a: &Arithmetic, total, o, i, t| weight_index(a.geometry, a.outputs, total, o, i, t);
         let mut first = [0; 2];
         for (w, n) in wide.inputs.iter().zip(&narrow.inputs) {
-            for (o, i, t) in (0..narrow.outputs).flat_map(|o| {
-                (0..*w).flat_map(move |i| (0..taps).map(move |t| (o, i, t)))
-            }) {
+            for (o, i, t) in
+                (0..narrow.outputs).flat_map(|o| (0..*w).flat_map(move |i| (0..taps).map(move |t| (o, i, t))))
+            {
                 let old = (i < *n).then(|| weight[place(narrow, total[1], o, first[1] + i, t)]);
                 weights[place(wide, total[0], o, first[0] + i, t)] = old.unwrap_or(0.0);
             }

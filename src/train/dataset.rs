@@ -53,8 +53,10 @@ impl Dataset {
     /// # Errors
     /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
     pub fn load(pairs: &[Pair], (needed, optional): (&[Pass], &[Pass]), patch: usize) -> Result<Self> {
-        let frames: Vec<Stored> =
-            pairs.par_iter().map(|pair| Stored::load(pair, needed, optional, patch)).collect::<Result<_>>()?;
+        let frames: Vec<Stored> = pairs
+            .par_iter()
+            .map(|pair| Stored::load(pair, needed, optional, patch))
+            .collect::<Result<_>>()?;
         let mut total = 0;
         let pixels = frames.iter().map(|f| {
             total += f.width * f.height;

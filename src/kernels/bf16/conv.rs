@@ -184,7 +184,10 @@ pub fn convolve(
     let geometry = weights.geometry;
     let spread = spread(geometry);
     assert!(sources.iter().all(|s| s.grid == grid && s.shape.n == out.n), "sources differ in size");
-    assert!(sources.iter().map(|s| s.shape.c).eq(weights.inputs.iter().copied()), "sources differ in channels");
+    assert!(
+        sources.iter().map(|s| s.shape.c).eq(weights.inputs.iter().copied()),
+        "sources differ in channels"
+    );
     assert_eq!(grid.split, geometry == Geometry::Strided);
     assert_eq!((out.h, out.w, out.c), (spread * grid.h, spread * grid.w, weights.outputs));
     assert!(epilogue.accumulate || bias.len() == out.planes());
@@ -204,10 +207,15 @@ pub fn convolve(
         let signed = |v: usize| isize::try_from(v).expect("buffers fit in memory");
         let place = |(i, (plane, tap)): (usize, (usize, Tap))| {
             let (first, step): (*const Wide, usize) = planes[plane];
-            let at = signed((n * step + tap.phase) * grid.positions()) + tap.dy * signed(grid.stride()) + tap.dx;
+            let at =
+                signed((n * step + tap.phase) * grid.positions()) + tap.dy * signed(grid.stride()) + tap.dx;
             Term { input: first.wrapping_offset(at), weights: i * LANES * size_of::<Wide>() }
         };
-        terms(geometry, planes.len(), (phase / spread, phase % spread)).into_iter().enumerate().map(place).collect()
+        terms(geometry, planes.len(), (phase / spread, phase % spread))
+            .into_iter()
+            .enumerate()
+            .map(place)
+            .collect()
     };
     let phases: Vec<Vec<Vec<Term>>> =
         (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();
@@ -231,7 +239,18 @@ pub fn convolve(
         let rows = (y0, grid.h.min(y0 + band));
         let n = task / bands;
         engine.ready(|| {
-            tier.run(Band { engine, grid, weights, bias, epilogue, phases: &phases[n], out, target, n, rows });
+            tier.run(Band {
+                engine,
+                grid,
+                weights,
+                bias,
+                epilogue,
+                phases: &phases[n],
+                out,
+                target,
+                n,
+                rows,
+            });
         });
     });
 }
@@ -282,7 +301,12 @@ impl Kernel for Band<'_> {
                     // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
                         self.engine.multiply(terms, position, weights, (outputs, plane_rows), &mut sums);
-                        self.store::<S>(&mut sums, (plane, outputs), phase, (position, end.min(position + CHUNK)));
+                        self.store::<S>(
+                            &mut sums,
+                            (plane, outputs),
+                            phase,
+                            (position, end.min(position + CHUNK)),
+                        );
                     }
                 }
             }
@@ -307,7 +331,8 @@ impl Band<'_> {
             let (y, x) = (position / grid.stride() - grid.pad, position % grid.stride());
             // Positions run from the left border, over the pixels, to the right border.
             let skip = grid.pad.saturating_sub(x);
-            let run = (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
+            let run =
+                (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
             let (first, column) = (position + skip - from, x + skip - grid.pad);
             let row = y * spread + phase / spread;
             for o in 0..outputs {

@@ -148,7 +148,13 @@ impl Engine {
     ///
     /// # Safety
     /// `out` is valid for as many writes.
-    pub(super) unsafe fn narrow_spread(self, low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
+    pub(super) unsafe fn narrow_spread(
+        self,
+        low: &[Block],
+        high: Option<&[Block]>,
+        out: *mut Wide,
+        step: usize,
+    ) {
         // SAFETY: the caller's promise.
         unsafe {
             if step == 1 {
@@ -237,7 +243,8 @@ mod portable {
                         ([row.read_unaligned(), row.add(1).read_unaligned()], &*pairs.add(o * plane + pair))
                     };
                     for l in 0..LANES {
-                        sum.0[l] += x[0].to_f32() * g.0[2 * l].to_f32() + x[1].to_f32() * g.0[2 * l + 1].to_f32();
+                        sum.0[l] +=
+                            x[0].to_f32() * g.0[2 * l].to_f32() + x[1].to_f32() * g.0[2 * l + 1].to_f32();
                     }
                 }
             }
@@ -322,7 +329,9 @@ mod avx512 {
                             std::mem::transmute(_mm512_load_si512(w.add(o * plane + pair).cast()))
                         });
                         for p in 0..TILE {
-                            let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(*x.add(p * LANES + pair)));
+                            let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(
+                                *x.add(p * LANES + pair),
+                            ));
                             for o in 0..OUT {
                                 acc[o][p] = _mm512_dpbf16_ps(acc[o][p], w[o], x);
                             }
@@ -358,7 +367,8 @@ mod avx512 {
             // SAFETY: blocks and wides are 64 bytes, aligned to as many.
             unsafe {
                 let [a, b] = [0, 1].map(|i| {
-                    let half: __m256i = std::mem::transmute(_mm512_cvtneps_pbh(_mm512_load_ps(pair[i].0.as_ptr())));
+                    let half: __m256i =
+                        std::mem::transmute(_mm512_cvtneps_pbh(_mm512_load_ps(pair[i].0.as_ptr())));
                     _mm512_cvtepu16_epi32(half)
                 });
                 let both = _mm512_or_si512(a, _mm512_slli_epi32::<16>(b));

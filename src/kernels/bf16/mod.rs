@@ -175,7 +175,8 @@ impl Operand {
         let part = if grid.split { grid.positions() } else { PART.min(grid.positions()) };
         body.par_chunks_mut(grid.positions()).enumerate().for_each(|(i, out)| {
             let (phase, plane) = (i % grid.phases(), i / grid.phases());
-            let (low, high) = halves(source, plane * grid.phases() / planes, plane % (planes / grid.phases()));
+            let (low, high) =
+                halves(source, plane * grid.phases() / planes, plane % (planes / grid.phases()));
             if grid.split {
                 out.fill(Wide::ZERO);
                 grid.pixels(shape, phase, |to, from| {

@@ -156,7 +156,8 @@ pub fn weight_gradient(
                         let position = signed(grid.row(0) - grid.pad + step * CHUNK) + shift;
                         // SAFETY: borders and slack cover the shift; `ready` was called.
                         unsafe {
-                            let channels = source.data.0.as_ptr().cast::<bf16>().add(channels).offset(position);
+                            let channels =
+                                source.data.0.as_ptr().cast::<bf16>().add(channels).offset(position);
                             let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
                             let pairs = output_gradient.data.0.as_ptr().add(at);
                             let stride = source.stride * size_of::<bf16>();
