@@ -14,8 +14,13 @@ use crate::{
     planes::Planes,
 };
 
-/// The built-in weights: name and file, smallest first.
-pub const BUILT_IN: [(&str, &[u8]); 1] = [("demc-m", include_bytes!("weights/demc-m.safetensors"))];
+/// The built-in weights, name and file: ours, smallest first, then the paper's networks and its rivals.
+pub const BUILT_IN: [(&str, &[u8]); 4] = [
+    ("demc-m", include_bytes!("weights/demc-m.safetensors")),
+    ("demc", include_bytes!("weights/demc.safetensors")),
+    ("semc", include_bytes!("weights/semc.safetensors")),
+    ("lbf", include_bytes!("weights/lbf.safetensors")),
+];
 
 /// A network with its weights.
 pub struct Learned {
