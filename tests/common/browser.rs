@@ -9,6 +9,7 @@ use std::{
     fs::{self, File},
     io::{BufRead, BufReader, Read},
     net::TcpStream,
+    os::unix::process::CommandExt,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
     time::{Duration, Instant},
@@ -88,6 +89,8 @@ pub struct Record {
 /// A browser with one open page. Ends with its value.
 pub struct Browser {
     child: Child,
+    /// Dropped after the browser was asked to end.
+    _group: Group,
     socket: WebSocket<MaybeTlsStream<TcpStream>>,
     session: String,
     last_id: u64,
@@ -114,8 +117,10 @@ impl Browser {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
+            .process_group(0)
             .spawn()
             .unwrap_or_else(|e| panic!("{}: does not start: {e}", program.display()));
+        let group = Group(child.id());
         let mut said = BufReader::new(child.stderr.take().expect("stderr is piped"));
         let address = listen_address(&mut said)
             .unwrap_or_else(|said| panic!("{}: no DevTools address:\n{said}", program.display()));
@@ -126,8 +131,16 @@ impl Browser {
             stream.set_read_timeout(Some(PATIENCE)).unwrap();
         }
         let (session, record) = (String::new(), Record::default());
-        let mut browser =
-            Self { child, socket, session, last_id: 0, record, has_loaded: false, _profile: profile };
+        let mut browser = Self {
+            child,
+            _group: group,
+            socket,
+            session,
+            last_id: 0,
+            record,
+            has_loaded: false,
+            _profile: profile,
+        };
         let target = browser.call("Target.createTarget", json!({ "url": "about:blank" }));
         let attach = json!({ "targetId": target["targetId"], "flatten": true });
         let session = browser.call("Target.attachToTarget", attach);
@@ -263,6 +276,18 @@ impl Drop for Browser {
         }
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+/// Ends every process of a group, those that a wrapper script left behind too.
+struct Group(u32);
+
+impl Drop for Group {
+    fn drop(&mut self) {
+        let _ = Command::new("kill")
+            .args(["-KILL", "--", &format!("-{}", self.0)])
+            .stderr(Stdio::null())
+            .status();
     }
 }
 
