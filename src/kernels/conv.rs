@@ -53,8 +53,13 @@ impl Geometry {
         }
     }
 
+    /// The geometry of the input gradient.
+    pub fn backward(self) -> Self {
+        if self == Geometry::Transposed { Geometry::Strided } else { self }
+    }
+
     /// The border an input needs so that no tap leaves it.
-    fn reach(self) -> usize {
+    pub(super) fn reach(self) -> usize {
         match self {
             Geometry::Same(k) => k / 2,
             Geometry::Transposed | Geometry::Strided => 1,

@@ -57,21 +57,34 @@ pub fn weight_gradient(
         });
     });
 
-    gradient.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
-        let (o, i) = match geometry {
-            Geometry::Same(_) => (at / inputs, at % inputs),
-            _ => (at % g.c, at / g.c),
-        };
-        if i < first || i >= first + s.c {
-            return;
-        }
-        debug_assert_eq!(weight_index(geometry, g.c, inputs, o, i, 0), at * taps);
-        let i = i - first;
+    each_kernel(gradient, geometry, g.c, (first, s.c, inputs), |o, i, chunk| {
         for (t, value) in chunk.iter_mut().enumerate() {
             let slab = (((o / LANES) * s.planes() + i / LANES) * taps + t) * LANES + i % LANES;
             for part in 0..parts {
                 *value += partial[part * slabs + slab].0[o % LANES];
             }
+        }
+    });
+}
+
+/// Calls `visit(output, input of the source, taps)` for every kernel of `weights` that reads one of a
+/// source's `channels`, the inputs from `first` on of `inputs` in all.
+pub(super) fn each_kernel(
+    weights: &mut [f32],
+    geometry: Geometry,
+    outputs: usize,
+    (first, channels, inputs): (usize, usize, usize),
+    visit: impl Fn(usize, usize, &mut [f32]) + Sync,
+) {
+    let taps = geometry.taps();
+    weights.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
+        let (o, i) = match geometry {
+            Geometry::Same(_) => (at / inputs, at % inputs),
+            _ => (at % outputs, at / outputs),
+        };
+        debug_assert_eq!(weight_index(geometry, outputs, inputs, o, i, 0), at * taps);
+        if (first..first + channels).contains(&i) {
+            visit(o, i - first, chunk);
         }
     });
 }

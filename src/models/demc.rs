@@ -10,7 +10,7 @@ use dfdx::{
     tensor_ops::powf,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
@@ -354,10 +354,6 @@ impl Network for Demc {
     }
 
     fn duplicate(&self) -> Box<dyn Network> {
-        let mut copy = self.clone();
-        for param in copy.params() {
-            *param = param.duplicate();
-        }
-        Box::new(copy)
+        duplicate(self)
     }
 }

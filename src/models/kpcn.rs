@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{
@@ -26,7 +26,7 @@ use crate::{
         kpcn_streams,
     },
     kernels::Shape,
-    nn::{Activation, BatchNorm, Conv, Field, Images, Init, Param, Rng, Stats},
+    nn::{Activation, Conv, Field, Images, Init, Param, Rng, Stats},
     passes::{Pass, PassSet},
 };
 
@@ -176,10 +176,6 @@ impl Network for Kpcn {
         self.streams.iter_mut().flat_map(|s| &mut s.layers).collect()
     }
 
-    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
-        Vec::new()
-    }
-
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
         self.run::<NoneTape>(batch)
     }
@@ -200,10 +196,6 @@ impl Network for Kpcn {
     }
 
     fn duplicate(&self) -> Box<dyn Network> {
-        let mut copy = self.clone();
-        for param in copy.params() {
-            *param = param.duplicate();
-        }
-        Box::new(copy)
+        duplicate(self)
     }
 }

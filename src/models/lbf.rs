@@ -17,11 +17,11 @@ use dfdx::{
     tensor_ops::{clamp, exp, ln, sigmoid},
 };
 
-use super::network::{Batch, Config, Network, Taped};
+use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
-    nn::{Activation, BatchNorm, Conv, Guides, Images, Init, Param, Rng, Stats, cross_bilateral},
+    nn::{Activation, Conv, Guides, Images, Init, Param, Rng, Stats, cross_bilateral},
     passes::{Pass, PassSet},
 };
 
@@ -110,10 +110,6 @@ impl Network for Lbf {
         self.hidden.params().into_iter().chain(self.output.params()).collect()
     }
 
-    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
-        Vec::new()
-    }
-
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
         self.run::<NoneTape>(batch)
     }
@@ -135,10 +131,6 @@ impl Network for Lbf {
     }
 
     fn duplicate(&self) -> Box<dyn Network> {
-        let mut copy = self.clone();
-        for param in copy.params() {
-            *param = param.duplicate();
-        }
-        Box::new(copy)
+        duplicate(self)
     }
 }

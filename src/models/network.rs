@@ -115,7 +115,9 @@ pub trait Network: Send + Sync {
     }
 
     /// Its batch-norm layers, in the order in which a forward pass records their statistics.
-    fn batch_norms(&mut self) -> Vec<&mut BatchNorm>;
+    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
+        Vec::new()
+    }
 
     /// Radiance (N, 3, H, W), in the network's own scale.
     fn forward(&self, batch: &Batch, stats: &mut Stats) -> Images;
@@ -131,6 +133,15 @@ pub trait Network: Send + Sync {
 
     /// A copy with its own parameters.
     fn duplicate(&self) -> Box<dyn Network>;
+}
+
+/// [`Network::duplicate`] of a network that can be cloned.
+pub(super) fn duplicate(network: &(impl Network + Clone + 'static)) -> Box<dyn Network> {
+    let mut copy = network.clone();
+    for param in copy.params() {
+        *param = param.duplicate();
+    }
+    Box::new(copy)
 }
 
 /// What [`Network::whole_frame_pixels`] is for most: activations of an 8K frame would take more memory

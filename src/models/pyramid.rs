@@ -11,12 +11,12 @@
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Batch, Config, Network, Taped};
+use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{GUIDE_PASSES, Inputs, guides},
     kernels::blend::CORNERS,
-    nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
+    nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
 };
 
@@ -248,10 +248,6 @@ impl Network for Pyramid {
         encoders.chain(decoder).chain([&mut self.full]).chain(&mut self.heads).collect()
     }
 
-    fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
-        Vec::new()
-    }
-
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
         self.run::<NoneTape>(batch)
     }
@@ -277,10 +273,6 @@ impl Network for Pyramid {
     }
 
     fn duplicate(&self) -> Box<dyn Network> {
-        let mut copy = self.clone();
-        for param in copy.params() {
-            *param = param.duplicate();
-        }
-        Box::new(copy)
+        duplicate(self)
     }
 }

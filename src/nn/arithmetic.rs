@@ -148,7 +148,7 @@ impl Arithmetic {
     /// The gradient of each source from that of the output: a function of the source's index, where to
     /// write, and whether to add to what is there.
     pub(super) fn input_gradient(&self, gradient: View, weights: &[f32]) -> impl Fn(usize, ViewMut, bool) {
-        let back = if self.geometry == Geometry::Transposed { Geometry::Strided } else { self.geometry };
+        let back = self.geometry.backward();
         let engine = Engine::detect();
         let operand =
             (self.precision == Precision::Bf16).then(|| bf16::Operand::narrow(engine, gradient, back));

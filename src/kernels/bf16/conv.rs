@@ -102,8 +102,7 @@ impl Weights {
                 weights[weight_index(geometry, outputs, total, o, i, t)]
             }),
             Direction::Backward => {
-                let back = if geometry == Geometry::Transposed { Geometry::Strided } else { geometry };
-                Self::build(back, vec![outputs], inputs[source], |o, i, t| {
+                Self::build(geometry.backward(), vec![outputs], inputs[source], |o, i, t| {
                     // Mirrored for a stride-1 convolution; a strided read visits the taps in order.
                     let t = if matches!(geometry, Geometry::Same(_)) { taps - 1 - t } else { t };
                     weights[weight_index(geometry, outputs, total, i, first + o, t)]
@@ -191,8 +190,7 @@ pub fn convolve(
     assert_eq!(grid.split, geometry == Geometry::Strided);
     assert_eq!((out.h, out.w, out.c), (spread * grid.h, spread * grid.w, weights.outputs));
     assert!(epilogue.accumulate || bias.len() == out.planes());
-    let reach = if let Geometry::Same(k) = geometry { k / 2 } else { 1 };
-    assert!(grid.pad >= reach, "border too small for {geometry:?}");
+    assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
 
     // Every plane of every source: its first position in image 0, and planes from one image to the next.
     let planes: Vec<(*const Wide, usize)> = sources

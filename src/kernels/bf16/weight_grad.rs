@@ -8,7 +8,7 @@ use half::bf16;
 use rayon::prelude::*;
 
 use super::{Block, Buffer, CHUNK, Engine, Geometry, Grid, LANES, Shape, Sums, View, WIDE, Wide, halves};
-use crate::kernels::conv::weight_index;
+use crate::kernels::weight_grad::each_kernel;
 
 /// Products of 32 positions that keep both factors in the first-level cache over all taps.
 const STEPS: usize = 8;
@@ -171,16 +171,7 @@ pub fn weight_gradient(
     };
     let sums: Vec<Vec<Sums>> = (0..parts * wide * groups).into_par_iter().map(task_sums).collect();
 
-    gradient.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
-        let (o, i) = match geometry {
-            Geometry::Same(_) => (at / inputs, at % inputs),
-            _ => (at % g.c, at / g.c),
-        };
-        if i < first || i >= first + s.c {
-            return;
-        }
-        debug_assert_eq!(weight_index(geometry, g.c, inputs, o, i, 0), at * taps);
-        let i = i - first;
+    each_kernel(gradient, geometry, g.c, (first, s.c, inputs), |o, i, chunk| {
         let (plane, lane) = (o / LANES, o % LANES);
         for part in 0..parts {
             let sums = &sums[(part * groups + plane / 2) * wide + i / WIDE];
