@@ -19,7 +19,7 @@ use exr::{
 use half::f16;
 use rayon::prelude::*;
 
-use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text};
+use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text, zip};
 use crate::Result;
 
 /// A channel to store: values of the whole data window, row-major.
@@ -333,7 +333,7 @@ impl<'a> Encoder<'a> {
             }
         }
         let block = UncompressedBlock { index: at, data };
-        let chunk = block.compress_to_chunk(&self.meta.headers)?;
+        let chunk = zip::compress(block, &self.meta.headers)?;
         Ok(StoredChunk { part: self.part, index, chunk })
     }
 

@@ -8,6 +8,7 @@ mod decode;
 mod edit;
 mod read;
 mod write;
+mod zip;
 
 use std::{
     fmt,
