@@ -32,10 +32,10 @@ pub const KPCN_PASSES: [Pass; 7] = [
 pub const KPCN_UNFILTERED: [Pass; 2] = [Pass::Emission, Pass::Environment];
 
 /// Channels that a stream's network reads: colour, normal and albedo with one variance and six
-/// differences each, depth with one and two (Section 5.1).
+/// differences each, depth with one and two.
 pub const KPCN_CHANNELS: usize = 34;
 
-/// Added to albedo before diffuse light is divided by it, and before it is multiplied back (Section 4.3).
+/// Added to albedo before diffuse light is divided by it, and before it is multiplied back.
 pub const DIFFUSE_FLOOR: f32 = 0.00316;
 
 /// The single stream over Combined, in this order: radiance, exposed and divided by albedo (3, H, W);
@@ -58,7 +58,7 @@ pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     Ok(Inputs { planes: vec![irradiance, albedo, input], scale: exposure.recip() })
 }
 
-/// The two streams of Section 4.3, in this order: diffuse light, exposed and divided by the diffuse
+/// The two streams, in this order: diffuse light, exposed and divided by the diffuse
 /// colour (3, H, W); that colour (3, H, W); `log(1 + specular light)` (3, H, W); light that is not
 /// filtered (3, H, W); the diffuse and the specular network's input (34, H, W each).
 ///
@@ -101,7 +101,7 @@ pub fn kpcn_streams(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     Ok(Inputs { planes, scale: exposure.recip() })
 }
 
-/// `log(1 + v)`, the transfer of specular light (Section 4.3).
+/// `log(1 + v)`, the transfer of specular light.
 fn logarithm(planes: &Planes) -> Planes {
     let mut out = planes.clone();
     out.data.par_iter_mut().for_each(|v| *v = v.ln_1p());

@@ -14,7 +14,7 @@ use crate::{
     planes::Planes,
 };
 
-/// The passes of [`lbf`]: those of the paper's network.
+/// The passes of [`lbf`]: those of the DEMC paper's networks.
 pub const LBF_PASSES: [Pass; 7] = PAPER_PASSES;
 
 /// Channels of the filter's feature groups: world position, shading normal, texture at the first hit,

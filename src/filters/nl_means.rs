@@ -1,5 +1,5 @@
 //! NL-means weights with known noise: Rousselle, Knaus, Zwicker 2012, "Adaptive Rendering with Non-Local
-//! Means Filtering", Section 4.1.
+//! Means Filtering".
 //!
 //! In: a guide image with the variance of each pixel. Out: for every pixel p and every q in the window
 //! around it a weight `exp(-max(0, d))`, where d is the mean over the pixels and channels of two patches

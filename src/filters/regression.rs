@@ -1,5 +1,5 @@
 //! Weighted first-order regression over windows: Bitterli et al. 2016, "Nonlinearly Weighted
-//! First-order Regression for Denoising Monte Carlo Renderings", Sections 3 and 4.
+//! First-order Regression for Denoising Monte Carlo Renderings", Section 5.2.
 //!
 //! In: colour, features and the weights of windows. Around each pixel p colour is fitted by a constant,
 //! the two screen coordinates and the features, all relative to p; each fit then predicts its whole

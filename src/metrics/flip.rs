@@ -3,7 +3,7 @@
 //! Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A Difference Evaluator for
 //! Alternating Images" (2020), and Andersson, Nilsson, Shirley, Akenine-Moller, "Visualizing Errors in
 //! Rendered High Dynamic Range Images" (2021): the maximum of FLIP over exposures that span the
-//! reference, tone mapped, averaged over pixels. Section numbers below are those of the first paper.
+//! reference, tone mapped, averaged over pixels.
 
 use rayon::prelude::*;
 
@@ -11,20 +11,20 @@ use crate::planes::Planes;
 
 /// Pixels per degree of visual angle: a 0.7 m wide monitor of 3840 pixels seen from 0.7 m.
 const PIXELS_PER_DEGREE: f32 = 67.020_64;
-/// Exponent of the colour difference (4.1.3).
+/// Exponent of the colour difference.
 const QC: f32 = 0.7;
 /// Colour differences below this share of the largest ...
 const PC: f32 = 0.4;
-/// ... are spread over this share of the output range (4.1.3).
+/// ... are spread over this share of the output range.
 const PT: f32 = 0.95;
-/// Exponent of the feature difference (4.2).
+/// Exponent of the feature difference.
 const QF: f32 = 0.5;
-/// Width of the feature detectors in degrees (4.2).
+/// Width of the feature detectors in degrees.
 const FEATURE_WIDTH: f32 = 0.082;
-/// Contrast sensitivity of the achromatic, red-green and blue-yellow channels (4.1.1, table 1):
+/// Contrast sensitivity of the achromatic, red-green and blue-yellow channels:
 /// amplitudes and widths of up to two Gaussians.
 const CSF: [&[(f32, f32)]; 3] = [&[(1.0, 0.0047)], &[(1.0, 0.0053)], &[(34.1, 0.04), (13.5, 0.025)]];
-/// Tone mapped brightness that the extreme exposures bring maximum and median to (2021, section 3.1).
+/// Tone mapped brightness that the extreme exposures bring maximum and median to (2021).
 const TONE_TARGET: f32 = 0.85;
 /// Narkowicz' fit of the ACES curve with the 2021 paper's factor of 0.6 on radiance:
 /// `(k0 x^2 + k1 x) / (k2 x^2 + k3 x + k4)`.
@@ -67,9 +67,9 @@ pub fn hdr_flip_map(image: &Planes, reference: &Planes) -> Option<Vec<f32>> {
     Some(worst)
 }
 
-/// The factors on radiance, darkest first (2021, section 3.1): from the one that brings the
-/// reference's brightest pixel to 0.85 after tone mapping to the one that does so for its median, a
-/// stop apart at most.
+/// The factors on radiance, darkest first (2021): from the one that brings the reference's brightest
+/// pixel to 0.85 after tone mapping to the one that does so for its median, evenly spaced in stops, as
+/// many as there are stops between them, rounded up, and at least two.
 fn exposures(reference: &Planes) -> Option<Vec<f32>> {
     let [r, g, b] = [0, 1, 2].map(|c| reference.channel(c));
     let y = RGB_TO_XYZ[1];
@@ -131,7 +131,7 @@ struct Filters {
 impl Filters {
     fn new() -> Self {
         let pi = std::f32::consts::PI;
-        // All channels share the radius of the widest Gaussian: three standard deviations (4.1.1).
+        // All channels share the radius of the widest Gaussian: three standard deviations.
         let widest = CSF.iter().flat_map(|g| g.iter()).map(|g| g.1).fold(0.0, f32::max);
         let radius = (3.0 * (widest / (2.0 * pi * pi)).sqrt() * PIXELS_PER_DEGREE).ceil() as i32;
         let csf = CSF.map(|gaussians| {
@@ -153,7 +153,7 @@ impl Filters {
         let kernel = |f: &dyn Fn(f32) -> f32| -> Kernel {
             let gaussian = |x: f32| (-x * x / (2.0 * sigma * sigma)).exp();
             let raw: Kernel = (-radius..=radius).map(|i| f(i as f32) * gaussian(i as f32)).collect();
-            // Positive weights add up to 1 and negative ones to -1 (4.2).
+            // Positive weights add up to 1 and negative ones to -1.
             let positive: f32 = raw.iter().filter(|v| **v > 0.0).sum();
             let negative: f32 = -raw.iter().filter(|v| **v < 0.0).sum::<f32>();
             raw.iter().map(|v| if *v > 0.0 { v / positive } else { v / negative.max(1e-30) }).collect()
@@ -181,7 +181,7 @@ impl Filters {
             let rgb = multiply(&XYZ_TO_RGB, from_opponent(ycc)).map(|v| v.clamp(0.0, 1.0));
             hunt(lab(multiply(&RGB_TO_XYZ, rgb)))
         });
-        // Features are found in the unfiltered achromatic channel, scaled to 0..1 (4.2).
+        // Features are found in the unfiltered achromatic channel, scaled to 0..1.
         let grey: Vec<f32> = opponent.channel(0).iter().map(|y| (y + 16.0) / 116.0).collect();
         let smooth = rows(&grey, width, &self.gaussian);
         let mut features = Planes::new(2, width, height);
@@ -195,10 +195,10 @@ impl Filters {
     }
 }
 
-/// FLIP of every pixel (4.3): the colour difference raised to one minus the feature difference.
+/// FLIP of every pixel: the colour difference raised to one minus the feature difference.
 fn difference(test: &Percept, reference: &Percept) -> Vec<f32> {
     let extreme = |rgb| hunt(lab(multiply(&RGB_TO_XYZ, rgb)));
-    // The largest difference within sRGB is between green and blue (4.1.3).
+    // The largest difference within sRGB is between green and blue.
     let largest = hyab(extreme([0.0, 1.0, 0.0]), extreme([0.0, 0.0, 1.0])).powf(QC);
     let knee = PC * largest;
     let n = test.lab.pixels();
@@ -228,7 +228,7 @@ fn white() -> [f32; 3] {
     RGB_TO_XYZ.map(|row| row.iter().sum())
 }
 
-/// XYZ to the linearised opponent space YCxCz (4.1.1).
+/// XYZ to the linearised opponent space YCxCz.
 fn opponent(xyz: [f32; 3]) -> [f32; 3] {
     let w = white();
     let [x, y, z] = [xyz[0] / w[0], xyz[1] / w[1], xyz[2] / w[2]];
@@ -251,12 +251,12 @@ fn lab(xyz: [f32; 3]) -> [f32; 3] {
     [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
 }
 
-/// The Hunt effect: colours of dark pixels differ less (4.1.2).
+/// The Hunt effect: colours of dark pixels differ less.
 fn hunt([l, a, b]: [f32; 3]) -> [f32; 3] {
     [l, 0.01 * l * a, 0.01 * l * b]
 }
 
-/// City-block in lightness, Euclidean in chroma (4.1.2).
+/// City-block in lightness, Euclidean in chroma (HyAB).
 fn hyab(a: [f32; 3], b: [f32; 3]) -> f32 {
     (a[0] - b[0]).abs() + (a[1] - b[1]).hypot(a[2] - b[2])
 }

@@ -8,9 +8,9 @@
 //! Departures: (1) with half buffers variance comes from their difference, averaged over 7x7 pixels, not
 //! from the renderer's sample variance; (2) without them nothing is cross-buffered: variance is the
 //! residual of a first-order fit, and Section 5.3's error estimate is Stein's (SURE) instead; (3) a
-//! small ridge on slopes replaces a rank-revealing solver; (4) one bandwidth serves all three channels;
-//! (5) depth is mapped to 0..1, radiance is scaled to a mean of 1; (6) there is no visibility or caustics
-//! feature, because Cycles writes none.
+//! small ridge on slopes replaces a rank-revealing solver; (4) one bandwidth serves all three channels, and
+//! the channels of a feature are prefiltered with common weights; (5) depth is mapped to 0..1, radiance is
+//! scaled to a mean of 1; (6) there is no visibility feature, because Cycles writes none.
 
 use std::{
     path::{Path, PathBuf},
