@@ -113,6 +113,14 @@ const EXPOSURE_SQUARE: usize = 16;
 /// # Errors
 /// A pass is missing.
 pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
+    guides_exposed(passes, exposure(passes.require(Pass::Combined, needed_by)?), needed_by)
+}
+
+/// [`guides`] with an exposure that was found before: for some rows of a frame.
+///
+/// # Errors
+/// As [`guides`].
+pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
@@ -124,7 +132,6 @@ pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
         passes.height,
         albedo.data.iter().chain(&normal.data).map(|v| v.clamp(-1.0, 1.0)).collect(),
     );
-    let exposure = exposure(radiance);
     albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
     let mut irradiance = radiance.clone();
     irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
@@ -143,7 +150,7 @@ fn log_transfer(exposed: f32) -> f32 {
 
 /// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
 /// a black frame. Scaling radiance scales it inversely.
-fn exposure(radiance: &Planes) -> f32 {
+pub fn exposure(radiance: &Planes) -> f32 {
     let (w, h) = (radiance.width, radiance.height);
     let (mut sum, mut count) = (0.0, 0usize);
     for y0 in (0..h).step_by(EXPOSURE_SQUARE) {
@@ -208,21 +215,6 @@ pub fn pad_to_multiple(planes: Planes, multiple: usize) -> Planes {
     out
 }
 
-/// A rectangle of pixels, from column `x` and row `y`: undoes [`pad_to_multiple`] and cuts tiles.
-///
-/// # Panics
-/// If the rectangle leaves the planes.
-pub fn window(planes: &Planes, (x, y): (usize, usize), (width, height): (usize, usize)) -> Planes {
-    let mut out = Planes::new(planes.channels, width, height);
-    for c in 0..planes.channels {
-        let from = planes.channel(c);
-        for (row, out) in out.channel_mut(c).chunks_mut(width).enumerate() {
-            out.copy_from_slice(&from[(y + row) * planes.width + x..][..width]);
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -259,6 +251,6 @@ mod tests {
         let padded = pad_to_multiple(planes.clone(), 4);
         assert_eq!((padded.width, padded.height), (4, 4));
         assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
-        assert_eq!(window(&padded, (0, 0), (3, 1)), planes);
+        assert_eq!(padded.window((0, 0), (3, 1)), planes);
     }
 }

@@ -44,6 +44,22 @@ impl Planes {
         &mut self.data[c * n..][..n]
     }
 
+    /// A rectangle of pixels, from column `x` and row `y`: cuts tiles and undoes padding.
+    ///
+    /// # Panics
+    /// If the rectangle leaves the planes.
+    pub fn window(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Self {
+        assert!(x + width <= self.width && y + height <= self.height, "the rectangle lies inside");
+        let mut out = Self::new(self.channels, width, height);
+        for c in 0..self.channels {
+            let from = self.channel(c);
+            for (row, out) in out.channel_mut(c).chunks_mut(width.max(1)).enumerate() {
+                out.copy_from_slice(&from[(y + row) * self.width + x..][..width]);
+            }
+        }
+        out
+    }
+
     /// How many values are NaN or infinite.
     pub fn non_finite(&self) -> usize {
         self.data.iter().filter(|v| !v.is_finite()).count()

@@ -11,7 +11,7 @@ use std::{
 };
 
 use assert_cmd::Command;
-use common::files::{bits, read_exr, values};
+use common::files::{bits, data, read_exr, values};
 use demc::{
     metrics,
     models::{self, learned, network::Architecture},
@@ -147,6 +147,19 @@ fn the_readme_s_command_denoises_and_keeps_every_layer() {
     assert!(clean.relmse < 0.5 * noisy.relmse, "RelMSE {} of {} noisy", clean.relmse, noisy.relmse);
     assert!(clean.ssim.unwrap() > noisy.ssim.unwrap(), "SSIM {:?} of {:?} noisy", clean.ssim, noisy.ssim);
     assert!(clean.flip.unwrap() < noisy.flip.unwrap(), "FLIP {:?} of {:?} noisy", clean.flip, noisy.flip);
+}
+
+#[test]
+fn a_frame_of_many_samples_is_never_made_worse() {
+    let pair =
+        ["principled_0064spp.exr", "principled_ref.exr"].map(|name| passes::load(data(name), None).unwrap());
+    let [noisy, reference] = pair.each_ref().map(|set| set.require(Pass::Combined, "this test").unwrap());
+    let before = metrics::error::relmse(noisy, reference);
+    for model in ["demc-s", "demc-m"] {
+        let after =
+            metrics::error::relmse(&models::open(model).unwrap().denoise(&pair[0]).unwrap(), reference);
+        assert!(after < before, "{model}: RelMSE {before} became {after}");
+    }
 }
 
 #[test]

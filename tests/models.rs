@@ -1,15 +1,15 @@
 //! The networks as contracts: sizes of the paper's, reach and scaling of the built-in ones.
 
 use demc::{
-    features::Inputs,
+    features::{Inputs, pad_to_multiple},
     models::{
         self,
         demc::{Demc, PAPER_WIDTHS, semc_widths},
         kpcn::PUBLISHED_WIDTH,
-        network::{Architecture, Config, Network, run},
+        network::{Architecture, Config, Network, stack},
         weights_file::{self, Facts},
     },
-    nn::Rng,
+    nn::{Precision, Rng, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -94,7 +94,7 @@ fn every_network_takes_every_size_from_one_pixel_up() {
     for (name, config) in models::trainable() {
         let network = models::build(&config, 1);
         for (width, height) in [(1, 1), (3, 1), (1, 7), (33, 17)] {
-            let image = run(&*network, &random_passes(width, height, 4), None).expect("all passes are there");
+            let image = network.infer(&random_passes(width, height, 4), None).expect("all passes are there");
             assert_eq!((image.channels, image.width, image.height), (3, width, height), "{name}");
             assert_eq!(image.non_finite(), 0, "{name} at {width}x{height}");
         }
@@ -103,20 +103,66 @@ fn every_network_takes_every_size_from_one_pixel_up() {
 
 #[test]
 fn tiles_give_the_same_bits_as_the_whole_frame() {
-    for name in ["demc-s", "demc", "kpcn", "kpcn-combined", "lbf"] {
+    for name in ["demc", "kpcn", "kpcn-combined", "lbf"] {
         let mut config =
             models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
         config.widths.fill(8);
         let network = models::build(&config, 1);
         let passes = random_passes(1300, 40, 11);
-        let whole = run(&*network, &passes, Some(4096)).expect("all passes are there");
+        let whole = network.infer(&passes, Some(4096)).expect("all passes are there");
         for tile in [100, 333] {
             assert!(2 * network.reach() + tile < 1300, "no tile sees the whole frame");
             assert!(
-                run(&*network, &passes, Some(tile)).expect("all passes are there") == whole,
+                network.infer(&passes, Some(tile)).expect("all passes are there") == whole,
                 "{name}, {tile}"
             );
         }
+    }
+}
+
+#[test]
+fn bands_give_the_same_bits_as_the_whole_frame() {
+    let mut network = models::build(&Config { widths: vec![40, 20, 33, 8], ..trainable("demc-s") }, 3);
+    let (width, height) = (70, 731);
+    let passes = random_passes(width, height, 12);
+    for precision in [Precision::F32, Precision::Bf16] {
+        network.convolutions().into_iter().for_each(|conv| conv.set_precision(precision));
+        // The network's own forward pass over all of the frame is what the plan must equal.
+        let mut inputs = network.inputs(&passes).expect("all passes are there");
+        inputs.planes = inputs.planes.into_iter().map(|p| pad_to_multiple(p, network.multiple())).collect();
+        let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);
+        let whole = network.forward(&stack(&[inputs.clone()]), &mut Stats::Running).as_vec();
+        let mut whole = Planes::from_vec(3, w, h, whole).window((0, 0), (width, height));
+        whole.data.iter_mut().for_each(|v| *v *= inputs.scale);
+        network.freeze();
+        for rows in [Some(1), Some(48), Some(300), None] {
+            let image = network.infer(&passes, rows).expect("all passes are there");
+            assert!(image == whole, "bands of {rows:?} rows, {precision:?}");
+        }
+    }
+}
+
+#[test]
+fn folding_batch_norms_changes_nothing_but_rounding() {
+    let mut network = models::build(&Config { widths: vec![12, 9, 8, 8, 8], ..trainable("demc") }, 3);
+    let mut rng = Rng::new(2, 2);
+    for norm in network.batch_norms() {
+        for (param, (low, high)) in
+            norm.params().into_iter().zip([(0.5, 2.0), (-0.5, 0.5), (-0.5, 0.5), (0.1, 2.0)])
+        {
+            let values: Vec<f32> =
+                param.values().iter().map(|_| low + (high - low) * rng.uniform()).collect();
+            param.set(&values);
+        }
+    }
+    let passes = random_passes(64, 40, 5);
+    let plain = network.infer(&passes, None).expect("all passes are there");
+    network.freeze();
+    assert!(network.batch_norms().is_empty());
+    let folded = network.infer(&passes, None).expect("all passes are there");
+    let scale = plain.data.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    for (a, b) in folded.data.iter().zip(&plain.data) {
+        assert!((a - b).abs() <= 1e-4 * scale, "{a} for {b}");
     }
 }
 
@@ -127,7 +173,7 @@ fn a_missing_pass_is_named() {
         for &missing in network.passes() {
             let mut passes = random_passes(16, 16, 4);
             passes.remove(missing);
-            let error = run(&*network, &passes, None).expect_err("a pass is missing").to_string();
+            let error = network.infer(&passes, None).expect_err("a pass is missing").to_string();
             assert!(error.contains(&missing.to_string()) && error.contains("random.exr"), "{name}: {error}");
         }
     }
@@ -138,7 +184,7 @@ fn networks_that_filter_scale_with_their_input() {
     let passes = random_passes(40, 24, 9);
     for name in ["demc-s", "kpcn", "kpcn-combined", "lbf"] {
         let network = models::build(&trainable(name), 1);
-        let base = run(&*network, &passes, None).expect("all passes are there");
+        let base = network.infer(&passes, None).expect("all passes are there");
         for stops in [-8, -3, 5, 8] {
             let factor = 2f32.powi(stops);
             let mut scaled = passes.clone();
@@ -147,7 +193,7 @@ fn networks_that_filter_scale_with_their_input() {
                 radiance.data.iter_mut().for_each(|v| *v *= factor);
                 scaled.insert(pass, radiance);
             }
-            let image = run(&*network, &scaled, None).expect("all passes are there");
+            let image = network.infer(&scaled, None).expect("all passes are there");
             for (a, b) in image.data.iter().zip(&base.data) {
                 assert!((a / factor - b).abs() <= 0.01 * b.abs(), "{name}, 2^{stops}: {a} for {b}");
             }
@@ -191,7 +237,7 @@ fn kpcn_keeps_what_is_constant_in_each_stream() {
     }
     for name in ["kpcn", "kpcn-combined"] {
         let network = models::build(&trainable(name), 7);
-        let image = run(&*network, &passes, None).expect("all passes are there");
+        let image = network.infer(&passes, None).expect("all passes are there");
         assert!(image.data.iter().all(|v| (v - 2.0).abs() < 1e-3), "{name}: {:?}", &image.data[..8]);
     }
 }
@@ -200,9 +246,9 @@ fn kpcn_keeps_what_is_constant_in_each_stream() {
 fn light_that_kpcn_does_not_filter_is_optional() {
     let network = models::build(&trainable("kpcn"), 1);
     let mut passes = random_passes(20, 20, 2);
-    let with = run(&*network, &passes, None).expect("all passes are there");
+    let with = network.infer(&passes, None).expect("all passes are there");
     passes.remove(Pass::Emission);
-    let without = run(&*network, &passes, None).expect("emission may be missing");
+    let without = network.infer(&passes, None).expect("emission may be missing");
     assert!(with != without && without.non_finite() == 0);
 }
 
@@ -219,7 +265,7 @@ fn a_constant_image_stays_as_it_is() {
     let network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 4);
-    let image = run(&*network, &passes, None).expect("all passes are there");
+    let image = network.infer(&passes, None).expect("all passes are there");
     assert!(image.data.iter().all(|v| (v - 0.7).abs() < 1e-4), "{:?}", &image.data[..8]);
 }
 
@@ -254,7 +300,7 @@ fn a_wider_network_begins_as_the_narrower_one() {
     let held = weights_file::read_as(&path, &narrow, 1).unwrap();
     let wider = weights_file::read_as(&path, &wide, 1).unwrap();
     assert_eq!(wider.config(), wide);
-    let (a, b) = (run(&*held, &passes, None).unwrap(), run(&*wider, &passes, None).unwrap());
+    let (a, b) = (held.infer(&passes, None).unwrap(), wider.infer(&passes, None).unwrap());
     for (a, b) in a.data.iter().zip(&b.data) {
         assert!((a - b).abs() <= 1e-4 * a.abs(), "{a} became {b}");
     }

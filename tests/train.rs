@@ -214,6 +214,30 @@ fn the_rivals_train_and_their_weights_denoise_and_are_scored() {
 }
 
 #[test]
+fn kpcn_filters_diffuse_and_specular_apart_where_blender_wrote_light_passes() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let blender = format!("{}/tests/data/blender5.exr", env!("CARGO_MANIFEST_DIR"));
+    for scene in ["train/a", "val/b"] {
+        for end in ["0004spp", "ref"] {
+            let to = dir.path().join(format!("{scene}_{end}.exr"));
+            fs::create_dir_all(to.parent().expect("a folder")).expect("a folder");
+            fs::copy(&blender, to).expect("a copy");
+        }
+    }
+    let out = dir.path().join("run");
+    let mut command = Command::new(cargo_bin("demc"));
+    command
+        .args(["train", "--model", "kpcn", "--widths", "8", "--steps", "2", "--batch", "1", "--patch", "24"]);
+    command.arg("--data").arg(dir.path().join("train")).arg("--val").arg(dir.path().join("val"));
+    run(command.arg("--out").arg(&out)).success();
+    let mut denoise = Command::new(cargo_bin("demc"));
+    denoise.args(["denoise", &blender, "--out"]).arg(dir.path().join("images"));
+    run(denoise.arg("--model").arg(out.join("best.safetensors")))
+        .success()
+        .stderr(predicate::str::contains("diffuse and specular light are filtered apart"));
+}
+
+#[test]
 fn a_method_without_weights_says_how_to_get_them() {
     let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
     let mut denoise = Command::new(cargo_bin("demc"));

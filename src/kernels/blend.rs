@@ -1,8 +1,8 @@
 //! Blending the levels of a filtered pyramid, planar f32, one image at a time.
 //!
-//! `fine + sigmoid(alpha) * up(coarse - down(fine))`, with `down` the mean of 2x2: the coarse level
-//! replaces the low frequencies of the fine one and leaves its detail (Vogels et al. 2018, Section 4.3,
-//! with a mask for each pixel). `up` weighs the four nearest coarse pixels: bilinearly, times the
+//! `fine + sigmoid(alpha) * up(correction)`: what filtering changed in the level below, the correction,
+//! replaces the low frequencies of the fine level and leaves its detail (after Vogels et al. 2018,
+//! Section 4.3, with a mask for each pixel). `up` weighs the four nearest coarse pixels: bilinearly, times the
 //! exponential of what the network predicts for each, so that light does not leak over an edge (Balint et
 //! al. 2023 predict the whole upsampling kernel).
 
@@ -57,46 +57,46 @@ pub struct Masks<'a> {
     pub corners: &'a [f32],
 }
 
-/// Blends a coarse level (3, H/2, W/2) into a fine one (3, H, W).
-///
-/// `difference` (3, H/2, W/2) gets `coarse - down(fine)`.
+/// Which rows of a taller frame are blended.
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    /// The frame's row that the fine level's first is.
+    pub first: usize,
+    /// Rows of the frame.
+    pub total: usize,
+    /// The coarse frame's row that the correction's first is; every coarse row next to a fine one is there.
+    pub coarse: usize,
+}
+
+/// Adds a correction (3, h, W/2) to a fine level (3, H, W), where h is H/2 if that is all of the frame.
 ///
 /// # Panics
 /// If lengths do not fit.
 pub fn blend(
     size: Size,
-    (fine, coarse): (&[f32], &[f32]),
+    place: Place,
+    (fine, correction): (&[f32], &[f32]),
     masks: Masks,
-    difference: &mut [f32],
     output: &mut [f32],
 ) {
-    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
-    assert_eq!((fine.len(), coarse.len()), (3 * n, 3 * h * w));
+    let n = size.pixels();
+    assert_eq!((fine.len(), output.len(), correction.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
     assert_eq!((masks.alpha.len(), masks.corners.len()), (n, CORNERS * n));
-    assert_eq!((difference.len(), output.len()), (coarse.len(), fine.len()));
-    difference.par_chunks_mut(w).enumerate().for_each(|(i, row)| {
-        let (c, y) = (i / h, i % h);
-        let fine = &fine[c * n + 2 * y * size.w..][..2 * size.w];
-        for (x, (out, coarse)) in row.iter_mut().zip(&coarse[i * w..][..w]).enumerate() {
-            let sum = fine[2 * x] + fine[2 * x + 1] + fine[size.w + 2 * x] + fine[size.w + 2 * x + 1];
-            *out = coarse - 0.25 * sum;
-        }
-    });
-    let difference = &*difference;
     let (red, rest) = output.split_at_mut(n);
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
     rows.enumerate().for_each(|(y, ((red, green), blue))| {
-        Tier::detect().run(Row { size, y, fine, difference, masks, output: [red, green, blue] });
+        Tier::detect().run(Row { size, place, y, fine, correction, masks, output: [red, green, blue] });
     });
 }
 
 /// One row of a blend.
 struct Row<'a> {
     size: Size,
+    place: Place,
     y: usize,
     fine: &'a [f32],
-    difference: &'a [f32],
+    correction: &'a [f32],
     masks: Masks<'a>,
     output: [&'a mut [f32]; 3],
 }
@@ -104,9 +104,10 @@ struct Row<'a> {
 impl Kernel for Row<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { size, y, fine, difference, masks, output } = self;
-        let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
-        let (own, other) = near(y, h);
+        let Self { size, place, y, fine, correction, masks, output } = self;
+        let (w, n) = (size.w / 2, size.pixels());
+        let h = correction.len() / (3 * w).max(1);
+        let (own, other) = near(place.first + y, place.total / 2);
         let row = |values: &'_ [f32], plane: usize| -> std::ops::Range<usize> {
             debug_assert!(values.len() >= (plane + 1) * n);
             plane * n + y * size.w..plane * n + (y + 1) * size.w
@@ -125,11 +126,11 @@ impl Kernel for Row<'_> {
         for (x, share) in share[..size.w].iter_mut().enumerate() {
             *share = sigmoid(alpha[x]) / (w0[x] + w1[x] + w2[x] + w3[x]);
         }
-        // Each corner's difference, drawn out to the fine row.
+        // Each corner's correction, drawn out to the fine row.
         let mut drawn: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
         for (c, output) in output.into_iter().enumerate() {
-            for (pair, coarse) in [own, other].into_iter().enumerate() {
-                let coarse = &difference[(c * h + coarse) * w..][..w];
+            for (pair, coarse) in [own - place.coarse, other - place.coarse].into_iter().enumerate() {
+                let coarse = &correction[(c * h + coarse) * w..][..w];
                 for x in 0..w {
                     let (left, right) = (coarse[x.saturating_sub(1)], coarse[(x + 1).min(w - 1)]);
                     drawn[2 * pair][2 * x..2 * x + 2].fill(coarse[x]);
@@ -151,8 +152,8 @@ impl Kernel for Row<'_> {
 pub struct BlendGradient<'a> {
     /// To the fine level, (3, H, W).
     pub fine: &'a mut [f32],
-    /// To the coarse level, (3, H/2, W/2).
-    pub coarse: &'a mut [f32],
+    /// To the correction, (3, H/2, W/2).
+    pub correction: &'a mut [f32],
     /// To the share's logit, (1, H, W).
     pub alpha: &'a mut [f32],
     /// To the corners' logits, (4, H, W).
@@ -166,46 +167,33 @@ pub struct BlendGradient<'a> {
 pub fn blend_gradient(
     size: Size,
     masks: Masks,
-    difference: &[f32],
+    correction: &[f32],
     output_gradient: &[f32],
     into: BlendGradient,
 ) {
-    let (h, w, n) = (size.h / 2, size.w / 2, size.pixels());
-    assert_eq!((masks.alpha.len(), difference.len(), output_gradient.len()), (n, 3 * h * w, 3 * n));
-    let mut sent = vec![0.0; 3 * h * w];
+    let (quarter, n) = (size.pixels() / 4, size.pixels());
+    assert_eq!((masks.alpha.len(), correction.len(), output_gradient.len()), (n, 3 * quarter, 3 * n));
     for y in 0..size.h {
         for x in 0..size.w {
             let at = y * size.w + x;
             let share = sigmoid(masks.alpha[at]);
             let (corners, weights) = (corners(size, y, x), weights(masks.corners, n, at));
-            // What a unit of each corner's weight, and the upsampled difference, would change.
+            // What a unit of each corner's weight, and the upsampled correction, would change.
             let (mut by_weight, mut by_share) = ([0.0; CORNERS], 0.0);
             for c in 0..3 {
                 let g = output_gradient[c * n + at];
                 into.fine[c * n + at] += g;
                 for i in 0..CORNERS {
-                    let d = difference[c * h * w + corners[i]];
-                    by_weight[i] += g * share * d;
-                    by_share += g * weights[i] * d;
-                    sent[c * h * w + corners[i]] += weights[i] * g * share;
+                    let from = c * quarter + corners[i];
+                    by_weight[i] += g * share * correction[from];
+                    by_share += g * weights[i] * correction[from];
+                    into.correction[from] += weights[i] * g * share;
                 }
             }
             into.alpha[at] += by_share * share * (1.0 - share);
             let mean: f32 = (0..CORNERS).map(|i| weights[i] * by_weight[i]).sum();
             for i in 0..CORNERS {
                 into.corners[i * n + at] += weights[i] * (by_weight[i] - mean);
-            }
-        }
-    }
-    for c in 0..3 {
-        for y in 0..h {
-            for x in 0..w {
-                let g = sent[c * h * w + y * w + x];
-                into.coarse[c * h * w + y * w + x] += g;
-                let at = c * n + 2 * y * size.w + 2 * x;
-                for i in [at, at + 1, at + size.w, at + size.w + 1] {
-                    into.fine[i] -= 0.25 * g;
-                }
             }
         }
     }

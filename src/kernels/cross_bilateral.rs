@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{Size, exp},
+    filter::{Size, each_row, exp},
     simd::{Kernel, Simd, Tier},
 };
 
@@ -65,16 +65,7 @@ impl CrossBilateral<'_> {
         self.check();
         let (n, w) = (self.size.pixels(), self.size.w);
         assert_eq!((output.len(), total.len()), (3 * n, n));
-        let (r, rest) = output.split_at_mut(n);
-        let (g, b) = rest.split_at_mut(n);
-        r.par_chunks_mut(w)
-            .zip(g.par_chunks_mut(w))
-            .zip(b.par_chunks_mut(w))
-            .zip(total.par_chunks_mut(w))
-            .enumerate()
-            .for_each(|(y, (((r, g), b), total))| {
-                tier.run(Forward { filter: &self, y, output: [r, g, b], total });
-            });
+        each_row(w, output, total, |y, output, total| tier.run(Forward { filter: &self, y, output, total }));
     }
 
     /// Adds to `into` (2 + groups, H, W) what the output's gradient (3, H, W) sends back to the

@@ -31,13 +31,15 @@ impl Size {
 /// One image to be filtered: everything the forward pass reads.
 #[derive(Clone, Copy)]
 pub struct Filter<'a> {
-    /// Rows and columns.
+    /// Rows and columns of the image.
     pub size: Size,
+    /// The rows to filter, R of them: all, or those of a band whose neighbours the image holds too.
+    pub rows: (usize, usize),
     /// Kernel size, odd.
     pub k: usize,
     /// The image, (3, H, W).
     pub image: &'a [f32],
-    /// Kernel logits, (k*k, H, W).
+    /// Kernel logits, (k*k, R, W).
     pub logits: &'a [f32],
     /// Confidence of each pixel, (1, H, W), or nothing for equal trust.
     pub confidence: Option<&'a [f32]>,
@@ -80,20 +82,43 @@ fn columns(w: usize, dx: isize) -> (usize, usize) {
     ((-dx).max(0) as usize, (w as isize - dx.max(0)) as usize)
 }
 
+/// Runs `work(row, its red, green and blue, its sums)` on every row of `w` pixels of `output` (3, H, W) and
+/// `total` (1, H, W).
+pub(super) fn each_row(
+    w: usize,
+    output: &mut [f32],
+    total: &mut [f32],
+    work: impl Fn(usize, [&mut [f32]; 3], &mut [f32]) + Sync,
+) {
+    let (r, rest) = output.split_at_mut(total.len());
+    let (g, b) = rest.split_at_mut(total.len());
+    let rows = r.par_chunks_mut(w).zip(g.par_chunks_mut(w)).zip(b.par_chunks_mut(w));
+    rows.zip(total.par_chunks_mut(w))
+        .enumerate()
+        .for_each(|(y, (((r, g), b), total))| work(y, [r, g, b], total));
+}
+
 impl<'a> Filter<'a> {
     fn check(&self) {
         let n = self.size.pixels();
         assert!(self.k % 2 == 1, "kernels have a centre");
-        assert_eq!((self.image.len(), self.logits.len()), (3 * n, self.k * self.k * n));
+        assert!(self.rows.0 <= self.rows.1 && self.rows.1 <= self.size.h, "only rows of the image");
+        assert_eq!((self.image.len(), self.logits.len()), (3 * n, self.k * self.k * self.filtered()));
         assert!(self.confidence.is_none_or(|c| c.len() == n));
     }
 
-    /// Calls `visit(tap, neighbour row, dx)` for every tap whose row lies inside the image.
+    /// Pixels that are filtered.
+    fn filtered(&self) -> usize {
+        (self.rows.1 - self.rows.0) * self.size.w
+    }
+
+    /// Calls `visit(tap, neighbour row, dx)` for every tap of row `y` of those filtered whose row lies
+    /// inside the image.
     #[inline(always)]
     fn taps(&self, y: usize, mut visit: impl FnMut(usize, usize, isize)) {
         let r = (self.k / 2) as isize;
         for ky in 0..self.k {
-            let row = y as isize + ky as isize - r;
+            let row = (self.rows.0 + y + ky) as isize - r;
             if row < 0 || row >= self.size.h as isize {
                 continue;
             }
@@ -107,12 +132,12 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// The unnormalised weights of one tap along row `y`, columns `x0..x1`.
+    /// The unnormalised weights of one tap along row `y` of those filtered, columns `x0..x1`.
     #[inline(always)]
     fn weights(&self, y: usize, tap: usize, row: usize, dx: isize, out: &mut [f32]) -> (usize, usize) {
         let Size { w, .. } = self.size;
         let (x0, x1) = columns(w, dx);
-        let logits = &self.logits[tap * self.size.pixels() + y * w..][x0..x1];
+        let logits = &self.logits[tap * self.filtered() + y * w..][x0..x1];
         let out = &mut out[x0..x1];
         match self.confidence {
             Some(confidence) => {
@@ -126,31 +151,22 @@ impl<'a> Filter<'a> {
         (x0, x1)
     }
 
-    /// Filters the image: `output` (3, H, W), `total` (1, H, W) the sum of each pixel's weights.
+    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights.
     ///
     /// # Panics
     /// If lengths do not fit the size.
     pub fn apply(self, tier: Tier, output: &mut [f32], total: &mut [f32]) {
         self.check();
-        let (n, w) = (self.size.pixels(), self.size.w);
+        let (n, w) = (self.filtered(), self.size.w);
         assert_eq!((output.len(), total.len()), (3 * n, n));
-        let (r, rest) = output.split_at_mut(n);
-        let (g, b) = rest.split_at_mut(n);
-        r.par_chunks_mut(w)
-            .zip(g.par_chunks_mut(w))
-            .zip(b.par_chunks_mut(w))
-            .zip(total.par_chunks_mut(w))
-            .enumerate()
-            .for_each(|(y, (((r, g), b), total))| {
-                tier.run(Forward { filter: &self, y, output: [r, g, b], total });
-            });
+        each_row(w, output, total, |y, output, total| tier.run(Forward { filter: &self, y, output, total }));
     }
 
     /// Adds what the output's gradient (3, H, W) sends back; `output` and `total` are those of
-    /// [`Filter::apply`].
+    /// [`Filter::apply`] to all rows.
     ///
     /// # Panics
-    /// If lengths do not fit the size.
+    /// If lengths do not fit the size, or not all rows are filtered.
     pub fn gradient(
         self,
         tier: Tier,
@@ -160,6 +176,7 @@ impl<'a> Filter<'a> {
     ) {
         self.check();
         let n = self.size.pixels();
+        assert_eq!(self.filtered(), n, "gradients are those of whole images");
         assert_eq!((output.len(), total.len(), output_gradient.len()), (3 * n, n, 3 * n));
         assert_eq!(into.logits.len(), self.logits.len());
         assert!(into.image.as_ref().is_none_or(|i| i.len() == 3 * n));
@@ -269,29 +286,21 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
     );
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
     let n = size.pixels();
-    let (r, rest) = output.split_at_mut(h * w);
-    let (g, b) = rest.split_at_mut(h * w);
-    r.par_chunks_mut(w)
-        .zip(g.par_chunks_mut(w))
-        .zip(b.par_chunks_mut(w))
-        .zip(total.par_chunks_mut(w))
-        .enumerate()
-        .for_each(|(y, (((r, g), b), total))| {
-            let at = 2 * y * size.w;
-            let weights: Vec<f32> = confidence[at..][..2 * size.w].iter().map(|c| exp(*c)).collect();
-            let square =
-                |v: &[f32], x: usize| [v[2 * x], v[2 * x + 1], v[size.w + 2 * x], v[size.w + 2 * x + 1]];
-            for (x, total) in total.iter_mut().enumerate() {
-                *total = square(&weights, x).iter().sum();
+    each_row(w, output, total, |y, output, total| {
+        let at = 2 * y * size.w;
+        let weights: Vec<f32> = confidence[at..][..2 * size.w].iter().map(|c| exp(*c)).collect();
+        let square = |v: &[f32], x: usize| [v[2 * x], v[2 * x + 1], v[size.w + 2 * x], v[size.w + 2 * x + 1]];
+        for (x, total) in total.iter_mut().enumerate() {
+            *total = square(&weights, x).iter().sum();
+        }
+        for (c, out) in output.into_iter().enumerate() {
+            let image = &image[c * n + at..][..2 * size.w];
+            for (x, out) in out.iter_mut().enumerate() {
+                let (v, k) = (square(image, x), square(&weights, x));
+                *out = (v[0] * k[0] + v[1] * k[1] + v[2] * k[2] + v[3] * k[3]) / total[x];
             }
-            for (c, out) in [r, g, b].into_iter().enumerate() {
-                let image = &image[c * n + at..][..2 * size.w];
-                for (x, out) in out.iter_mut().enumerate() {
-                    let (v, k) = (square(image, x), square(&weights, x));
-                    *out = (v[0] * k[0] + v[1] * k[1] + v[2] * k[2] + v[3] * k[3]) / total[x];
-                }
-            }
-        });
+        }
+    });
 }
 
 /// Adds what [`reduce`]'s output gradient sends back to image and confidence.

@@ -17,6 +17,7 @@ pub mod conv;
 pub mod cross_bilateral;
 pub mod filter;
 pub mod layout;
+pub mod memory;
 pub mod peak;
 pub mod pool;
 pub mod simd;

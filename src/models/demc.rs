@@ -6,16 +6,17 @@
 //! straight into the feature encoder (Section 4.3).
 
 use dfdx::{
-    tensor::{Cpu, Merge, NoneTape, Tape},
-    tensor_ops::powf,
+    tensor::{Cpu, Merge, NoneTape, Tape, WithEmptyTape},
+    tensor_ops::{abs, exp, ln, powf, relu},
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate, run_tiled};
 use crate::{
     Result,
     features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
     nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
+    planes::Planes,
 };
 
 /// Channels at each level in the paper.
@@ -24,9 +25,13 @@ pub const PAPER_WIDTHS: [usize; 5] = [64, 128, 256, 512, 512];
 /// Channels of the detail map.
 const DETAIL: usize = 3;
 
-/// The bias of the last layer at the start: ReLU is its activation as everywhere in the paper, and an
-/// output that begins at or below zero would never learn.
+/// The bias of the last layer at the start, and its weights in units of Xavier's: the first outputs are dark
+/// grey. Xavier's own begin so bright that RelMSE's first steps overshoot to black.
 const OUTPUT_BIAS: f32 = 0.2;
+const OUTPUT_GAIN: f32 = 0.1;
+
+/// How sharply the last activation bends: it is within `ln 2` of this part of a ReLU.
+const SHARPNESS: f32 = 16.0;
 
 /// The trained parameters of a network of these widths.
 pub fn parameters(architecture: Architecture, widths: &[usize]) -> usize {
@@ -103,7 +108,8 @@ pub struct Demc {
 #[derive(Clone)]
 struct Fusion {
     first: Conv,
-    middle: Vec<(Conv, BatchNorm)>,
+    /// A folded convolution has no batch norm.
+    middle: Vec<(Conv, Option<BatchNorm>)>,
     last: Conv,
 }
 
@@ -129,7 +135,8 @@ impl Fusion {
             middle: (1..3)
                 .map(|i| {
                     let name = format!("fusion.{i}");
-                    (conv(&name, width, width).linear(), BatchNorm::new(&format!("{name}.norm"), width))
+                    let norm = BatchNorm::new(&format!("{name}.norm"), width);
+                    (conv(&name, width, width).linear(), Some(norm))
                 })
                 .collect(),
             last: conv("fusion.3", width, DETAIL),
@@ -140,7 +147,10 @@ impl Fusion {
     fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, x: Activation<T>, stats: &mut Stats) -> Activation<T> {
         let mut x = self.first.forward(vec![x]);
         for (conv, norm) in &self.middle {
-            x = norm.forward(conv.forward(vec![x]), stats);
+            x = conv.forward(vec![x]);
+            if let Some(norm) = norm {
+                x = norm.forward(x, stats);
+            }
         }
         self.last.forward(vec![x])
     }
@@ -211,7 +221,8 @@ impl Demc {
             }
         });
         let decoder = decoder.collect();
-        let output = Conv::new(rng, "output", &[widths[0]], 3, 1, Init::Xavier).with_bias(OUTPUT_BIAS);
+        let output = Conv::new(rng, "output", &[widths[0]], 3, 1, Init::Scaled(OUTPUT_GAIN));
+        let output = output.linear().with_bias(OUTPUT_BIAS);
         Self { config: Config { architecture, widths: widths.into() }, fusion, encoders, decoder, output }
     }
 
@@ -251,7 +262,7 @@ impl Demc {
             x = level.fuse.forward(sources); // Eq. 2: (N, 3K, H, W) -> (N, K, H, W)
         }
         let compressed = self.output.forward(vec![x]); // (N, K, H, W) -> (N, 3, H, W)
-        powf(compressed.into_images(), GAMMA)
+        powf(softplus(compressed.into_images()), GAMMA)
     }
 
     /// The extent of the latent, (channels, rows, columns), for a frame of `width` x `height`.
@@ -278,6 +289,12 @@ impl Demc {
         let decoder = decoder.flat_map(|(level, l)| [(&l.up, level), (&l.fuse, level)]);
         fusion.chain(encoders).chain(decoder).chain([(&self.output, 0)])
     }
+}
+
+/// `ln(1 + e^(S x)) / S`: a ReLU that a step too far does not leave without a gradient.
+fn softplus<T: Tape<f32, Cpu> + Merge<T>>(x: Images<T>) -> Images<T> {
+    let bend = ln(exp(abs(x.with_empty_tape()) * -SHARPNESS) + 1.0) / SHARPNESS;
+    relu(x) + bend
 }
 
 impl Network for Demc {
@@ -316,7 +333,7 @@ impl Network for Demc {
             params.extend(fusion.first.params());
             for (conv, norm) in &mut fusion.middle {
                 params.extend(conv.params());
-                params.extend(norm.params());
+                params.extend(norm.iter_mut().flat_map(BatchNorm::params));
             }
             params.extend(fusion.last.params());
         }
@@ -331,8 +348,17 @@ impl Network for Demc {
         params
     }
 
+    fn freeze(&mut self) {
+        for (conv, norm) in self.fusion.iter_mut().flat_map(|f| &mut f.middle) {
+            if let Some(norm) = norm.take() {
+                conv.fold(&norm);
+            }
+        }
+        self.convolutions().into_iter().for_each(Conv::freeze);
+    }
+
     fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
-        self.fusion.iter_mut().flat_map(|f| f.middle.iter_mut().map(|m| &mut m.1)).collect()
+        self.fusion.iter_mut().flat_map(|f| f.middle.iter_mut().filter_map(|m| m.1.as_mut())).collect()
     }
 
     fn forward(&self, batch: &Batch, stats: &mut Stats) -> Images {
@@ -351,6 +377,10 @@ impl Network for Demc {
         // Three 3x3 convolutions and a pool a level on the way down, a 4x4 upsampling on the way up.
         let fusion = if self.fusion.is_some() { 4 } else { 0 };
         fusion + (0..self.config.widths.len()).map(|level| (3 + 1 + 2) << level).sum::<usize>()
+    }
+
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

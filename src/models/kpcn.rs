@@ -3,8 +3,8 @@
 //!
 //! In: `features::kpcn_streams` where a file holds Cycles' diffuse light passes, else
 //! `features::kpcn_combined`. Out: radiance. A stream is nine 5x5 convolutions that predict, for each
-//! pixel, a softmax kernel over 21x21 pixels (Section 4.2); diffuse light is filtered without its
-//! albedo, specular light as a logarithm (Section 4.3).
+//! pixel, a softmax kernel over 21x21 pixels; diffuse light is filtered without its albedo, specular light
+//! as a logarithm.
 //!
 //! Departures: (1) variance comes from neighbouring pixels, since Cycles writes none of its samples;
 //! (2) exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate, run_tiled};
 use crate::{
     Result,
     features::{
@@ -28,9 +28,10 @@ use crate::{
     kernels::Shape,
     nn::{Activation, Conv, Field, Images, Init, Param, Rng, Stats},
     passes::{Pass, PassSet},
+    planes::Planes,
 };
 
-/// Channels of the hidden layers as published (Section 5.2).
+/// Channels of the hidden layers as published.
 pub const PUBLISHED_WIDTH: usize = 100;
 
 /// Convolutions of a stream, and their taps in a row.
@@ -84,7 +85,7 @@ impl Stream {
             x = layer.forward(vec![x]); // (N, 34, H, W) -> (N, K, H, W) -> ... -> (N, 441, H, W)
         }
         let logits = Field::from_activation(x, 0, KERNEL * KERNEL, 1);
-        field(image).filter(KERNEL, logits, None) // Section 4.2
+        field(image).filter(KERNEL, logits, None)
     }
 }
 
@@ -118,7 +119,7 @@ impl Kpcn {
                 let constant = |planes| field::<NoneTape>(planes).into_images();
                 let diffuse = of_diffuse.filter::<T>(diffuse, input_d).into_images() * constant(colour);
                 let specular = of_specular.filter::<T>(specular, input_s).into_images();
-                // Section 4.3: both halves of the decomposition are undone.
+                // The decomposition and both transfers are undone.
                 diffuse + (exp(specular) - 1.0) + constant(unfiltered)
             }
             _ => unreachable!("`inputs` makes the planes of these streams"),
@@ -193,6 +194,10 @@ impl Network for Kpcn {
 
     fn reach(&self) -> usize {
         LAYERS * (TAPS / 2) + KERNEL / 2
+    }
+
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

@@ -2,27 +2,30 @@
 //! TOG 34:4).
 //!
 //! In: `features::lbf`. Out: radiance, filtered by a cross-bilateral filter whose parameters a small
-//! perceptron chooses for each pixel from the secondary features (Section 3). Both are trained end to
+//! perceptron chooses for each pixel from the secondary features (Sections 3.3 and 4.1). Both are trained end to
 //! end: the loss is that of the filtered image, and its gradient passes through the filter.
 //!
 //! Departures: (1) the window is 21x21, not 55x55, which takes a seventh of the time; (2) deviations
 //! come from neighbouring pixels, since Cycles writes none of its samples, and there is no visibility
-//! feature; (3) files do not tell the sampling rate, which is left out of the secondary features; (4) the
-//! perceptron gives precisions, the inverse squares of the published bandwidths, so that 0 switches a
-//! feature off; (5) exposure is normalised and colour statistics are of its logarithm; (6) Adam trains
-//! it, not RPROP, with any of `demc train`'s losses; (7) no spikes are removed afterwards.
+//! feature; (3) files do not tell the sampling rate, which is left out of the secondary features; (4) those
+//! describe colour too, and their median deviation is that of 3x3 pixels, not of wavelet details; (5) the
+//! weight of colour is learned like the others, not fixed; variances are summed over channels before
+//! distances are divided by them; features are not prefiltered; (6) exposure is normalised and colour
+//! statistics are of its logarithm; (7) Adam trains it, with any of `demc train`'s losses; (8) no spikes
+//! are removed afterwards.
 
 use dfdx::{
     tensor::{Cpu, Merge, NoneTape, Tape, TensorFromVec},
     tensor_ops::{clamp, exp, ln, sigmoid},
 };
 
-use super::network::{Batch, Config, Network, Taped, duplicate};
+use super::network::{Batch, Config, Network, Taped, duplicate, run_tiled};
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
     nn::{Activation, Conv, Guides, Images, Init, Param, Rng, Stats, cross_bilateral},
     passes::{Pass, PassSet},
+    planes::Planes,
 };
 
 /// Hidden units as published.
@@ -128,6 +131,10 @@ impl Network for Lbf {
 
     fn reach(&self) -> usize {
         RADIUS
+    }
+
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

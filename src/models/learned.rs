@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{
     Denoiser,
-    network::{self, Network},
+    network::Network,
     weights_file::{self, Metadata},
 };
 use crate::{
@@ -55,8 +55,8 @@ impl Learned {
         self.name = name.to_string();
         for conv in self.network.convolutions() {
             conv.set_precision(precision);
-            conv.freeze();
         }
+        self.network.freeze();
         self
     }
 
@@ -84,10 +84,10 @@ impl Denoiser for Learned {
     }
 
     fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        network::run(&*self.network, passes, None)
+        self.network.infer(passes, None)
     }
 
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        network::run(&*self.network, passes, tile)
+        self.network.infer(passes, tile)
     }
 }

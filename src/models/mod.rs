@@ -151,8 +151,8 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     let kpcn = |architecture| Config { architecture, widths: vec![32] };
     vec![
         ("demc-s", pyramid([32, 48, 64, 80])),
-        ("demc-m", pyramid([64, 80, 96, 112])),
-        ("demc-l", pyramid([96, 128, 160, 160])),
+        ("demc-m", pyramid([96, 96, 96, 112])),
+        ("demc-l", pyramid([128, 144, 160, 160])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Result,
-    features::{Inputs, pad_to_multiple, window},
+    features::{Inputs, pad_to_multiple},
     kernels::Shape,
     nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
     passes::{Pass, PassSet},
@@ -114,6 +114,12 @@ pub trait Network: Send + Sync {
         Vec::new()
     }
 
+    /// Plans for inference: folds batch norms into convolutions and packs weights once. Its parameters are
+    /// then no longer those that were trained.
+    fn freeze(&mut self) {
+        self.convolutions().into_iter().for_each(Conv::freeze);
+    }
+
     /// Its batch-norm layers, in the order in which a forward pass records their statistics.
     fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {
         Vec::new()
@@ -130,6 +136,13 @@ pub trait Network: Send + Sync {
 
     /// How far, in pixels, an output pixel can see to either side.
     fn reach(&self) -> usize;
+
+    /// Denoised radiance of a frame, (3, H, W), worked on in parts of `tile` rows (and columns, where the
+    /// network wants squares), whatever their size to the same bits.
+    ///
+    /// # Errors
+    /// A pass is missing.
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes>;
 
     /// A copy with its own parameters.
     fn duplicate(&self) -> Box<dyn Network>;
@@ -148,12 +161,12 @@ pub(super) fn duplicate(network: &(impl Network + Clone + 'static)) -> Box<dyn N
 /// than a workstation has.
 const WHOLE_FRAME_PIXELS: usize = 8 << 20;
 
-/// Denoised radiance of a frame, (3, H, W), at once or in tiles of `tile` rows and columns. Every tile
+/// [`Network::infer`] for any network: radiance, (3, H, W), at once or in tiles of `tile` rows and columns. Every tile
 /// sees as far beyond its edge as the network reaches, so the result is the same, bit for bit.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+pub(super) fn run_tiled(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
     let multiple = network.multiple();
     let mut inputs = network.inputs(passes)?;
     inputs.planes = inputs.planes.into_iter().map(|planes| pad_to_multiple(planes, multiple)).collect();
@@ -181,7 +194,7 @@ pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Resu
                 .map(|planes| {
                     // A frame in one piece is not needed again.
                     let whole = seen == (width, height);
-                    let seen = if whole { std::mem::take(planes) } else { window(planes, (x0, y0), seen) };
+                    let seen = if whole { std::mem::take(planes) } else { planes.window((x0, y0), seen) };
                     (Shape::new(1, seen.channels, seen.height, seen.width), seen.data)
                 })
                 .collect();
@@ -196,5 +209,5 @@ pub fn run(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Resu
             }
         }
     }
-    Ok(window(&image, (0, 0), (passes.width, passes.height)))
+    Ok(image.window((0, 0), (passes.width, passes.height)))
 }

@@ -3,11 +3,15 @@
 //! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
 //! follows what measurement favoured: the trunk works on 2x2 squares (space to depth), and each level
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
-//! al. 2018). Radiance is divided by albedo first and multiplied by a filtered albedo last, so texture
-//! is never blurred with the noise, and noise in the albedo (depth of field, 4 spp edges) is removed.
-//! A confidence for every pixel and level lets a firefly take itself out of all kernels at once.
+//! al. 2018), after it was corrected by what filtering changed in the level below: a level's own kernels
+//! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
+//! by a filtered albedo last, so texture is never blurred with the noise, and noise in the albedo (depth
+//! of field, 4 spp edges) is removed. A confidence for every pixel and level lets a firefly take itself
+//! out of all kernels at once.
 //!
 //! A network that outputs kernels cannot invent a colour, and scales with its input exactly.
+
+mod bands;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
@@ -18,6 +22,7 @@ use crate::{
     kernels::blend::CORNERS,
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
+    planes::Planes,
 };
 
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
@@ -32,10 +37,11 @@ const ALBEDO_KERNEL: usize = 3;
 /// Channels of a radiance level's head: kernel, confidence, and the mask that blends the level below.
 const HEAD: usize = KERNEL * KERNEL + 2;
 
-/// Channels of the full-resolution head for one pixel, and of a trunk level's: the former's albedo kernel,
-/// and the corners from which the level below is upsampled.
-const FULL_HEAD: usize = HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL + CORNERS;
+/// Channels of a trunk level's head: also the corners from which the level below is upsampled.
 const LEVEL_HEAD: usize = HEAD + CORNERS;
+
+/// Channels of the full-resolution head for one pixel: also the albedo kernel.
+const FULL_HEAD: usize = LEVEL_HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -73,6 +79,33 @@ struct Level {
     up: Option<Conv>,
     fuse: Conv,
     refine: Conv,
+}
+
+/// What a head says of one level of the radiance pyramid.
+struct Prediction<T> {
+    /// Logits of the kernels, (N, 25, H, W).
+    kernel: Field<T>,
+    /// How far each pixel is to be trusted, (N, 1, H, W).
+    confidence: Field<T>,
+    /// The share of the level below before its logistic, (N, 1, H, W).
+    mask: Field<T>,
+    /// Logits of the corners from which that level is upsampled, (N, 4, H, W).
+    corners: Field<T>,
+}
+
+impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
+    /// Parts a head's channels; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
+    /// `between` are the channels before the corners that are not of this.
+    fn split(head: Activation<T>, factor: usize, between: usize) -> Self {
+        let area = factor * factor;
+        let taps = KERNEL * KERNEL * area;
+        Self {
+            kernel: Field::from_activation(head.fork(), 0, taps, factor),
+            confidence: Field::from_activation(head.fork(), taps, area, factor),
+            mask: Field::from_activation(head.fork(), taps + area, area, factor),
+            corners: Field::from_activation(head, HEAD * area + between, CORNERS * area, factor),
+        }
+    }
 }
 
 impl Encoder {
@@ -169,39 +202,41 @@ impl Pyramid {
         }
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
-        // Kernel, confidence and mask of every pyramid level, full resolution first.
-        let split = |head: Activation<T>, factor: usize| {
-            let area = factor * factor;
-            let taps = KERNEL * KERNEL * area;
-            let corners = head.shape().c - CORNERS * area;
-            let kernel = Field::from_activation(head.fork(), 0, taps, factor);
-            let confidence = Field::from_activation(head.fork(), taps, area, factor);
-            let mask = Field::from_activation(head.fork(), taps + area, area, factor);
-            let corners = Field::from_activation(head, corners, CORNERS * area, factor);
-            (kernel, confidence, (mask, corners))
-        };
+        // What is predicted for every pyramid level, full resolution first.
         let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
         let albedo_kernel = Field::from_activation(full.fork(), 4 * HEAD, albedo_taps, 2);
-        let mut levels = vec![split(full, 2)];
-        levels.extend(heads.into_iter().rev().map(|head| split(head, 1)));
+        let mut levels = vec![Prediction::split(full, 2, albedo_taps)];
+        levels.extend(heads.into_iter().rev().map(|head| Prediction::split(head, 1, 0)));
 
-        // Radiance pyramid: each level filtered, then blended from the coarsest up.
+        // The radiance pyramid, finest level first; then, from the coarsest up, each level is corrected by
+        // what filtering changed in the one below, and filtered.
         let mut image = field(irradiance);
-        let mut filtered = Vec::with_capacity(levels.len());
+        let mut pyramid = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
-        for (level, (kernel, confidence, masks)) in levels.into_iter().enumerate() {
-            let below = (level < last).then(|| image.fork().reduce(confidence.fork()));
-            filtered.push((image.filter(KERNEL, kernel, Some(confidence)), masks));
+        for (level, predicted) in levels.into_iter().enumerate() {
+            let below = (level < last).then(|| image.fork().reduce(predicted.confidence.fork()));
+            pyramid.push((image, predicted));
             match below {
                 Some(below) => image = below,
                 None => break,
             }
         }
-        let (mut out, _) = filtered.pop().expect("there are levels");
-        while let Some((fine, (mask, corners))) = filtered.pop() {
-            out = fine.blend(out, mask, corners); // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+        let mut correction: Option<Field<T>> = None;
+        loop {
+            let (noisy, predicted) = pyramid.pop().expect("there are levels");
+            let Prediction { kernel, confidence, mask, corners } = predicted;
+            let corrected = match correction.take() {
+                None => noisy.fork(),
+                // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+                Some(correction) => noisy.fork().blend(correction, mask, corners),
+            };
+            let filtered = corrected.filter(KERNEL, kernel, Some(confidence));
+            if pyramid.is_empty() {
+                let albedo = field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None);
+                return filtered.product(albedo).into_images();
+            }
+            correction = Some(filtered.minus(noisy));
         }
-        out.product(field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None)).into_images()
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.
@@ -270,6 +305,10 @@ impl Network for Pyramid {
         // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
         let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
         trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>()
+    }
+
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        bands::infer(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

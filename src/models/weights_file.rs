@@ -83,14 +83,12 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
 /// As [`read`], or the file holds another network.
 pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Network>> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
-    if let Ok((network, metadata)) = parse(&bytes, path)
-        && metadata.network == *config
-    {
-        return Ok(network);
-    }
     let (metadata, tensors) = metadata(&bytes, path)?;
     let held = &metadata.network;
     let mut network = super::build(config, seed);
+    if held == config && fill(&mut *network, &tensors, path).is_ok() {
+        return Ok(network);
+    }
     // Only convolutions can be widened: a network's every parameter must belong to one.
     let all = 2 * network.convolutions().len() == network.params().len();
     let fits = held.architecture == config.architecture && all && {
@@ -132,6 +130,12 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
 pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
     let (metadata, tensors) = metadata(bytes, path)?;
     let mut network = super::build(&metadata.network, 0);
+    fill(&mut *network, &tensors, path)?;
+    Ok((network, metadata))
+}
+
+/// Sets every parameter from the tensor of its name.
+fn fill(network: &mut dyn Network, tensors: &[Tensor], path: &Path) -> Result<()> {
     for param in network.params() {
         let found = tensors.binary_search_by(|t| t.name.cmp(&param.name)).ok().map(|i| &tensors[i]);
         match found {
@@ -151,5 +155,5 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> 
             }
         }
     }
-    Ok((network, metadata))
+    Ok(())
 }

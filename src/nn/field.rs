@@ -2,12 +2,12 @@
 
 use std::{cell::RefCell, rc::Rc, sync::Arc};
 
-use dfdx::tensor::{Cpu, Merge, PutTape, Tape, TensorFromVec};
+use dfdx::tensor::{Cpu, Merge, NoneTape, PutTape, Tape, TensorFromVec};
 use rayon::prelude::*;
 
 use super::{Activation, Images, pool::PlaneBuffer};
 use crate::kernels::{
-    blend::{BlendGradient, CORNERS, Masks, blend, blend_gradient},
+    blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     layout::{from_blocked_shuffled, to_blocked_shuffled},
     simd::Tier,
@@ -85,8 +85,24 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
         let mut data = PlaneBuffer::new(values.len());
         data.copy_from_slice(values);
+        Self::from_buffer(extent, data)
+    }
+
+    /// An input from pooled memory.
+    pub(super) fn from_buffer(extent: Extent, data: PlaneBuffer) -> Self {
         let values = Values { extent, data: Arc::new(data) };
         Self { saved: Saved { values, gradient: None }, tape: T::default() }
+    }
+
+    /// Channel `c` of the first image.
+    pub(super) fn plane(&self, c: usize) -> &[f32] {
+        let pixels = self.saved.values.size().pixels();
+        &self.saved.values.data[c * pixels..][..pixels]
+    }
+
+    /// All values, (N, C, H, W).
+    pub fn values(&self) -> &[f32] {
+        &self.saved.values.data
     }
 
     fn output(extent: Extent, data: PlaneBuffer, tape: T) -> (Self, Saved) {
@@ -148,7 +164,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         let mut output = PlaneBuffer::new(images * 3 * h * w);
         let mut total = PlaneBuffer::new(images * h * w);
         for (n, (output, total)) in output.chunks_mut(3 * h * w).zip(total.chunks_mut(h * w)).enumerate() {
-            filter_of(&values, n, k).apply(tier, output, total);
+            filter_of(&values, n, k, (0, h)).apply(tier, output, total);
         }
         let (mut field, out) = Self::output((images, 3, h, w), output, tape);
         if T::OWNS_TAPE {
@@ -165,7 +181,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                             let forward = (output.image(n), &total[n * h * w..][..h * w]);
                             let gradient = &gradient[n * 3 * h * w..][..3 * h * w];
                             let into = FilterGradient { image, logits, confidence };
-                            filter_of(&values, n, k).gradient(tier, forward, gradient, into);
+                            filter_of(&values, n, k, (0, h)).gradient(tier, forward, gradient, into);
                         });
                 };
                 image.accumulate(|into_image| {
@@ -233,7 +249,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         assert_eq!(self.extent(), other.extent());
         let (a, b) = (self.saved, other.saved);
         let mut output = PlaneBuffer::new(a.values.data.len());
-        multiply(&mut output, &a.values.data, &b.values.data, |out, product| *out = product);
+        combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a * b);
         let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
         if T::OWNS_TAPE {
             field.tape.add_backward_op(move |_| {
@@ -241,7 +257,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                 for (into, other) in [(&a, &b), (&b, &a)] {
                     into.accumulate(|into| {
                         if let Some(into) = into {
-                            multiply(into, &gradient, &other.values.data, |sum, product| *sum += product);
+                            combine(into, &gradient, &other.values.data, |sum, g, b| *sum += g * b);
                         }
                     });
                 }
@@ -251,27 +267,55 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Blends a coarse level, (N, 3, H/2, W/2), into this one, (N, 3, H, W): its share before the
-    /// logistic is `alpha`, (N, 1, H, W), the logits of its upsampling `corners`, (N, 4, H, W). See
-    /// [`crate::kernels::blend`].
-    pub fn blend(self, coarse: Self, alpha: Self, corners: Self) -> Self {
+    /// The difference to a field of the same extent, `self - other`.
+    ///
+    /// # Panics
+    /// If extents differ.
+    pub fn minus(self, other: Self) -> Self {
+        assert_eq!(self.extent(), other.extent());
+        let (a, b) = (self.saved, other.saved);
+        let mut output = PlaneBuffer::new(a.values.data.len());
+        combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a - b);
+        let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                for (into, sign) in [(&a, 1.0), (&b, -1.0)] {
+                    into.accumulate(|into| {
+                        if let Some(into) = into {
+                            into.iter_mut().zip(&*gradient).for_each(|(sum, g)| *sum += sign * g);
+                        }
+                    });
+                }
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// Adds a `correction` of the level below, (N, 3, H/2, W/2), to this one, (N, 3, H, W): its share
+    /// before the logistic is `alpha`, (N, 1, H, W), the logits of its upsampling `corners`, (N, 4, H, W).
+    /// See [`crate::kernels::blend`].
+    pub fn blend(self, correction: Self, alpha: Self, corners: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
         let size = Size { h, w };
         let mut output = PlaneBuffer::new(images * 3 * pixels);
-        let mut difference = PlaneBuffer::new(images * 3 * quarter);
-        let tape = self.tape.merge(coarse.tape).merge(alpha.tape).merge(corners.tape);
-        let (fine, below, mask, corners) = (self.saved, coarse.saved, alpha.saved, corners.saved);
+        let tape = self.tape.merge(correction.tape).merge(alpha.tape).merge(corners.tape);
+        let (fine, below, mask, corners) = (self.saved, correction.saved, alpha.saved, corners.saved);
         let predicted = (mask.values.clone(), corners.values.clone());
-        let chunks = output.chunks_mut(3 * pixels).zip(difference.chunks_mut(3 * quarter));
-        for (n, (output, difference)) in chunks.enumerate() {
+        let place = Place { first: 0, total: h, coarse: 0 };
+        for (n, output) in output.chunks_mut(3 * pixels).enumerate() {
             let levels = (fine.values.image(n), below.values.image(n));
-            blend(size, levels, masks_of(&predicted, n), difference, output);
+            blend(size, place, levels, masks_of(&predicted, n), output);
         }
         let (mut field, out) = Self::output((images, 3, h, w), output, tape);
         if T::OWNS_TAPE {
             field.tape.add_backward_op(move |_| {
                 let Some(gradient) = out.take() else { return Ok(()) };
+                let correction = &below.values;
+                // A fine level that is the network's input gets no gradient; the kernel's goes nowhere.
+                let mut nowhere = PlaneBuffer::new(0);
                 let run = |fine: &mut [f32], coarse: &mut [f32], alpha: &mut [f32], corners: &mut [f32]| {
                     fine.par_chunks_mut(3 * pixels)
                         .zip(coarse.par_chunks_mut(3 * quarter))
@@ -280,18 +324,22 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                         .enumerate()
                         .for_each(|(n, (((fine, coarse), alpha), corners))| {
                             let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
-                            let difference = &difference[n * 3 * quarter..][..3 * quarter];
-                            let into = BlendGradient { fine, coarse, alpha, corners };
-                            blend_gradient(size, masks_of(&predicted, n), difference, gradient, into);
+                            let into = BlendGradient { fine, correction: coarse, alpha, corners };
+                            let masks = masks_of(&predicted, n);
+                            blend_gradient(size, masks, correction.image(n), gradient, into);
                         });
                 };
                 const LEARNED: &str = "what is blended was filtered or predicted";
                 fine.accumulate(|fine| {
+                    let fine = fine.unwrap_or_else(|| {
+                        nowhere = PlaneBuffer::zeros(images * 3 * pixels);
+                        &mut nowhere
+                    });
                     below.accumulate(|below| {
                         mask.accumulate(|mask| {
                             corners.accumulate(|corners| {
                                 run(
-                                    fine.expect(LEARNED),
+                                    fine,
                                     below.expect(LEARNED),
                                     mask.expect(LEARNED),
                                     corners.expect(LEARNED),
@@ -326,11 +374,40 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     }
 }
 
-/// Calls `put(out, a * b)` value by value.
-fn multiply(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32) + Sync) {
+impl Field<NoneTape> {
+    /// [`Field::filter`] of some rows of the one image that the field holds more rows of: `logits` are of
+    /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
+    pub fn filter_rows(
+        &self,
+        rows: (usize, usize),
+        k: usize,
+        logits: &Self,
+        confidence: Option<&Self>,
+    ) -> Self {
+        let (_, _, _, w) = self.extent();
+        let h = rows.1 - rows.0;
+        let values = |field: &Self| field.saved.values.clone();
+        let problem = (values(self), values(logits), confidence.map(values));
+        let (mut output, mut total) = (PlaneBuffer::new(3 * h * w), PlaneBuffer::new(h * w));
+        filter_of(&problem, 0, k, rows).apply(Tier::detect(), &mut output, &mut total);
+        Self::from_buffer((1, 3, h, w), output)
+    }
+
+    /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)
+    pub fn blend_rows(&self, place: Place, correction: &Self, alpha: &Self, corners: &Self) -> Self {
+        let (_, _, h, w) = self.extent();
+        let mut output = PlaneBuffer::new(3 * h * w);
+        let masks = Masks { alpha: alpha.values(), corners: corners.values() };
+        blend(Size { h, w }, place, (self.values(), correction.values()), masks, &mut output);
+        Self::from_buffer((1, 3, h, w), output)
+    }
+}
+
+/// Calls `put(out, a, b)` value by value.
+fn combine(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32, f32) + Sync) {
     const CHUNK: usize = 16384;
     out.par_chunks_mut(CHUNK).zip(a.par_chunks(CHUNK)).zip(b.par_chunks(CHUNK)).for_each(|((out, a), b)| {
-        out.iter_mut().zip(a.iter().zip(b)).for_each(|(out, (a, b))| put(out, a * b));
+        out.iter_mut().zip(a.iter().zip(b)).for_each(|(out, (a, b))| put(out, *a, *b));
     });
 }
 
@@ -344,9 +421,11 @@ fn filter_of(
     (image, logits, confidence): &(Values, Values, Option<Values>),
     n: usize,
     k: usize,
+    rows: (usize, usize),
 ) -> Filter<'_> {
     Filter {
         size: image.size(),
+        rows,
         k,
         image: image.image(n),
         logits: logits.image(n),

@@ -125,6 +125,29 @@ impl Conv {
         self.frozen = None;
     }
 
+    /// Takes in the batch norm that follows, with its running statistics and its ReLU: one layer computes what
+    /// the two did.
+    ///
+    /// # Panics
+    /// If the layer has a ReLU of its own, or is transposed.
+    pub fn fold(&mut self, norm: &BatchNorm) {
+        assert!(
+            !self.relu && matches!(self.arithmetic.geometry, Geometry::Same(_)),
+            "only a linear layer folds"
+        );
+        let (scale, shift) = norm.scale_and_shift();
+        let (mut weights, mut bias) = (self.weight.values(), self.bias.values());
+        let each = weights.len() / self.arithmetic.outputs;
+        for (channel, (scale, shift)) in scale.into_iter().zip(shift).enumerate() {
+            weights[channel * each..][..each].iter_mut().for_each(|w| *w *= scale);
+            bias[channel] = bias[channel] * scale + shift;
+        }
+        self.weight.set(&weights);
+        self.bias.set(&bias);
+        self.relu = true;
+        self.frozen = None;
+    }
+
     /// Packs the weights once for all forward passes to come, until the layer is changed again.
     pub fn freeze(&mut self) {
         self.frozen = Some(Arc::new(self.arithmetic.pack(&self.weight.values())));
@@ -311,6 +334,15 @@ impl BatchNorm {
             let values: Vec<f32> = param.values().into_iter().zip(new).map(blend).collect();
             param.set(&values);
         }
+    }
+
+    /// What each channel is multiplied by, and what is added then, by the running statistics.
+    fn scale_and_shift(&self) -> (Vec<f32>, Vec<f32>) {
+        let inverse = self.variance.values().into_iter().map(|v| (v + Self::EPSILON).sqrt().recip());
+        let scale: Vec<f32> = self.scale.values().iter().zip(inverse).map(|(g, i)| g * i).collect();
+        let moved = self.mean.values().into_iter().zip(&scale).map(|(m, s)| s * m);
+        let shift = self.shift.values().iter().zip(moved).map(|(b, m)| b - m).collect();
+        (scale, shift)
     }
 
     /// Normalises, scales, shifts, rectifies. (N, C, H, W) -> (N, C, H, W)

@@ -9,6 +9,7 @@ mod arithmetic;
 mod cross_bilateral;
 mod field;
 mod layers;
+mod line;
 mod param;
 mod pool;
 pub mod weights;
@@ -18,6 +19,7 @@ pub use arithmetic::{Arithmetic, Precision};
 pub use cross_bilateral::{Guides, cross_bilateral};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
+pub use line::{Line, Rows};
 pub use param::{Init, Param, Rng};
 pub use pool::clear as clear_buffers;
 

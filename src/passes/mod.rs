@@ -148,6 +148,18 @@ impl PassSet {
         Self { path: path.into(), view_layer: view_layer.into(), width, height, planes: BTreeMap::new() }
     }
 
+    /// Some rows of those of `passes` that it holds.
+    ///
+    /// # Panics
+    /// If there are no such rows.
+    pub fn rows(&self, passes: &[Pass], rows: std::ops::Range<usize>) -> Self {
+        let mut part = Self::new(&self.path, &self.view_layer, self.width, rows.len());
+        for (&pass, planes) in self.planes.iter().filter(|(pass, _)| passes.contains(pass)) {
+            part.insert(pass, planes.window((0, rows.start), (self.width, rows.len())));
+        }
+        part
+    }
+
     /// Adds or replaces a pass.
     ///
     /// # Panics

@@ -217,9 +217,11 @@ fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step
 /// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames.
 fn validate(network: &dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
+    let mut network = network.duplicate();
+    network.freeze();
     for index in 0..frames.len() {
         let (name, sample) = frames.frame(index);
-        let image = models::network::run(network, &sample.passes, None)?;
+        let image = network.infer(&sample.passes, None)?;
         let (image, reference) = (&image, &sample.reference);
         if image.non_finite() > 0 {
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));

@@ -59,7 +59,8 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 
-    /// Work on squares of at most N pixels where the model can, to bound memory [default: its choice]
+    /// Work on bands of N rows, or squares of N by N pixels where a model wants those, to bound memory; the
+    /// result is the same to the bit [default: the model's choice]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(16..))]
     tile: Option<u32>,
 

@@ -14,12 +14,10 @@ pub mod weight_grad;
 
 pub use engine::Engine;
 
-use std::sync::{Mutex, PoisonError};
-
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{Block, LANES, Shape, View, ViewMut, conv::Geometry};
+use super::{Block, LANES, Shape, View, ViewMut, conv::Geometry, memory::Pool};
 
 /// Channels in a [`Wide`].
 pub const WIDE: usize = 2 * LANES;
@@ -55,32 +53,28 @@ unsafe impl Send for Term {}
 #[repr(C, align(64))]
 struct Sums([[Block; CHUNK]; 2]);
 
-/// Free buffers by length. What they hold is whatever the last user left.
-static FREE: Mutex<Vec<Vec<Wide>>> = Mutex::new(Vec::new());
+/// Free memory of operands.
+static FREE: Pool<Wide> = Pool::new();
 
-/// Pooled memory: after the first step nothing is allocated and no page is faulted in.
+/// Pooled memory: at least as much as was asked for.
 #[derive(Debug)]
 struct Buffer(Vec<Wide>);
 
 impl Buffer {
     fn new(len: usize) -> Self {
-        let mut free = FREE.lock().unwrap_or_else(PoisonError::into_inner);
-        match free.iter().position(|b| b.len() == len) {
-            Some(i) => Self(free.swap_remove(i)),
-            None => Self(vec![Wide::ZERO; len]),
-        }
+        Self(FREE.take(len, Wide::ZERO))
     }
 }
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        FREE.lock().unwrap_or_else(PoisonError::into_inner).push(std::mem::take(&mut self.0));
+        FREE.give(std::mem::take(&mut self.0));
     }
 }
 
 /// Gives every free buffer back to the system.
 pub fn clear() {
-    FREE.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    FREE.clear();
 }
 
 /// A plane of positions: its extent, and how the four pixels of a square are dealt to four planes where a
@@ -207,6 +201,28 @@ impl Operand {
                 out.0.iter_mut().zip(half).for_each(|(o, h)| *o = h.to_f32());
             }
         });
+    }
+
+    /// Copies `count` rows of another activation of the same width and channels, from its row `from` on, to
+    /// row `to` on. Rows -1 and H are those of the border, which then belong to a taller activation.
+    ///
+    /// # Panics
+    /// If the two do not fit together, or hold several images.
+    pub fn copy_rows(&mut self, to: isize, source: &Operand, from: isize, count: usize) {
+        let (grid, other) = (self.grid, source.grid);
+        assert_eq!((self.shape.with_size(0, 0), self.shape.n), (source.shape.with_size(0, 0), 1));
+        assert_eq!((grid.w, grid.pad, grid.split, other.split), (other.w, other.pad, false, false));
+        let len = count * grid.stride();
+        let start = |grid: Grid, row: isize| {
+            let row = row.checked_add_unsigned(grid.pad).and_then(|row| usize::try_from(row).ok());
+            let row = row.filter(|row| row + count <= grid.h + 2 * grid.pad);
+            row.expect("rows lie inside the activation") * grid.stride()
+        };
+        let (to, from) = (start(grid, to), start(other, from));
+        for plane in 0..self.planes() {
+            let rows = &source.data.0[plane * other.positions() + from..][..len];
+            self.data.0[plane * grid.positions() + to..][..len].copy_from_slice(rows);
+        }
     }
 
     /// Its extent.

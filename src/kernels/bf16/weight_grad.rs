@@ -30,8 +30,9 @@ impl Channels {
         let grid = Grid::new(s, false);
         // An odd number of cache lines: rows of a tile then lie in different cache sets.
         let lines = (grid.positions() + grid.slack()).div_ceil(WIDE) | 1;
-        let mut data = Buffer::new(s.n * planes * WIDE * lines);
-        data.0.par_chunks_mut(WIDE * lines).enumerate().for_each(|(i, out)| {
+        let len = s.n * planes * WIDE * lines;
+        let mut data = Buffer::new(len);
+        data.0[..len].par_chunks_mut(WIDE * lines).enumerate().for_each(|(i, out)| {
             let (low, high) = halves(source, i / planes, i % planes);
             let stride = lines * WIDE;
             let (lower, upper) = out.split_at_mut(LANES * lines);
@@ -73,9 +74,10 @@ impl Pairs {
         let g = gradient.shape;
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
-        let mut data = Buffer::new(g.n * g.planes() * grid.phases() * rows);
+        let len = g.n * g.planes() * grid.phases() * rows;
+        let mut data = Buffer::new(len);
         let origin = grid.row(0) - grid.pad;
-        data.0.par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
+        data.0[..len].par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
             let (phase, plane) = (i % grid.phases(), i / grid.phases());
             let blocks = &gradient.data[plane * g.plane_stride()..][..g.plane_stride()];
             if grid.split {

@@ -1,0 +1,347 @@
+//! Inference from top to bottom, band by band, to the same bits as [`Network::forward`] on the whole frame.
+//!
+//! Every layer goes as far down as the rows above it allow and no row is computed twice; rows are kept only
+//! while something below needs them. Memory so grows with the width of a frame, not with its height, and
+//! a pixel costs the same in a frame of any size.
+
+use std::{collections::VecDeque, ops::Range};
+
+use dfdx::tensor::NoneTape;
+
+use super::{ALBEDO_KERNEL, HEAD, KERNEL, LEVELS, Prediction, Pyramid};
+use crate::{
+    Result,
+    features::{Inputs, exposure, guides_exposed, pad_to_multiple},
+    kernels::{Shape, blend::Place},
+    models::network::Network,
+    nn::{Activation, Conv, Line, MaxPool},
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+type Maps = Activation<NoneTape>;
+type Field = crate::nn::Field<NoneTape>;
+
+/// Pixels of a band: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
+const BAND_PIXELS: usize = 1 << 17;
+
+/// Denoised radiance of a frame, (3, H, W). `rows` are those of a band, if the user has an opinion.
+///
+/// # Errors
+/// A pass is missing.
+pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<Planes> {
+    let multiple = network.multiple();
+    let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
+    let (width, height) = (passes.width.next_multiple_of(multiple), passes.height.next_multiple_of(multiple));
+    let rows = rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple;
+    let rows = rows.max(multiple);
+    let mut frame = Frame::new(network, height, rows);
+    let mut image = Planes::new(3, passes.width, passes.height);
+    for y in (0..height).step_by(rows) {
+        let band = passes.rows(network.passes(), y..(y + rows).min(passes.height));
+        let mut inputs = guides_exposed(&band, exposure, NEEDED_BY)?;
+        inputs.planes = inputs.planes.into_iter().map(|p| pad_to_multiple(p, multiple)).collect();
+        let mut done = |first: usize, field: &Field| {
+            let (_, _, h, w) = field.extent();
+            for (c, plane) in field.values().chunks(h * w).enumerate() {
+                let first = first.min(passes.height) * passes.width;
+                let into = image.channel_mut(c)[first..].chunks_mut(passes.width);
+                for (into, from) in into.zip(plane.chunks(w)) {
+                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * inputs.scale);
+                }
+            }
+        };
+        frame.push(&inputs);
+        frame.advance(&mut done);
+        while frame.is_whole() && !frame.is_done() {
+            frame.advance(&mut done);
+        }
+    }
+    Ok(image)
+}
+
+/// Who asks for passes, in messages.
+const NEEDED_BY: &str = "this model";
+
+/// All that is under way in a frame.
+struct Frame<'a> {
+    network: &'a Pyramid,
+    /// Rows that one step may take: without it, the last step would take all that is behind.
+    band: usize,
+    encoders: [Vec<Encoded>; 2],
+    /// Finest level first.
+    decoder: Vec<Decoded>,
+    /// Full resolution first.
+    scales: Vec<Scale>,
+    albedo: Line<Field>,
+    /// One for each kernel of full resolution.
+    albedo_kernels: VecDeque<Field>,
+}
+
+/// A level of an encoder.
+struct Encoded {
+    input: Line<Maps>,
+    middle: Line<Maps>,
+    output: Line<Maps>,
+}
+
+/// A level of the decoder.
+struct Decoded {
+    up: Line<Maps>,
+    fused: Line<Maps>,
+    refined: Line<Maps>,
+}
+
+/// A level of the radiance pyramid.
+struct Scale {
+    image: Line<Field>,
+    confidence: Line<Field>,
+    /// What the head predicted for bands not yet corrected, and for those not yet filtered.
+    masks: VecDeque<(Range<usize>, Field, Field)>,
+    kernels: VecDeque<(Range<usize>, Field)>,
+    /// The image, corrected by the level below.
+    corrected: Line<Field>,
+    /// What filtering changed: the correction of the level above.
+    correction: Line<Field>,
+    /// Rows filtered.
+    filtered: usize,
+}
+
+impl<'a> Frame<'a> {
+    fn new(network: &'a Pyramid, height: usize, band: usize) -> Self {
+        let rows = |level: usize| height >> (level + 1);
+        let encoder = || {
+            let level = |l| Encoded {
+                input: Line::new(rows(l)),
+                middle: Line::new(rows(l)),
+                output: Line::new(rows(l)),
+            };
+            (0..LEVELS).map(level).collect()
+        };
+        let decoded =
+            |l| Decoded { up: Line::new(rows(l)), fused: Line::new(rows(l)), refined: Line::new(rows(l)) };
+        let scale = |s: usize| Scale {
+            image: Line::new(height >> s),
+            confidence: Line::new(height >> s),
+            masks: VecDeque::new(),
+            kernels: VecDeque::new(),
+            corrected: Line::new(height >> s),
+            correction: Line::new(height >> s),
+            filtered: 0,
+        };
+        Self {
+            network,
+            band,
+            encoders: [encoder(), encoder()],
+            decoder: (0..LEVELS).map(decoded).collect(),
+            scales: (0..=LEVELS).map(scale).collect(),
+            albedo: Line::new(height),
+            albedo_kernels: VecDeque::new(),
+        }
+    }
+
+    /// Adds the inputs of the next rows.
+    fn push(&mut self, inputs: &Inputs) {
+        let [irradiance, albedo, radiance, guide] = &inputs.planes[..] else {
+            unreachable!("`inputs` makes four planes")
+        };
+        let field = |p: &Planes| Field::input((1, p.channels, p.height, p.width), &p.data);
+        self.scales[0].image.push(field(irradiance));
+        self.albedo.push(field(albedo));
+        for (encoder, planes) in self.encoders.iter_mut().zip([radiance, guide]) {
+            let shape = Shape::new(1, planes.channels, planes.height, planes.width);
+            encoder[0].input.push(Maps::input_halved(shape, &planes.data));
+        }
+    }
+
+    /// Whether all inputs are there.
+    fn is_whole(&self) -> bool {
+        self.albedo.end() == self.albedo.total()
+    }
+
+    /// Whether everything is computed.
+    fn is_done(&self) -> bool {
+        self.scales[0].filtered == self.albedo.total()
+    }
+
+    /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
+    /// first row, and radiance.
+    fn advance(&mut self, done: &mut impl FnMut(usize, &Field)) {
+        self.encode();
+        self.decode();
+        self.reduce();
+        for scale in (0..=LEVELS).rev() {
+            self.correct(scale);
+            self.filter(scale, done);
+        }
+        self.forget();
+    }
+
+    fn encode(&mut self) {
+        for (encoder, levels) in self.network.encoders.iter().zip(&mut self.encoders) {
+            for (level, [first, second]) in encoder.levels.iter().enumerate() {
+                let (above, rest) = levels.split_at_mut(level);
+                let Encoded { input, middle, output } = &mut rest[0];
+                if let Some(above) = above.last() {
+                    let (from, to) = (input.end(), above.output.end() / 2);
+                    if from < to {
+                        input.push(MaxPool.forward(above.output.rows(2 * from..2 * to)));
+                    }
+                }
+                let most = self.band >> (level + 1);
+                convolve(first, input, middle, most);
+                convolve(second, middle, output, most);
+            }
+        }
+    }
+
+    fn decode(&mut self) {
+        // The decoder's layers, coarsest level first; its lines, finest first.
+        for (level, layers) in (0..LEVELS).rev().zip(&self.network.decoder) {
+            let (finer, coarser) = self.decoder.split_at_mut(level + 1);
+            let Decoded { up, fused, refined } = &mut finer[level];
+            if let (Some(layer), Some(below)) = (&layers.up, coarser.first()) {
+                let from = up.end() / 2;
+                let to = below.refined.settled(1).min(from + (self.band >> (level + 2)));
+                if from < to {
+                    up.push(layer.forward(vec![below.refined.rows_and_border(from..to)]));
+                }
+            }
+            // A band of the skips at a time, which so need no copy.
+            let skips = self.encoders.each_ref().map(|encoder| &encoder[level].output);
+            while let Some(to) = skips[0].band_end(fused.end()) {
+                let rows = fused.end()..to;
+                if layers.up.is_some() && up.end() < to {
+                    break;
+                }
+                let mut sources: Vec<Maps> = skips.iter().map(|skip| skip.rows(rows.clone())).collect();
+                sources.extend(layers.up.iter().map(|_| up.rows(rows.clone())));
+                fused.push(layers.fuse.forward(sources));
+            }
+            let from = refined.end();
+            convolve(&layers.refine, fused, refined, self.band >> (level + 1));
+            let rows = from..refined.end();
+            if rows.is_empty() {
+                continue;
+            }
+            let head = self.network.heads[level].forward(vec![refined.rows(rows.clone())]);
+            self.scales[level + 1].predicted(rows.clone(), Prediction::split(head, 1, 0));
+            if level == 0 {
+                let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
+                let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
+                self.albedo_kernels.push_back(Field::from_activation(head.fork(), 4 * HEAD, albedo_taps, 2));
+                let rows = 2 * rows.start..2 * rows.end;
+                self.scales[0].predicted(rows, Prediction::split(head, 2, albedo_taps));
+            }
+        }
+    }
+
+    /// Builds the radiance pyramid.
+    fn reduce(&mut self) {
+        for scale in 0..LEVELS {
+            let [fine, coarse] = &mut self.scales[scale..scale + 2] else { unreachable!("two scales") };
+            let (from, to) = (coarse.image.end(), fine.image.end().min(fine.confidence.end()) / 2);
+            if from < to {
+                let rows = 2 * from..2 * to;
+                coarse.image.push(fine.image.rows(rows.clone()).reduce(fine.confidence.rows(rows)));
+            }
+        }
+    }
+
+    /// Adds the correction of the scale below to the image.
+    fn correct(&mut self, scale: usize) {
+        let (finer, coarser) = self.scales.split_at_mut(scale + 1);
+        let Scale { image, masks, corrected, .. } = &mut finer[scale];
+        let Some(below) = coarser.first().map(|c| &c.correction) else { return };
+        while let Some((rows, _, _)) = masks.front() {
+            if image.end() < rows.end || 2 * below.settled(1) < rows.end {
+                break;
+            }
+            let (rows, mask, corners) = masks.pop_front().expect("there is one");
+            let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
+            let place = Place { first: rows.start, total: image.total(), coarse: near.start };
+            corrected.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
+        }
+    }
+
+    /// Filters the image; at full resolution, hands out what becomes of it.
+    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field)) {
+        const REACH: usize = KERNEL / 2;
+        let Scale { image, confidence, kernels, corrected, correction, filtered, .. } =
+            &mut self.scales[scale];
+        let source = if scale == LEVELS { &*image } else { &*corrected };
+        while let Some((rows, _)) = kernels.front() {
+            if source.settled(REACH).min(confidence.settled(REACH)) < rows.end {
+                break;
+            }
+            let (rows, kernel) = kernels.pop_front().expect("there is one");
+            let (near, inside) = around(&rows, REACH, source.total());
+            let (source, trust) = (source.rows(near.clone()), confidence.rows(near));
+            let smooth = source.filter_rows(inside, KERNEL, &kernel, Some(&trust));
+            *filtered = rows.end;
+            if scale > 0 {
+                correction.push(smooth.minus(image.rows(rows)));
+                continue;
+            }
+            let kernel = self.albedo_kernels.pop_front().expect("there is one for each kernel");
+            let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
+            let albedo = self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None);
+            done(rows.start, &smooth.product(albedo));
+        }
+    }
+
+    /// Lets go of every row that nothing needs any more.
+    fn forget(&mut self) {
+        for level in 0..LEVELS {
+            let pooled = (level + 1 < LEVELS).then(|| level + 1);
+            for encoder in &mut self.encoders {
+                let below = pooled.map_or(usize::MAX, |below| 2 * encoder[below].input.end());
+                let Encoded { input, middle, output } = &mut encoder[level];
+                input.forget(middle.end().saturating_sub(1));
+                middle.forget(output.end().saturating_sub(1));
+                output.forget(below.min(self.decoder[level].fused.end()));
+            }
+            let above = level.checked_sub(1).map_or(usize::MAX, |above| self.decoder[above].up.end() / 2);
+            let Decoded { up, fused, refined } = &mut self.decoder[level];
+            up.forget(fused.end());
+            fused.forget(refined.end().saturating_sub(1));
+            refined.forget(above.min(refined.end()).saturating_sub(1));
+        }
+        for scale in 0..=LEVELS {
+            let reduced = self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.image.end());
+            let above = scale.checked_sub(1).map_or(0, |above| self.scales[above].corrected.end() / 2);
+            let Scale { image, confidence, corrected, correction, filtered, .. } = &mut self.scales[scale];
+            let reach = filtered.saturating_sub(KERNEL / 2);
+            image.forget(reach.min(reduced));
+            confidence.forget(reach.min(reduced));
+            corrected.forget(reach);
+            correction.forget(above.saturating_sub(1));
+        }
+        self.albedo.forget(self.scales[0].filtered.saturating_sub(ALBEDO_KERNEL / 2));
+    }
+}
+
+impl Scale {
+    /// Takes in what a head predicted for `rows`.
+    fn predicted(&mut self, rows: Range<usize>, prediction: Prediction<NoneTape>) {
+        let Prediction { kernel, confidence, mask, corners } = prediction;
+        self.confidence.push(confidence);
+        self.masks.push_back((rows.clone(), mask, corners));
+        self.kernels.push_back((rows, kernel));
+    }
+}
+
+/// A 3x3 convolution of at most `most` rows whose neighbours are there.
+fn convolve(layer: &Conv, from: &Line<Maps>, to: &mut Line<Maps>, most: usize) {
+    let rows = to.end()..from.settled(1).min(to.end() + most);
+    if !rows.is_empty() {
+        to.push(layer.forward(vec![from.rows_and_border(rows)]));
+    }
+}
+
+/// Rows `rows` of `total` with `reach` rows more on either side, and where `rows` lie among those.
+fn around(rows: &Range<usize>, reach: usize, total: usize) -> (Range<usize>, (usize, usize)) {
+    let near = rows.start.saturating_sub(reach)..(rows.end + reach).min(total);
+    let inside = (rows.start - near.start, rows.end - near.start);
+    (near, inside)
+}
