@@ -13,12 +13,10 @@ mkdir -p "$out"
 
 for name in "$@"; do
     case $name in
-        demc) steps=2000 more="--loss relmse --lr 1e-3:5e-5" ;;
-        # At 1e-3 its last ReLU dies: no fusion network tames the features.
-        demc-nofusion) steps=2000 more="--loss relmse --lr 2e-4:2e-5" ;;
-        semc) steps=1400 more="--loss relmse --lr 1e-3:5e-5" ;;
-        kpcn) steps=1100 more="--loss both --lr 1e-3:5e-5 --patch 64" ;;
-        lbf) steps=1300 more="--loss both --lr 1e-2:1e-3 --patch 64" ;;
+        demc | demc-nofusion) steps=2000 more="--loss relmse --lr 1e-3:5e-5" ;;
+        semc) steps=830 more="--loss relmse --lr 1e-3:5e-5" ;;
+        kpcn) steps=660 more="--loss smape --lr 1e-3:5e-5 --patch 64" ;;
+        lbf) steps=780 more="--loss both --lr 1e-2:1e-3 --patch 64" ;;
         *) echo "train.sh: no recipe for $name" >&2; exit 2 ;;
     esac
     steps=$(awk "BEGIN { print int($steps * ${SCALE:-1}) }")
