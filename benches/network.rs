@@ -3,7 +3,7 @@
 //! ```text
 //! cargo bench --bench network                     a table; rounds interleaved, medians
 //! cargo bench --bench network -- train            only the jobs whose name holds a word
-//! cargo bench --bench network -- --sizes a.csv    cost per pixel from 256x256 to 7680x4320
+//! cargo bench --bench network -- --sizes a.csv demc-m    cost per pixel from 256x256 to 7680x4320
 //! cargo bench --bench network -- --worker         answers eval/rivals_bench/run.py
 //! ```
 //! `--rounds N` (default 5) sets the rounds, `--small` shrinks everything to test the bench itself.
@@ -258,7 +258,8 @@ fn cost_by_size(csv: &PathBuf, options: &Options) {
     let sizes: Vec<(usize, usize)> = if options.small { vec![(96, 64), (160, 96)] } else { SIZES.into() };
     let usual = if options.small { sizes[1] } else { USUAL };
     let mut rows = Vec::new();
-    for (name, _) in BUILT_IN {
+    let wanted = |name: &str| options.words.is_empty() || options.words.iter().any(|word| word == name);
+    for (name, _) in BUILT_IN.into_iter().filter(|(name, _)| wanted(name)) {
         let model = Learned::built_in(name).expect("it is in the list");
         let mut times = vec![Vec::new(); sizes.len()];
         for round in 1..=options.rounds {
