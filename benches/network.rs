@@ -18,9 +18,9 @@ use std::{
 use demc::{
     kernels::{Shape, peak, simd::Tier},
     models::{
-        self, Denoiser,
+        self,
         demc::PAPER_WIDTHS,
-        learned::{BUILT_IN, Learned},
+        learned::Learned,
         network::{Architecture, Batch, Config, Network},
     },
     nn::{Precision, Rng, Stats, clear_buffers},
@@ -35,6 +35,8 @@ const BASE16: [usize; 5] = [16, 32, 64, 128, 128];
 const CROPS: (usize, usize) = (8, 128);
 const SIZES: [(usize, usize); 6] =
     [(256, 256), (512, 512), (1280, 720), (1920, 1080), (3840, 2160), (7680, 4320)];
+/// The models that are timed: those that read what [`frame`] makes.
+const LADDER: [&str; 2] = ["demc-s", "demc-m"];
 /// The size that others are compared with.
 const USUAL: (usize, usize) = (1280, 720);
 
@@ -103,7 +105,7 @@ fn jobs(small: bool) -> Vec<Job> {
             make: Box::new(move || infer(paper(), (width, height))),
         });
     }
-    for (name, _) in BUILT_IN {
+    for name in LADDER {
         for (width, height) in if small { vec![(160, 96)] } else { vec![USUAL, (1920, 1080)] } {
             let mut model = Learned::built_in(name).expect("it is in the list");
             let macs = model.network().macs_per_pixel();
@@ -111,7 +113,7 @@ fn jobs(small: bool) -> Vec<Job> {
                 name: format!("{name} {width}x{height}"),
                 flops: Some(2.0 * macs * (width * height) as f64),
                 make: Box::new(move || {
-                    let model = Learned::built_in(name).expect("it is in the list");
+                    let model = models::open(name).expect("it is built in");
                     let passes = frame(width, height);
                     Box::new(move || drop(model.denoise(&passes).expect("every pass is there")))
                 }),
@@ -174,8 +176,9 @@ fn train_step(precision: Precision, (n, size): (usize, usize)) -> Box<dyn FnMut(
     })
 }
 
-/// The network alone, from prepared inputs.
-fn infer(network: Box<dyn Network>, (width, height): (usize, usize)) -> Box<dyn FnMut()> {
+/// The network alone, planned, from prepared inputs.
+fn infer(mut network: Box<dyn Network>, (width, height): (usize, usize)) -> Box<dyn FnMut()> {
+    network.freeze();
     let multiple = network.multiple();
     let batch = batch(1, width.next_multiple_of(multiple), height.next_multiple_of(multiple));
     Box::new(move || {
@@ -259,8 +262,8 @@ fn cost_by_size(csv: &PathBuf, options: &Options) {
     let usual = if options.small { sizes[1] } else { USUAL };
     let mut rows = Vec::new();
     let wanted = |name: &str| options.words.is_empty() || options.words.iter().any(|word| word == name);
-    for (name, _) in BUILT_IN.into_iter().filter(|(name, _)| wanted(name)) {
-        let model = Learned::built_in(name).expect("it is in the list");
+    for name in LADDER.into_iter().filter(|name| wanted(name)) {
+        let model = models::open(name).expect("it is built in");
         let mut times = vec![Vec::new(); sizes.len()];
         for round in 1..=options.rounds {
             for (&(width, height), times) in sizes.iter().zip(&mut times) {

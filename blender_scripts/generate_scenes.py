@@ -39,7 +39,7 @@ from demc_scenes.stage import Stage
 
 _FRAME_SIZES = ((480, 270), (480, 270), (480, 270), (640, 360), (640, 360), (960, 540))
 _LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
-_DROPPED = ("Depth.Z", "DEMC Position.A")  # passes a network has no use for
+_DROPPED = (".Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
 def parse(arguments):
