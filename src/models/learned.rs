@@ -15,10 +15,11 @@ use crate::{
 };
 
 /// The built-in weights, name and file: ours, smallest first, then the paper's networks and its rivals.
-pub const BUILT_IN: [(&str, &[u8]); 6] = [
+pub const BUILT_IN: [(&str, &[u8]); 7] = [
     ("demc-s", include_bytes!("weights/demc-s.safetensors")),
     ("demc-m", include_bytes!("weights/demc-m.safetensors")),
     ("demc", include_bytes!("weights/demc.safetensors")),
+    ("demc-nofusion", include_bytes!("weights/demc-nofusion.safetensors")),
     ("semc", include_bytes!("weights/semc.safetensors")),
     ("kpcn", include_bytes!("weights/kpcn.safetensors")),
     ("lbf", include_bytes!("weights/lbf.safetensors")),
