@@ -196,9 +196,17 @@ pub struct Inputs {
     pub scale: f32,
 }
 
-/// Grows planes to a multiple of `multiple` in both directions by repeating the last row and column:
-/// what a network that halves its input `log2(multiple)` times needs.
-pub fn pad_to_multiple(planes: Planes, multiple: usize) -> Planes {
+impl Inputs {
+    /// Grows every input to a multiple of `multiple` in both directions by repeating the last row and column:
+    /// what a network that halves its input `log2(multiple)` times needs.
+    pub fn padded(mut self, multiple: usize) -> Self {
+        self.planes = self.planes.into_iter().map(|planes| pad_to_multiple(planes, multiple)).collect();
+        self
+    }
+}
+
+/// What [`Inputs::padded`] does to one input.
+fn pad_to_multiple(planes: Planes, multiple: usize) -> Planes {
     let (width, height) = (planes.width.next_multiple_of(multiple), planes.height.next_multiple_of(multiple));
     if (width, height) == (planes.width, planes.height) {
         return planes;

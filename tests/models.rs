@@ -1,7 +1,7 @@
 //! The networks as contracts: sizes of the paper's, reach and scaling of the built-in ones.
 
 use demc::{
-    features::{Inputs, pad_to_multiple},
+    features::Inputs,
     models::{
         self,
         demc::{Demc, PAPER_WIDTHS, semc_widths},
@@ -128,10 +128,9 @@ fn bands_give_the_same_bits_as_the_whole_frame() {
     for precision in [Precision::F32, Precision::Bf16] {
         network.convolutions().into_iter().for_each(|conv| conv.set_precision(precision));
         // The network's own forward pass over all of the frame is what the plan must equal.
-        let mut inputs = network.inputs(&passes).expect("all passes are there");
-        inputs.planes = inputs.planes.into_iter().map(|p| pad_to_multiple(p, network.multiple())).collect();
+        let inputs = network.inputs(&passes).expect("all passes are there").padded(network.multiple());
         let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);
-        let whole = network.forward(&stack(&[inputs.clone()]), &mut Stats::Running).as_vec();
+        let whole = network.forward(&stack(std::slice::from_ref(&inputs)), &mut Stats::Running).as_vec();
         let mut whole = Planes::from_vec(3, w, h, whole).window((0, 0), (width, height));
         whole.data.iter_mut().for_each(|v| *v *= inputs.scale);
         network.freeze();

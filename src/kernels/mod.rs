@@ -19,10 +19,13 @@ pub mod filter;
 pub mod layout;
 pub mod memory;
 pub mod peak;
+pub mod plane;
 pub mod pool;
 pub mod simd;
 pub mod vectorised;
 pub mod weight_grad;
+
+use plane::Plane;
 
 /// Channels in a [`Block`].
 pub const LANES: usize = 16;
@@ -68,14 +71,19 @@ impl Shape {
         self.c.div_ceil(LANES)
     }
 
+    /// One plane.
+    pub fn plane(self) -> Plane {
+        Plane { h: self.h, w: self.w, pad: self.pad }
+    }
+
     /// Blocks from one row to the next.
     pub fn row_stride(self) -> usize {
-        self.w + 2 * self.pad
+        self.plane().stride()
     }
 
     /// Blocks from one plane to the next.
     pub fn plane_stride(self) -> usize {
-        (self.h + 2 * self.pad) * self.row_stride()
+        self.plane().positions()
     }
 
     /// Blocks of the whole activation, borders included.
@@ -90,7 +98,7 @@ impl Shape {
 
     /// Index of the block at row `y`, column 0.
     pub fn row(self, n: usize, plane: usize, y: usize) -> usize {
-        (n * self.planes() + plane) * self.plane_stride() + (y + self.pad) * self.row_stride() + self.pad
+        (n * self.planes() + plane) * self.plane_stride() + self.plane().row(y)
     }
 }
 

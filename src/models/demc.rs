@@ -10,13 +10,12 @@ use dfdx::{
     tensor_ops::{abs, exp, ln, powf, relu},
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate, run_tiled};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
     nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
-    planes::Planes,
 };
 
 /// Channels at each level in the paper.
@@ -377,10 +376,6 @@ impl Network for Demc {
         // Three 3x3 convolutions and a pool a level on the way down, a 4x4 upsampling on the way up.
         let fusion = if self.fusion.is_some() { 4 } else { 0 };
         fusion + (0..self.config.widths.len()).map(|level| (3 + 1 + 2) << level).sum::<usize>()
-    }
-
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

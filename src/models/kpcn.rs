@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate, run_tiled};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{
@@ -28,7 +28,6 @@ use crate::{
     kernels::Shape,
     nn::{Activation, Conv, Field, Images, Init, Param, Rng, Stats},
     passes::{Pass, PassSet},
-    planes::Planes,
 };
 
 /// Channels of the hidden layers as published.
@@ -194,10 +193,6 @@ impl Network for Kpcn {
 
     fn reach(&self) -> usize {
         LAYERS * (TAPS / 2) + KERNEL / 2
-    }
-
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

@@ -19,13 +19,12 @@ use dfdx::{
     tensor_ops::{clamp, exp, ln, sigmoid},
 };
 
-use super::network::{Batch, Config, Network, Taped, duplicate, run_tiled};
+use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
     nn::{Activation, Conv, Guides, Images, Init, Param, Rng, Stats, cross_bilateral},
     passes::{Pass, PassSet},
-    planes::Planes,
 };
 
 /// Hidden units as published.
@@ -131,10 +130,6 @@ impl Network for Lbf {
 
     fn reach(&self) -> usize {
         RADIUS
-    }
-
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        run_tiled(self, passes, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Result,
-    features::{Inputs, pad_to_multiple},
+    features::Inputs,
     kernels::Shape,
     nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
     passes::{Pass, PassSet},
@@ -142,7 +142,9 @@ pub trait Network: Send + Sync {
     ///
     /// # Errors
     /// A pass is missing.
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes>;
+    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        run_tiled(self, passes, tile)
+    }
 
     /// A copy with its own parameters.
     fn duplicate(&self) -> Box<dyn Network>;
@@ -161,15 +163,14 @@ pub(super) fn duplicate(network: &(impl Network + Clone + 'static)) -> Box<dyn N
 /// than a workstation has.
 const WHOLE_FRAME_PIXELS: usize = 8 << 20;
 
-/// [`Network::infer`] for any network: radiance, (3, H, W), at once or in tiles of `tile` rows and columns. Every tile
-/// sees as far beyond its edge as the network reaches, so the result is the same, bit for bit.
+/// [`Network::infer`] for any network: radiance, (3, H, W), at once or in tiles of `tile` rows and columns.
+/// Every tile sees as far beyond its edge as the network reaches, so the result is the same, bit for bit.
 ///
 /// # Errors
 /// A pass is missing.
-pub(super) fn run_tiled(network: &dyn Network, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+fn run_tiled<N: Network + ?Sized>(network: &N, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
     let multiple = network.multiple();
-    let mut inputs = network.inputs(passes)?;
-    inputs.planes = inputs.planes.into_iter().map(|planes| pad_to_multiple(planes, multiple)).collect();
+    let mut inputs = network.inputs(passes)?.padded(multiple);
     let (width, height) = (inputs.planes[0].width, inputs.planes[0].height);
     let most = network.whole_frame_pixels();
     // A tile is a square of half of what may be worked on at once: it sees beyond its edge as well.

@@ -94,6 +94,18 @@ struct Prediction<T> {
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
+    /// What a trunk level's head says.
+    fn of_level(head: Activation<T>) -> Self {
+        Self::split(head, 1, 0)
+    }
+
+    /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W).
+    fn of_full(head: Activation<T>) -> (Self, Field<T>) {
+        let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
+        let albedo_kernel = Field::from_activation(head.fork(), 4 * HEAD, albedo_taps, 2);
+        (Self::split(head, 2, albedo_taps), albedo_kernel)
+    }
+
     /// Parts a head's channels; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
     /// `between` are the channels before the corners that are not of this.
     fn split(head: Activation<T>, factor: usize, between: usize) -> Self {
@@ -203,10 +215,9 @@ impl Pyramid {
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
         // What is predicted for every pyramid level, full resolution first.
-        let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
-        let albedo_kernel = Field::from_activation(full.fork(), 4 * HEAD, albedo_taps, 2);
-        let mut levels = vec![Prediction::split(full, 2, albedo_taps)];
-        levels.extend(heads.into_iter().rev().map(|head| Prediction::split(head, 1, 0)));
+        let (finest, albedo_kernel) = Prediction::of_full(full);
+        let mut levels = vec![finest];
+        levels.extend(heads.into_iter().rev().map(Prediction::of_level));
 
         // The radiance pyramid, finest level first; then, from the coarsest up, each level is corrected by
         // what filtering changed in the one below, and filtered.

@@ -5,7 +5,10 @@ use std::{cell::RefCell, rc::Rc, sync::Arc};
 use dfdx::tensor::{Cpu, Merge, NoneTape, PutTape, Tape, TensorFromVec};
 use rayon::prelude::*;
 
-use super::{Activation, Images, pool::PlaneBuffer};
+use super::{
+    Activation, Images,
+    pool::{PlaneBuffer, plane_buffer, zeros},
+};
 use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
@@ -54,7 +57,7 @@ impl Saved {
         match &self.gradient {
             Some(slot) => {
                 let mut slot = slot.borrow_mut();
-                add(Some(slot.get_or_insert_with(|| PlaneBuffer::zeros(self.values.data.len()))));
+                add(Some(slot.get_or_insert_with(|| zeros(self.values.data.len()))));
             }
             None => add(None),
         }
@@ -83,7 +86,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// If the length of `values` is not what `extent` demands.
     pub fn input(extent: Extent, values: &[f32]) -> Self {
         assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
-        let mut data = PlaneBuffer::new(values.len());
+        let mut data = plane_buffer(values.len());
         data.copy_from_slice(values);
         Self::from_buffer(extent, data)
     }
@@ -129,7 +132,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         let shape = activation.shape();
         let planes = channels / (factor * factor);
         let extent = (shape.n, planes, factor * shape.h, factor * shape.w);
-        let mut data = PlaneBuffer::new(shape.n * channels * shape.h * shape.w);
+        let mut data = plane_buffer(shape.n * channels * shape.h * shape.w);
         from_blocked_shuffled(activation.saved.data.view(), first, factor, &mut data);
         let (mut field, out) = Self::output(extent, data, activation.tape);
         if T::OWNS_TAPE {
@@ -161,8 +164,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
             trust = Some(confidence.saved);
         }
         let values = (image.values.clone(), logits.values.clone(), trust.as_ref().map(|t| t.values.clone()));
-        let mut output = PlaneBuffer::new(images * 3 * h * w);
-        let mut total = PlaneBuffer::new(images * h * w);
+        let mut output = plane_buffer(images * 3 * h * w);
+        let mut total = plane_buffer(images * h * w);
         for (n, (output, total)) in output.chunks_mut(3 * h * w).zip(total.chunks_mut(h * w)).enumerate() {
             filter_of(&values, n, k, (0, h)).apply(tier, output, total);
         }
@@ -204,8 +207,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn reduce(self, confidence: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let quarter = h * w / 4;
-        let (mut output, mut total) =
-            (PlaneBuffer::new(images * 3 * quarter), PlaneBuffer::new(images * quarter));
+        let (mut output, mut total) = (plane_buffer(images * 3 * quarter), plane_buffer(images * quarter));
         let (image, trust) = (self.saved, confidence.saved);
         let (values, weights) = (image.values.clone(), trust.values.clone());
         output.par_chunks_mut(3 * quarter).zip(total.par_chunks_mut(quarter)).enumerate().for_each(
@@ -248,7 +250,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn product(self, other: Self) -> Self {
         assert_eq!(self.extent(), other.extent());
         let (a, b) = (self.saved, other.saved);
-        let mut output = PlaneBuffer::new(a.values.data.len());
+        let mut output = plane_buffer(a.values.data.len());
         combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a * b);
         let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
         if T::OWNS_TAPE {
@@ -274,7 +276,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn minus(self, other: Self) -> Self {
         assert_eq!(self.extent(), other.extent());
         let (a, b) = (self.saved, other.saved);
-        let mut output = PlaneBuffer::new(a.values.data.len());
+        let mut output = plane_buffer(a.values.data.len());
         combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a - b);
         let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
         if T::OWNS_TAPE {
@@ -300,7 +302,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
         let size = Size { h, w };
-        let mut output = PlaneBuffer::new(images * 3 * pixels);
+        let mut output = plane_buffer(images * 3 * pixels);
         let tape = self.tape.merge(correction.tape).merge(alpha.tape).merge(corners.tape);
         let (fine, below, mask, corners) = (self.saved, correction.saved, alpha.saved, corners.saved);
         let predicted = (mask.values.clone(), corners.values.clone());
@@ -315,7 +317,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                 let Some(gradient) = out.take() else { return Ok(()) };
                 let correction = &below.values;
                 // A fine level that is the network's input gets no gradient; the kernel's goes nowhere.
-                let mut nowhere = PlaneBuffer::new(0);
+                let mut nowhere = plane_buffer(0);
                 let run = |fine: &mut [f32], coarse: &mut [f32], alpha: &mut [f32], corners: &mut [f32]| {
                     fine.par_chunks_mut(3 * pixels)
                         .zip(coarse.par_chunks_mut(3 * quarter))
@@ -332,7 +334,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                 const LEARNED: &str = "what is blended was filtered or predicted";
                 fine.accumulate(|fine| {
                     let fine = fine.unwrap_or_else(|| {
-                        nowhere = PlaneBuffer::zeros(images * 3 * pixels);
+                        nowhere = zeros(images * 3 * pixels);
                         &mut nowhere
                     });
                     below.accumulate(|below| {
@@ -388,7 +390,7 @@ impl Field<NoneTape> {
         let h = rows.1 - rows.0;
         let values = |field: &Self| field.saved.values.clone();
         let problem = (values(self), values(logits), confidence.map(values));
-        let (mut output, mut total) = (PlaneBuffer::new(3 * h * w), PlaneBuffer::new(h * w));
+        let (mut output, mut total) = (plane_buffer(3 * h * w), plane_buffer(h * w));
         filter_of(&problem, 0, k, rows).apply(Tier::detect(), &mut output, &mut total);
         Self::from_buffer((1, 3, h, w), output)
     }
@@ -396,7 +398,7 @@ impl Field<NoneTape> {
     /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)
     pub fn blend_rows(&self, place: Place, correction: &Self, alpha: &Self, corners: &Self) -> Self {
         let (_, _, h, w) = self.extent();
-        let mut output = PlaneBuffer::new(3 * h * w);
+        let mut output = plane_buffer(3 * h * w);
         let masks = Masks { alpha: alpha.values(), corners: corners.values() };
         blend(Size { h, w }, place, (self.values(), correction.values()), masks, &mut output);
         Self::from_buffer((1, 3, h, w), output)

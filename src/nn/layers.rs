@@ -135,7 +135,7 @@ impl Conv {
             !self.relu && matches!(self.arithmetic.geometry, Geometry::Same(_)),
             "only a linear layer folds"
         );
-        let (scale, shift) = norm.scale_and_shift();
+        let (scale, shift) = norm.scale_and_shift(&norm.running());
         let (mut weights, mut bias) = (self.weight.values(), self.bias.values());
         let each = weights.len() / self.arithmetic.outputs;
         for (channel, (scale, shift)) in scale.into_iter().zip(shift).enumerate() {
@@ -336,13 +336,18 @@ impl BatchNorm {
         }
     }
 
-    /// What each channel is multiplied by, and what is added then, by the running statistics.
-    fn scale_and_shift(&self) -> (Vec<f32>, Vec<f32>) {
-        let inverse = self.variance.values().into_iter().map(|v| (v + Self::EPSILON).sqrt().recip());
-        let scale: Vec<f32> = self.scale.values().iter().zip(inverse).map(|(g, i)| g * i).collect();
-        let moved = self.mean.values().into_iter().zip(&scale).map(|(m, s)| s * m);
+    /// What each channel is multiplied by, and what is added then, where its mean and variance are these.
+    fn scale_and_shift(&self, moments: &[(f32, f32)]) -> (Vec<f32>, Vec<f32>) {
+        let scale: Vec<f32> =
+            self.scale.values().iter().zip(moments).map(|(g, m)| g * inverse(m.1)).collect();
+        let moved = moments.iter().zip(&scale).map(|((mean, _), s)| s * mean);
         let shift = self.shift.values().iter().zip(moved).map(|(b, m)| b - m).collect();
         (scale, shift)
+    }
+
+    /// The running mean and variance of each channel.
+    fn running(&self) -> Vec<(f32, f32)> {
+        self.mean.values().into_iter().zip(self.variance.values()).collect()
     }
 
     /// Normalises, scales, shifts, rectifies. (N, C, H, W) -> (N, C, H, W)
@@ -351,7 +356,7 @@ impl BatchNorm {
         let shape = input.shape();
         let count = (shape.n * shape.h * shape.w) as f64;
         let moments: Vec<(f32, f32)> = match stats {
-            Stats::Running => self.mean.values().into_iter().zip(self.variance.values()).collect(),
+            Stats::Running => self.running(),
             Stats::Batch(seen) => {
                 let moments = channel_moments(input.saved.data.view());
                 let unbias = count / (count - 1.0).max(1.0);
@@ -362,12 +367,7 @@ impl BatchNorm {
                 moments.into_iter().map(|(m, v)| (m as f32, v as f32)).collect()
             }
         };
-        let inverse: Vec<f32> = moments.iter().map(|(_, v)| (v + Self::EPSILON).sqrt().recip()).collect();
-        let gamma = self.scale.values();
-        let scale: Vec<f32> = gamma.iter().zip(&inverse).map(|(g, i)| g * i).collect();
-        let shift: Vec<f32> = (self.shift.values().iter().zip(&scale).zip(&moments))
-            .map(|((b, s), (m, _))| b - s * m)
-            .collect();
+        let (scale, shift) = self.scale_and_shift(&moments);
         let mut output = Buffer::new(shape);
         scale_shift(input.saved.data.view(), &scale, &shift, true, output.view_mut());
 
@@ -379,6 +379,7 @@ impl BatchNorm {
             activation.tape.add_backward_op(move |gradients| {
                 let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
                 relu_mask(out.data.view(), gradient.view_mut());
+                let inverse: Vec<f32> = moments.iter().map(|(_, variance)| inverse(*variance)).collect();
                 // Sums of g and of g * normalised input, each channel.
                 let mut sums = vec![(0.0f64, 0.0f64); shape.c];
                 each_row(shape, |c0, row| {
@@ -421,6 +422,11 @@ impl BatchNorm {
         }
         activation
     }
+}
+
+/// What divides by the standard deviation of a channel of this variance.
+fn inverse(variance: f32) -> f32 {
+    (variance + BatchNorm::EPSILON).sqrt().recip()
 }
 
 /// Calls `visit(first channel, blocks of the row)` for every row of every plane.

@@ -8,7 +8,7 @@ use dfdx::tensor::NoneTape;
 use super::{
     Activation, Field,
     activation::{Data, Saved},
-    pool::{Buffer, PlaneBuffer},
+    pool::{Buffer, plane_buffer},
 };
 use crate::kernels::bf16::Operand;
 
@@ -76,7 +76,7 @@ impl Rows for Field<NoneTape> {
         assert!(!above && !below, "fields have no border");
         let (_, channels, _, w) = parts[0].0.extent();
         let h = parts.iter().map(|(_, rows)| rows.len()).sum::<usize>();
-        let mut data = PlaneBuffer::new(channels * h * w);
+        let mut data = plane_buffer(channels * h * w);
         for (c, plane) in data.chunks_mut((h * w).max(1)).enumerate() {
             let mut plane = plane;
             for (part, rows) in parts {

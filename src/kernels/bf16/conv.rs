@@ -196,7 +196,7 @@ pub fn convolve(
     let planes: Vec<(*const Wide, usize)> = sources
         .iter()
         .flat_map(|source| {
-            let first = source.data.0.as_ptr();
+            let first = source.data.as_ptr();
             let step = grid.phases() * grid.positions();
             (0..source.planes() / grid.phases()).map(move |p| (first.wrapping_add(p * step), source.planes()))
         })
@@ -228,7 +228,7 @@ pub fn convolve(
         }
         Output::Bf16(operand) => {
             assert!(!epilogue.accumulate && !operand.grid.split);
-            Target::Bf16(SharedWide(operand.data.0.as_mut_ptr()), operand.grid)
+            Target::Bf16(SharedWide(operand.data.as_mut_ptr()), operand.grid)
         }
     };
     let tier = Tier::detect();

@@ -14,10 +14,17 @@ pub mod weight_grad;
 
 pub use engine::Engine;
 
+use std::ops::Deref;
+
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{Block, LANES, Shape, View, ViewMut, conv::Geometry, memory::Pool};
+use super::{
+    Block, LANES, Shape, View, ViewMut,
+    conv::Geometry,
+    memory::{Pool, Pooled},
+    plane::Plane,
+};
 
 /// Channels in a [`Wide`].
 pub const WIDE: usize = 2 * LANES;
@@ -56,60 +63,33 @@ struct Sums([[Block; CHUNK]; 2]);
 /// Free memory of operands.
 static FREE: Pool<Wide> = Pool::new();
 
-/// Pooled memory: at least as much as was asked for.
-#[derive(Debug)]
-struct Buffer(Vec<Wide>);
-
-impl Buffer {
-    fn new(len: usize) -> Self {
-        Self(FREE.take(len, Wide::ZERO))
-    }
+/// Memory for `len` values, which are whatever the last user left.
+fn allocate(len: usize) -> Pooled<Wide> {
+    FREE.take(len, Wide::ZERO)
 }
 
-impl Drop for Buffer {
-    fn drop(&mut self) {
-        FREE.give(std::mem::take(&mut self.0));
-    }
-}
-
-/// Gives every free buffer back to the system.
+/// Gives all free memory back to the system.
 pub fn clear() {
     FREE.clear();
 }
 
-/// A plane of positions: its extent, and how the four pixels of a square are dealt to four planes where a
-/// convolution takes steps of two.
+/// A plane of positions, and how the four pixels of a square are dealt to four planes where a convolution
+/// takes steps of two.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Grid {
-    h: usize,
-    w: usize,
-    pad: usize,
+    plane: Plane,
     split: bool,
 }
 
 impl Grid {
     fn new(shape: Shape, split: bool) -> Self {
         let factor = if split { 2 } else { 1 };
-        Self { h: shape.h / factor, w: shape.w / factor, pad: shape.pad, split }
+        Self { plane: shape.with_size(shape.h / factor, shape.w / factor).plane(), split }
     }
 
     /// Planes that one plane of the source becomes.
     fn phases(self) -> usize {
         if self.split { 4 } else { 1 }
-    }
-
-    fn stride(self) -> usize {
-        self.w + 2 * self.pad
-    }
-
-    /// Positions of a plane, borders included.
-    fn positions(self) -> usize {
-        (self.h + 2 * self.pad) * self.stride()
-    }
-
-    /// The position of row `y`, column 0.
-    fn row(self, y: usize) -> usize {
-        (y + self.pad) * self.stride() + self.pad
     }
 
     /// How far a chunk may read beyond the last position: to its own end, and as far as a tap reaches.
@@ -126,11 +106,18 @@ impl Grid {
     }
 }
 
+impl Deref for Grid {
+    type Target = Plane;
+    fn deref(&self) -> &Plane {
+        &self.plane
+    }
+}
+
 /// An activation in bfloat16: the left factor of [`conv::convolve`], and what it can write.
 #[derive(Debug)]
 pub struct Operand {
     /// `[image][plane of 32 channels][phase][position]`, then slack.
-    data: Buffer,
+    data: Pooled<Wide>,
     grid: Grid,
     shape: Shape,
 }
@@ -140,22 +127,14 @@ impl Operand {
     pub fn new(shape: Shape) -> Self {
         let grid = Grid::new(shape, false);
         let mut operand = Self::allocate(shape, grid);
-        let (len, stride) = (operand.planes() * shape.n * grid.positions(), grid.stride());
-        operand.data.0[..len].par_chunks_mut(grid.positions()).for_each(|plane| {
-            let (above, below) = (grid.pad * stride, (grid.pad + grid.h) * stride);
-            plane[..above].fill(Wide::ZERO);
-            plane[below..].fill(Wide::ZERO);
-            for row in plane[above..below].chunks_mut(stride) {
-                row[..grid.pad].fill(Wide::ZERO);
-                row[grid.pad + grid.w..].fill(Wide::ZERO);
-            }
-        });
+        let body = operand.body_mut();
+        body.par_chunks_mut(grid.positions()).for_each(|plane| grid.fill_border(plane, Wide::ZERO));
         operand
     }
 
     fn allocate(shape: Shape, grid: Grid) -> Self {
         let planes = shape.c.div_ceil(WIDE) * grid.phases();
-        Self { data: Buffer::new(shape.n * planes * grid.positions() + grid.slack()), grid, shape }
+        Self { data: allocate(shape.n * planes * grid.positions() + grid.slack()), grid, shape }
     }
 
     /// An activation rounded to bfloat16. `geometry` is that of the convolution that reads it.
@@ -164,7 +143,7 @@ impl Operand {
         let grid = Grid::new(shape, geometry == Geometry::Strided);
         let mut operand = Self::allocate(shape, grid);
         let planes = operand.planes();
-        let body = &mut operand.data.0[..shape.n * planes * grid.positions()];
+        let body = operand.body_mut();
         // Parts of planes, so that few planes still keep every thread busy.
         let part = if grid.split { grid.positions() } else { PART.min(grid.positions()) };
         body.par_chunks_mut(grid.positions()).enumerate().for_each(|(i, out)| {
@@ -195,7 +174,7 @@ impl Operand {
         let (s, stride) = (self.shape, self.shape.plane_stride());
         output.data.par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
             let (n, plane) = (i / s.planes(), i % s.planes());
-            let from = &self.data.0[(n * self.planes() + plane / 2) * stride..][..stride];
+            let from = &self.data[(n * self.planes() + plane / 2) * stride..][..stride];
             for (out, wide) in out.iter_mut().zip(from) {
                 let half = &wide.0[plane % 2 * LANES..][..LANES];
                 out.0.iter_mut().zip(half).for_each(|(o, h)| *o = h.to_f32());
@@ -211,18 +190,19 @@ impl Operand {
     pub fn copy_rows(&mut self, to: isize, source: &Operand, from: isize, count: usize) {
         let (grid, other) = (self.grid, source.grid);
         assert_eq!((self.shape.with_size(0, 0), self.shape.n), (source.shape.with_size(0, 0), 1));
-        assert_eq!((grid.w, grid.pad, grid.split, other.split), (other.w, other.pad, false, false));
-        let len = count * grid.stride();
-        let start = |grid: Grid, row: isize| {
-            let row = row.checked_add_unsigned(grid.pad).and_then(|row| usize::try_from(row).ok());
-            let row = row.filter(|row| row + count <= grid.h + 2 * grid.pad);
-            row.expect("rows lie inside the activation") * grid.stride()
-        };
-        let (to, from) = (start(grid, to), start(other, from));
-        for plane in 0..self.planes() {
-            let rows = &source.data.0[plane * other.positions() + from..][..len];
-            self.data.0[plane * grid.positions() + to..][..len].copy_from_slice(rows);
-        }
+        assert!(!grid.split && !other.split);
+        grid.copy_rows((self.body_mut(), to), *other, (source.body(), from), count);
+    }
+
+    /// Every plane, without the slack.
+    fn body(&self) -> &[Wide] {
+        &self.data[..self.shape.n * self.planes() * self.grid.positions()]
+    }
+
+    /// [`Operand::body`], to write.
+    fn body_mut(&mut self) -> &mut [Wide] {
+        let len = self.body().len();
+        &mut self.data[..len]
     }
 
     /// Its extent.
@@ -248,9 +228,8 @@ pub fn max_pool(input: &Operand) -> Operand {
     assert!(s.h.is_multiple_of(2) && s.w.is_multiple_of(2), "only even sizes halve");
     let mut output = Operand::new(s.with_size(s.h / 2, s.w / 2));
     let (from, to) = (input.grid, output.grid);
-    let len = output.planes() * s.n * to.positions();
-    output.data.0[..len].par_chunks_mut(to.positions()).enumerate().for_each(|(i, out)| {
-        let plane = &input.data.0[i * from.positions()..][..from.positions()];
+    output.body_mut().par_chunks_mut(to.positions()).enumerate().for_each(|(i, out)| {
+        let plane = &input.data[i * from.positions()..][..from.positions()];
         for y in 0..to.h {
             let top = &plane[from.row(2 * y)..][..from.w];
             let bottom = &plane[from.row(2 * y + 1)..][..from.w];

@@ -7,7 +7,9 @@
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{Block, Buffer, CHUNK, Engine, Geometry, Grid, LANES, Shape, Sums, View, WIDE, Wide, halves};
+use super::{
+    Block, CHUNK, Engine, Geometry, Grid, LANES, Pooled, Shape, Sums, View, WIDE, Wide, allocate, halves,
+};
 use crate::kernels::weight_grad::each_kernel;
 
 /// Products of 32 positions that keep both factors in the first-level cache over all taps.
@@ -17,7 +19,7 @@ const STEPS: usize = 8;
 #[derive(Debug)]
 pub struct Channels {
     /// `[image][plane of 32][channel]`, each a row of `stride` values.
-    data: Buffer,
+    data: Pooled<Wide>,
     stride: usize,
     shape: Shape,
 }
@@ -30,9 +32,8 @@ impl Channels {
         let grid = Grid::new(s, false);
         // An odd number of cache lines: rows of a tile then lie in different cache sets.
         let lines = (grid.positions() + grid.slack()).div_ceil(WIDE) | 1;
-        let len = s.n * planes * WIDE * lines;
-        let mut data = Buffer::new(len);
-        data.0[..len].par_chunks_mut(WIDE * lines).enumerate().for_each(|(i, out)| {
+        let mut data = allocate(s.n * planes * WIDE * lines);
+        data.par_chunks_mut(WIDE * lines).enumerate().for_each(|(i, out)| {
             let (low, high) = halves(source, i / planes, i % planes);
             let stride = lines * WIDE;
             let (lower, upper) = out.split_at_mut(LANES * lines);
@@ -61,7 +62,7 @@ impl Channels {
 #[derive(Debug)]
 pub struct Pairs {
     /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the left border of row 0.
-    data: Buffer,
+    data: Pooled<Wide>,
     rows: usize,
     grid: Grid,
     shape: Shape,
@@ -74,10 +75,9 @@ impl Pairs {
         let g = gradient.shape;
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
-        let len = g.n * g.planes() * grid.phases() * rows;
-        let mut data = Buffer::new(len);
+        let mut data = allocate(g.n * g.planes() * grid.phases() * rows);
         let origin = grid.row(0) - grid.pad;
-        data.0[..len].par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
+        data.par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
             let (phase, plane) = (i % grid.phases(), i / grid.phases());
             let blocks = &gradient.data[plane * g.plane_stride()..][..g.plane_stride()];
             if grid.split {
@@ -158,10 +158,9 @@ pub fn weight_gradient(
                         let position = signed(grid.row(0) - grid.pad + step * CHUNK) + shift;
                         // SAFETY: borders and slack cover the shift; `ready` was called.
                         unsafe {
-                            let channels =
-                                source.data.0.as_ptr().cast::<bf16>().add(channels).offset(position);
+                            let channels = source.data.as_ptr().cast::<bf16>().add(channels).offset(position);
                             let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
-                            let pairs = output_gradient.data.0.as_ptr().add(at);
+                            let pairs = output_gradient.data.as_ptr().add(at);
                             let stride = source.stride * size_of::<bf16>();
                             engine.correlate(count, channels, stride, pairs, (outputs, phases), sums);
                         }

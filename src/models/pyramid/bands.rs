@@ -8,10 +8,10 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{ALBEDO_KERNEL, HEAD, KERNEL, LEVELS, Prediction, Pyramid};
+use super::{ALBEDO_KERNEL, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
-    features::{Inputs, exposure, guides_exposed, pad_to_multiple},
+    features::{Inputs, exposure, guides_exposed},
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -39,8 +39,7 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     let mut image = Planes::new(3, passes.width, passes.height);
     for y in (0..height).step_by(rows) {
         let band = passes.rows(network.passes(), y..(y + rows).min(passes.height));
-        let mut inputs = guides_exposed(&band, exposure, NEEDED_BY)?;
-        inputs.planes = inputs.planes.into_iter().map(|p| pad_to_multiple(p, multiple)).collect();
+        let inputs = guides_exposed(&band, exposure, NEEDED_BY)?.padded(multiple);
         let mut done = |first: usize, field: &Field| {
             let (_, _, h, w) = field.extent();
             for (c, plane) in field.values().chunks(h * w).enumerate() {
@@ -225,13 +224,12 @@ impl<'a> Frame<'a> {
                 continue;
             }
             let head = self.network.heads[level].forward(vec![refined.rows(rows.clone())]);
-            self.scales[level + 1].predicted(rows.clone(), Prediction::split(head, 1, 0));
+            self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
-                self.albedo_kernels.push_back(Field::from_activation(head.fork(), 4 * HEAD, albedo_taps, 2));
-                let rows = 2 * rows.start..2 * rows.end;
-                self.scales[0].predicted(rows, Prediction::split(head, 2, albedo_taps));
+                let (prediction, albedo_kernel) = Prediction::of_full(head);
+                self.albedo_kernels.push_back(albedo_kernel);
+                self.scales[0].predicted(2 * rows.start..2 * rows.end, prediction);
             }
         }
     }
