@@ -3,7 +3,11 @@
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
-    conv::{Epilogue, Geometry, convolve, packed_len},
+    bf16::{
+        Engine, Operand,
+        conv::{self, Output, Weights},
+    },
+    conv::{Direction, Epilogue, Geometry, convolve, packed_len},
     peak,
     simd::Tier,
     weight_grad::weight_gradient,
@@ -14,9 +18,11 @@ fn main() {
     divan::main();
 }
 
+/// Images, input channels, output channels, rows, columns.
+type Layer = (usize, usize, usize, usize, usize);
+
 /// Layers of the base-16 dual encoder on 8 patches of 128x128, and full-resolution inference.
-const LAYERS: [(usize, usize, usize, usize, usize); 6] = [
-    // images, input channels, output channels, rows, columns
+const LAYERS: [Layer; 6] = [
     (8, 16, 16, 128, 128),
     (8, 32, 32, 64, 64),
     (8, 64, 64, 32, 32),
@@ -25,54 +31,126 @@ const LAYERS: [(usize, usize, usize, usize, usize); 6] = [
     (1, 64, 64, 184, 320),
 ];
 
+/// Layers of `demc-s` and `demc-m` on a frame of 1280x720.
+const SHIPPED: [Layer; 4] =
+    [(1, 32, 32, 360, 640), (1, 96, 96, 360, 640), (1, 96, 96, 180, 320), (1, 112, 112, 45, 80)];
+
 fn blocks(len: usize) -> Vec<Block> {
     (0..len).map(|i| Block([(i % 7) as f32 * 0.1; LANES])).collect()
 }
 
-fn flops(n: usize, i: usize, o: usize, h: usize, w: usize, taps: usize) -> ItemsCount {
-    ItemsCount::new(2 * n * i * o * h * w * taps)
+/// Of a convolution that reads `h` x `w` pixels: a strided one makes a quarter as many, with every tap.
+fn flops((n, i, o, h, w): Layer, geometry: Geometry) -> ItemsCount {
+    let pixels = if geometry == Geometry::Strided { h * w / 4 } else { h * w };
+    ItemsCount::new(2 * n * i * o * pixels * geometry.taps())
 }
 
-fn forward(bencher: Bencher, (n, i, o, h, w): (usize, usize, usize, usize, usize), geometry: Geometry) {
+fn convolution(bencher: Bencher, layer: Layer, geometry: Geometry, epilogue: Epilogue) {
+    let (n, i, o, h, w) = layer;
     let tier = Tier::detect();
-    let shape = Shape::new(n, i, h, w);
+    let pad = if geometry == Geometry::Same(5) { 2 } else { 1 };
+    let shape = Shape { pad, ..Shape::new(n, i, h, w) };
     let (oh, ow) = geometry.output(h, w);
     let out_shape = shape.with_channels(o).with_size(oh, ow);
     let x = blocks(shape.blocks());
     let weights = blocks(packed_len(&[i], o, geometry));
     let bias = blocks(o.div_ceil(LANES));
     let mut out = blocks(out_shape.blocks());
-    let relu = Epilogue { relu: true, accumulate: false };
-    bencher.counter(flops(n, i, o, h, w, geometry.taps())).bench_local(|| {
+    bencher.counter(flops(layer, geometry)).bench_local(|| {
         let out = ViewMut::new(out_shape, &mut out);
-        convolve(tier, &[View::new(shape, &x)], &weights, &bias, geometry, relu, out);
+        convolve(tier, &[View::new(shape, &x)], &weights, &bias, geometry, epilogue, out);
+    });
+}
+
+fn forward(bencher: Bencher, layer: Layer, geometry: Geometry) {
+    convolution(bencher, layer, geometry, Epilogue { relu: true, accumulate: false });
+}
+
+/// As `forward`, between activations that stay in bfloat16.
+fn forward_bf16(bencher: Bencher, layer: Layer, geometry: Geometry) {
+    let (n, i, o, h, w) = layer;
+    let engine = Engine::detect();
+    let shape = Shape::new(n, i, h, w);
+    let (oh, ow) = geometry.output(h, w);
+    let x = blocks(shape.blocks());
+    let x = Operand::narrow(engine, View::new(shape, &x), geometry);
+    let weights = vec![0.01; i * o * geometry.taps()];
+    let weights = Weights::pack(&weights, &[i], o, geometry, Direction::Forward, 0);
+    let bias = blocks(o.div_ceil(LANES));
+    let mut out = Operand::new(shape.with_channels(o).with_size(oh, ow));
+    let relu = Epilogue { relu: true, accumulate: false };
+    bencher.counter(flops(layer, geometry)).bench_local(|| {
+        conv::convolve(engine, &[&x], &weights, &bias, relu, Output::Bf16(&mut out));
+    });
+}
+
+fn weight_gradient_of(bencher: Bencher, layer: Layer, geometry: Geometry) {
+    let (n, i, o, h, w) = layer;
+    let (oh, ow) = geometry.output(h, w);
+    let (shape, g_shape) = (Shape::new(n, i, h, w), Shape::new(n, o, oh, ow));
+    let (x, g) = (blocks(shape.blocks()), blocks(g_shape.blocks()));
+    let mut gradient = vec![0.0; i * o * geometry.taps()];
+    bencher.counter(flops(layer, geometry)).bench_local(|| {
+        let (x, g) = (View::new(shape, &x), View::new(g_shape, &g));
+        weight_gradient(Tier::detect(), x, g, geometry, (0, i), &mut gradient);
     });
 }
 
 #[divan::bench(args = LAYERS)]
-fn conv3x3(bencher: Bencher, layer: (usize, usize, usize, usize, usize)) {
+fn conv3x3(bencher: Bencher, layer: Layer) {
     forward(bencher, layer, Geometry::Same(3));
 }
 
 #[divan::bench(args = LAYERS)]
-fn fusion1x1(bencher: Bencher, layer: (usize, usize, usize, usize, usize)) {
+fn conv3x3_input_gradient(bencher: Bencher, (n, i, o, h, w): Layer) {
+    let add = Epilogue { relu: false, accumulate: true };
+    convolution(bencher, (n, o, i, h, w), Geometry::Same(3).backward(), add);
+}
+
+#[divan::bench(args = LAYERS)]
+fn conv3x3_weight_gradient(bencher: Bencher, layer: Layer) {
+    weight_gradient_of(bencher, layer, Geometry::Same(3));
+}
+
+#[divan::bench(args = &LAYERS[..4])]
+fn conv5x5(bencher: Bencher, layer: Layer) {
+    forward(bencher, layer, Geometry::Same(5));
+}
+
+#[divan::bench(args = LAYERS)]
+fn fusion1x1(bencher: Bencher, layer: Layer) {
     forward(bencher, layer, Geometry::Same(1));
 }
 
 #[divan::bench(args = &LAYERS[..4])]
-fn transposed4x4(bencher: Bencher, layer: (usize, usize, usize, usize, usize)) {
+fn transposed4x4(bencher: Bencher, layer: Layer) {
     forward(bencher, layer, Geometry::Transposed);
 }
 
 #[divan::bench(args = &LAYERS[..4])]
-fn conv3x3_weight_gradient(bencher: Bencher, (n, i, o, h, w): (usize, usize, usize, usize, usize)) {
-    let (shape, g_shape) = (Shape::new(n, i, h, w), Shape::new(n, o, h, w));
-    let (x, g) = (blocks(shape.blocks()), blocks(g_shape.blocks()));
-    let mut gradient = vec![0.0; i * o * 9];
-    bencher.counter(flops(n, i, o, h, w, 9)).bench_local(|| {
-        let (x, g) = (View::new(shape, &x), View::new(g_shape, &g));
-        weight_gradient(Tier::detect(), x, g, Geometry::Same(3), (0, i), &mut gradient);
-    });
+fn transposed4x4_input_gradient(bencher: Bencher, (n, i, o, h, w): Layer) {
+    let add = Epilogue { relu: false, accumulate: true };
+    convolution(bencher, (n, o, i, 2 * h, 2 * w), Geometry::Transposed.backward(), add);
+}
+
+#[divan::bench(args = &LAYERS[..4])]
+fn transposed4x4_weight_gradient(bencher: Bencher, layer: Layer) {
+    weight_gradient_of(bencher, layer, Geometry::Transposed);
+}
+
+#[divan::bench(args = SHIPPED)]
+fn bf16_conv3x3(bencher: Bencher, layer: Layer) {
+    forward_bf16(bencher, layer, Geometry::Same(3));
+}
+
+#[divan::bench(args = SHIPPED)]
+fn bf16_fusion1x1(bencher: Bencher, layer: Layer) {
+    forward_bf16(bencher, layer, Geometry::Same(1));
+}
+
+#[divan::bench(args = SHIPPED)]
+fn bf16_transposed4x4(bencher: Bencher, layer: Layer) {
+    forward_bf16(bencher, layer, Geometry::Transposed);
 }
 
 /// Register-to-register FMAs on every thread: what the machine can do at best.
@@ -82,6 +160,6 @@ fn fma_peak(bencher: Bencher) {
     let threads = rayon::current_num_threads();
     bencher.counter(ItemsCount::new(threads * peak::flops(STEPS))).bench_local(|| {
         // Unless its result is used and its length unknown, the compiler drops it.
-        rayon::broadcast(|_| peak::run(Tier::detect(), divan::black_box(STEPS)))
+        rayon::broadcast(|_| divan::black_box(peak::run(Tier::detect(), divan::black_box(STEPS))))
     });
 }

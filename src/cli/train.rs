@@ -196,7 +196,7 @@ impl Args {
             patch: self.patch,
             lr: self.lr,
             loss: self.loss,
-            precision: self.precision.unwrap_or_else(Precision::for_training),
+            precision: self.precision.unwrap_or_else(Precision::fastest),
             average: self.average,
             every: self.every,
             seed: self.seed,

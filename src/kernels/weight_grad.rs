@@ -4,13 +4,31 @@ use rayon::prelude::*;
 
 use super::{
     Block, LANES, Shape, Shared, View,
-    conv::{Geometry, weight_index},
+    conv::Geometry,
+    memory::Pool,
     simd::{Kernel, Simd, Tier},
 };
 
 /// Lanes of the input that one pass over the pixels serves: 2 output planes x 8 lanes, or 1 x 8,
 /// accumulators stay in registers.
 const CHUNK: usize = 8;
+
+/// Tasks that keep a workstation's threads busy.
+const TASKS: usize = 8;
+
+/// Rows that make a task of their own worth its sum.
+const PART_ROWS: usize = 32;
+
+/// Pixels of a band, whose input and output gradient stay in the first-level cache over all taps.
+const BAND_PIXELS: usize = 256;
+
+/// Memory for sums.
+static SLABS: Pool<Block> = Pool::new();
+
+/// Gives all free memory back to the system.
+pub fn clear() {
+    SLABS.clear();
+}
 
 /// Adds the weight gradient of one source to `gradient`, laid out like the layer's weights
 /// (`(O, I, k, k)`, transposed: `(I, O, 4, 4)`); `first` is the source's first input channel of
@@ -36,11 +54,13 @@ pub fn weight_gradient(
     let taps = geometry.taps();
     assert_eq!(gradient.len(), inputs * g.c * taps);
 
-    // Few planes leave too few tasks, so images become tasks as well, each with its own sum.
+    // Few planes leave too few tasks, so rows become tasks as well, each with its own sum.
     let pairs = g.planes().div_ceil(2) * s.planes();
-    let parts = if pairs >= 8 { 1 } else { s.n.min(8) };
+    let rows = s.n * s.h;
+    let parts = if pairs >= TASKS { 1 } else { (rows / PART_ROWS).clamp(1, TASKS) };
     let slabs = g.planes() * s.planes() * taps * LANES;
-    let mut partial = vec![Block::default(); slabs * parts];
+    let mut partial = SLABS.take(slabs * parts, Block::default());
+    partial.fill(Block::default());
     let pointer = Shared(partial.as_mut_ptr());
     (0..parts * pairs).into_par_iter().for_each(|task| {
         let (part, pair) = (task / pairs, task % pairs);
@@ -49,7 +69,7 @@ pub fn weight_gradient(
             source,
             gradient: output_gradient,
             geometry,
-            images: (part * s.n / parts, (part + 1) * s.n / parts),
+            rows: (part * rows / parts, (part + 1) * rows / parts),
             input,
             outputs: (2 * group, g.planes().min(2 * group + 2)),
             pointer,
@@ -77,14 +97,21 @@ pub(super) fn each_kernel(
     visit: impl Fn(usize, usize, &mut [f32]) + Sync,
 ) {
     let taps = geometry.taps();
-    weights.par_chunks_mut(taps).enumerate().for_each(|(at, chunk)| {
-        let (o, i) = match geometry {
-            Geometry::Same(_) => (at / inputs, at % inputs),
-            _ => (at % outputs, at / outputs),
-        };
-        debug_assert_eq!(weight_index(geometry, outputs, inputs, o, i, 0), at * taps);
-        if (first..first + channels).contains(&i) {
-            visit(o, i - first, chunk);
+    let same = matches!(geometry, Geometry::Same(_));
+    let columns = if same { inputs } else { outputs };
+    // A plane of outputs by a plane of inputs at a time, whose sums then stay in the first-level cache.
+    weights.par_chunks_mut(LANES * columns * taps).enumerate().for_each(|(rows, weights)| {
+        for tile in (0..columns).step_by(LANES) {
+            for (row, weights) in weights.chunks_mut(columns * taps).enumerate() {
+                let tiles = weights[tile * taps..].chunks_mut(taps).take(LANES);
+                for (column, chunk) in (tile..).zip(tiles) {
+                    let row = rows * LANES + row;
+                    let (o, i) = if same { (row, column) } else { (column, row) };
+                    if (first..first + channels).contains(&i) {
+                        visit(o, i - first, chunk);
+                    }
+                }
+            }
         }
     });
 }
@@ -94,7 +121,8 @@ struct Pair<'a> {
     source: View<'a>,
     gradient: View<'a>,
     geometry: Geometry,
-    images: (usize, usize),
+    /// Of all images, one below another.
+    rows: (usize, usize),
     input: usize,
     outputs: (usize, usize),
     pointer: Shared,
@@ -123,28 +151,32 @@ impl Pair<'_> {
     unsafe fn taps<S: Simd, const OUT: usize>(&self, output: usize) {
         let taps = self.geometry.taps();
         let s = self.source.shape;
-        // Rows are taken in bands that stay in the first-level cache over all taps.
-        let band = (256 / s.w.max(1)).clamp(1, s.h.max(1));
+        let band = match self.geometry {
+            Geometry::Same(_) => BAND_PIXELS,
+            // Four pixels of the gradient go with one of the input.
+            _ => BAND_PIXELS / 4,
+        };
+        let band = (band / s.w.max(1)).max(1);
         let lanes = s.lanes(self.input);
-        for n in self.images.0..self.images.1 {
-            for y0 in (0..s.h).step_by(band) {
-                let rows = (y0, s.h.min(y0 + band));
-                for t in 0..taps {
-                    // SAFETY: see `run`.
-                    unsafe {
-                        let slabs: [*mut Block; OUT] = std::array::from_fn(|o| {
-                            self.pointer
-                                .at(self.offset
-                                    + (((output + o) * s.planes() + self.input) * taps + t) * LANES)
-                        });
-                        for lane in (0..lanes).step_by(CHUNK) {
-                            let slabs = slabs.map(|p| p.add(lane));
-                            match self.geometry {
-                                Geometry::Same(k) => {
-                                    self.accumulate::<S, OUT, 1>(n, rows, output, lane, k, t, slabs)
-                                }
-                                _ => self.accumulate::<S, OUT, 2>(n, rows, output, lane, 4, t, slabs),
+        let mut row = self.rows.0;
+        while row < self.rows.1 {
+            let (n, y0) = (row / s.h, row % s.h);
+            let rows = (y0, s.h.min(y0 + band).min(y0 + self.rows.1 - row));
+            row += rows.1 - rows.0;
+            for t in 0..taps {
+                // SAFETY: see `run`.
+                unsafe {
+                    let slabs: [*mut Block; OUT] = std::array::from_fn(|o| {
+                        let slab = ((output + o) * s.planes() + self.input) * taps + t;
+                        self.pointer.at(self.offset + slab * LANES)
+                    });
+                    for lane in (0..lanes).step_by(CHUNK) {
+                        let slabs = slabs.map(|p| p.add(lane));
+                        match self.geometry {
+                            Geometry::Same(k) => {
+                                self.accumulate::<S, OUT, 1>(n, rows, output, lane, k, t, slabs)
                             }
+                            _ => self.accumulate::<S, OUT, 2>(n, rows, output, lane, 4, t, slabs),
                         }
                     }
                 }

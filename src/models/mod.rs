@@ -104,7 +104,7 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     let (plain, precision) = match name_or_file.rsplit_once(':') {
         Some((plain, "f32")) => (plain, Precision::F32),
         Some((plain, "bf16")) => (plain, Precision::Bf16),
-        _ => (name_or_file, Precision::for_inference()),
+        _ => (name_or_file, Precision::fastest()),
     };
     let learned = |model: learned::Learned| Box::new(model.with_precision(name_or_file, precision));
     match plain {

@@ -22,14 +22,9 @@ pub enum Precision {
 }
 
 impl Precision {
-    /// The faster one for inference on this processor.
-    pub fn for_inference() -> Self {
+    /// The faster one on this processor.
+    pub fn fastest() -> Self {
         if Engine::detect().is_native() { Self::Bf16 } else { Self::F32 }
-    }
-
-    /// The faster one for training on this processor.
-    pub fn for_training() -> Self {
-        if Engine::detect().trains() { Self::Bf16 } else { Self::F32 }
     }
 }
 

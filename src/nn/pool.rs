@@ -85,4 +85,5 @@ pub fn clear() {
     BLOCKS.clear();
     VALUES.clear();
     crate::kernels::bf16::clear();
+    crate::kernels::weight_grad::clear();
 }

@@ -58,18 +58,9 @@ impl Engine {
         })
     }
 
-    /// Whether forward products are faster than f32 ones.
+    /// Whether its products are faster than those of f32.
     pub fn is_native(self) -> bool {
         self != Engine::PORTABLE
-    }
-
-    /// Whether the products of training are faster than f32 ones, weight gradients included.
-    pub fn trains(self) -> bool {
-        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-        if self.0 == Unit::Amx {
-            return true;
-        }
-        false
     }
 
     /// Makes the processor ready for products on this thread while `work` runs.
@@ -127,9 +118,11 @@ impl Engine {
         // SAFETY: as in `multiply`.
         unsafe {
             match self.0 {
+                Unit::Portable => portable::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
+                #[cfg(target_arch = "x86_64")]
+                Unit::Avx512 => avx512::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
                 Unit::Amx => amx::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
-                _ => portable::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
             }
         }
     }
@@ -343,6 +336,63 @@ mod avx512 {
                 for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
                     // SAFETY: a block is 64 bytes, aligned to as many.
                     unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), *acc) };
+                }
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    pub unsafe fn correlate(
+        steps: usize,
+        channels: *const bf16,
+        stride: usize,
+        pairs: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            if outputs == 2 {
+                correlate_tiles::<2>(steps, channels, stride, pairs, plane, sums);
+            } else {
+                correlate_tiles::<1>(steps, channels, stride, pairs, plane, sums);
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    #[inline]
+    unsafe fn correlate_tiles<const OUT: usize>(
+        steps: usize,
+        channels: *const bf16,
+        stride: usize,
+        pairs: *const Wide,
+        plane: usize,
+        sums: &mut Sums,
+    ) {
+        for first in (0..CHUNK).step_by(TILE) {
+            // SAFETY: the caller's promise; a block is 64 bytes, aligned to as many.
+            unsafe {
+                let mut acc: [[__m512; TILE]; OUT] = std::array::from_fn(|o| {
+                    std::array::from_fn(|c| _mm512_load_ps(sums.0[o][first + c].0.as_ptr()))
+                });
+                let rows = channels.byte_add(first * stride);
+                for pair in 0..steps * CHUNK / 2 {
+                    let g: [__m512bh; OUT] = std::array::from_fn(|o| {
+                        std::mem::transmute(_mm512_load_si512(pairs.add(o * plane + pair).cast()))
+                    });
+                    for c in 0..TILE {
+                        let x = rows.byte_add(c * stride).add(2 * pair).cast::<i32>().read_unaligned();
+                        let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(x));
+                        for o in 0..OUT {
+                            acc[o][c] = _mm512_dpbf16_ps(acc[o][c], g[o], x);
+                        }
+                    }
+                }
+                for (acc, sums) in acc.iter().zip(&mut sums.0) {
+                    for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
+                        _mm512_store_ps(sum.0.as_mut_ptr(), *acc);
+                    }
                 }
             }
         }

@@ -1,0 +1,92 @@
+"""Copies a folder of training pairs with its references cleaned: B of README.md from A.
+
+    python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
+
+Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the scene's
+noisy frame as guides, denoised first. Noisy frames are copied as they are. What is there already is kept.
+"""
+
+import argparse
+import glob
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "blender_scripts"))
+
+from demc_blender import exr
+
+
+def planes(channels, ending, letters):
+    """The channels of the one pass whose name ends so, (height, width, 3)."""
+    found = [[c for c in channels if c.endswith(f"{ending}.{letter}")] for letter in letters]
+    if any(len(names) != 1 for names in found):
+        raise ValueError(f"no single pass {ending}")
+    return np.stack([channels[names[0]].astype("<f4") for names in found], axis=-1), [names[0] for names in found]
+
+
+def write_pfm(path, image):
+    with open(path, "wb") as file:
+        file.write(b"PF\n%d %d\n-1.0\n" % (image.shape[1], image.shape[0]))
+        file.write(image[::-1].astype("<f4").tobytes())
+
+
+def read_pfm(path):
+    with open(path, "rb") as file:
+        kind, size, scale = (file.readline().split() for _ in range(3))
+        if kind != [b"PF"] or float(scale[0]) >= 0:
+            raise ValueError(f"{path}: not a little-endian colour PFM")
+        width, height = map(int, size)
+        values = np.frombuffer(file.read(), "<f4").reshape(height, width, 3)
+    return values[::-1]
+
+
+def clean(oidn, folder, reference, albedo, normal):
+    """The reference without its noise."""
+    path = lambda name: os.path.join(folder, name + ".pfm")
+    run = lambda *arguments: subprocess.run(
+        [oidn, "-d", "cpu", "-q", "high", *arguments], check=True, stdout=subprocess.DEVNULL)
+    for name, image in (("reference", reference), ("albedo", albedo), ("normal", normal)):
+        write_pfm(path(name), image)
+    run("--alb", path("albedo"), "-o", path("clean_albedo"))
+    run("--nrm", path("normal"), "-o", path("clean_normal"))
+    run("--hdr", path("reference"), "--alb", path("clean_albedo"), "--nrm", path("clean_normal"), "--clean_aux",
+        "-o", path("clean"))
+    return read_pfm(path("clean"))
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="clean_references.py", description="Denoises the references of training pairs.")
+    parser.add_argument("pairs", help="folder of <scene>_<spp>spp.exr and <scene>_ref.exr")
+    parser.add_argument("out", help="folder for the pairs with clean references")
+    parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    options = parser.parse_args()
+    os.makedirs(options.out, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for source in sorted(glob.glob(os.path.join(glob.escape(options.pairs), "*_ref.exr"))):
+            scene = os.path.basename(source).removesuffix("_ref.exr")
+            target = os.path.join(options.out, os.path.basename(source))
+            noisy = sorted(glob.glob(os.path.join(glob.escape(options.pairs), glob.escape(scene) + "_[0-9]*spp*.exr")))
+            if os.path.exists(target) or not noisy:
+                continue
+            for path in noisy:
+                shutil.copy(path, options.out)
+            channels, guides = exr.read(source), exr.read(noisy[0])
+            reference, names = planes(channels, "Combined", "RGB")
+            albedo, _ = planes(guides, "Denoising Albedo", "RGB")
+            normal, _ = planes(guides, "Denoising Normal", "XYZ")
+            cleaned = clean(options.oidn, folder, reference, albedo, normal)
+            channels.update({name: cleaned[..., c] for c, name in enumerate(names)})
+            exr.write_half(target + ".tmp", channels)
+            os.replace(target + ".tmp", target)
+            print(scene, flush=True)
+
+
+if __name__ == "__main__":
+    main()
