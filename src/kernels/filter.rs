@@ -3,13 +3,14 @@
 //! A pixel's filtered value is `sum_k w_k x_k / sum_k w_k` over its k x k neighbourhood with
 //! `w_k = exp(logit_k + confidence_k)`: the pixel says how much it wants each neighbour, the neighbour
 //! says how far it can be trusted (a firefly marks itself once, instead of in 25 kernels). Neighbours
-//! outside the image have no weight.
+//! outside the image have no weight. Every pixel's largest exponent is subtracted from all of its own, which
+//! changes nothing but keeps the sum from overflowing, however large a network's logits have grown.
 
 use rayon::prelude::*;
 
 use super::simd::{Kernel, Simd, Tier};
 
-/// Exponents are kept within this of zero, so that no sum overflows and none vanishes.
+/// Exponents are kept within this of zero: `e^-40` is no weight beside 1.
 const LIMIT: f32 = 40.0;
 
 /// Rows and columns of an image.
@@ -132,9 +133,15 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// The unnormalised weights of one tap along row `y` of those filtered, columns `x0..x1`.
+    /// Calls `put(pixel, exponent)` on the pixels of row `y` of those filtered that have a neighbour at this tap.
     #[inline(always)]
-    fn weights(&self, y: usize, tap: usize, row: usize, dx: isize, out: &mut [f32]) -> (usize, usize) {
+    fn exponents(
+        &self,
+        y: usize,
+        (tap, row, dx): (usize, usize, isize),
+        out: &mut [f32],
+        put: impl Fn(&mut f32, f32),
+    ) {
         let Size { w, .. } = self.size;
         let (x0, x1) = columns(w, dx);
         let logits = &self.logits[tap * self.filtered() + y * w..][x0..x1];
@@ -142,16 +149,38 @@ impl<'a> Filter<'a> {
         match self.confidence {
             Some(confidence) => {
                 let confidence = &confidence[row * w..][(x0 as isize + dx) as usize..][..x1 - x0];
-                for ((out, l), c) in out.iter_mut().zip(logits).zip(confidence) {
-                    *out = exp(l + c);
-                }
+                out.iter_mut().zip(logits).zip(confidence).for_each(|((out, l), c)| put(out, l + c));
             }
-            None => out.iter_mut().zip(logits).for_each(|(out, l)| *out = exp(*l)),
+            None => out.iter_mut().zip(logits).for_each(|(out, l)| put(out, *l)),
         }
+    }
+
+    /// The largest exponent of each pixel of row `y` of those filtered.
+    #[inline(always)]
+    fn largest(&self, y: usize, out: &mut [f32]) {
+        out.fill(f32::NEG_INFINITY);
+        let larger = |out: &mut f32, exponent: f32| *out = if exponent > *out { exponent } else { *out };
+        self.taps(y, |tap, row, dx| self.exponents(y, (tap, row, dx), out, larger));
+    }
+
+    /// The weights of one tap along row `y` of those filtered, columns `x0..x1`, beside that of the `largest`
+    /// exponent.
+    #[inline(always)]
+    fn weights(
+        &self,
+        y: usize,
+        tap: (usize, usize, isize),
+        largest: &[f32],
+        out: &mut [f32],
+    ) -> (usize, usize) {
+        let (x0, x1) = columns(self.size.w, tap.2);
+        self.exponents(y, tap, out, |out, exponent| *out = exponent);
+        out[x0..x1].iter_mut().zip(&largest[x0..x1]).for_each(|(out, most)| *out = exp(*out - most));
         (x0, x1)
     }
 
-    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights.
+    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights, the largest of
+    /// which is 1.
     ///
     /// # Panics
     /// If lengths do not fit the size.
@@ -202,9 +231,10 @@ impl Kernel for Forward<'_, '_> {
         for out in [&mut *r, &mut *g, &mut *b, &mut *total] {
             out.fill(0.0);
         }
-        let mut weights = vec![0.0; w];
+        let (mut weights, mut largest) = (vec![0.0; w], vec![0.0; w]);
+        self.filter.largest(self.y, &mut largest);
         self.filter.taps(self.y, |tap, row, dx| {
-            let (x0, x1) = self.filter.weights(self.y, tap, row, dx, &mut weights);
+            let (x0, x1) = self.filter.weights(self.y, (tap, row, dx), &largest, &mut weights);
             let len = x1 - x0;
             let weights = &weights[x0..x1];
             let from = row * w + (x0 as isize + dx) as usize;
@@ -236,11 +266,12 @@ impl Kernel for Backward<'_, '_> {
         let Size { h, w } = self.filter.size;
         let n = h * w;
         let FilterGradient { mut image, logits, mut confidence } = self.into;
-        let (mut weights, mut slope) = (vec![0.0; w], vec![0.0; w]);
+        let (mut weights, mut slope, mut largest) = (vec![0.0; w], vec![0.0; w], vec![0.0; w]);
         for y in 0..h {
             let total = &self.total[y * w..][..w];
+            self.filter.largest(y, &mut largest);
             self.filter.taps(y, |tap, row, dx| {
-                let (x0, x1) = self.filter.weights(y, tap, row, dx, &mut weights);
+                let (x0, x1) = self.filter.weights(y, (tap, row, dx), &largest, &mut weights);
                 let len = x1 - x0;
                 let weights = &mut weights[x0..x1];
                 weights.iter_mut().zip(&total[x0..x1]).for_each(|(w, t)| *w /= t);
@@ -328,6 +359,53 @@ pub fn reduce_gradient(
                 into_confidence[at] += g * weight * (image[c * n + at] - output[c * h * w + to]);
                 if let Some(into) = &mut into_image {
                     into[c * n + at] += g * weight;
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Logits of a network that is sure of itself reach hundreds; the sum of their exponentials does not fit.
+    #[test]
+    fn large_logits_are_filtered_as_a_softmax_says() {
+        let (size, k) = (Size { h: 3, w: 21 }, 5);
+        let n = size.pixels();
+        let wave = |i: usize, scale: f32| ((i * 7919) as f32).sin() * scale;
+        let image: Vec<f32> = (0..3 * n).map(|i| 1.0 + wave(i, 0.9)).collect();
+        let confidence: Vec<f32> = (0..n).map(|i| wave(i + 5, 30.0)).collect();
+        for (offset, confidence) in [(0.0, None), (500.0, Some(&confidence[..])), (-500.0, None)] {
+            let logits: Vec<f32> = (0..k * k * n).map(|i| offset + wave(i, 150.0)).collect();
+            let filter = Filter { size, rows: (0, size.h), k, image: &image, logits: &logits, confidence };
+            let (mut output, mut total) = (vec![0.0; 3 * n], vec![0.0; n]);
+            for tier in Tier::available() {
+                filter.apply(tier, &mut output, &mut total);
+                for y in 0..size.h {
+                    for x in 0..size.w {
+                        let mut taps = Vec::new();
+                        filter.taps(y, |tap, row, dx| {
+                            if let Some(column) = x.checked_add_signed(dx).filter(|column| *column < size.w) {
+                                let at = row * size.w + column;
+                                let trust = confidence.map_or(0.0, |c| f64::from(c[at]));
+                                taps.push((at, trust + f64::from(logits[tap * n + y * size.w + x])));
+                            }
+                        });
+                        let most = taps.iter().map(|tap| tap.1).fold(f64::MIN, f64::max);
+                        let sum: f64 = taps.iter().map(|tap| (tap.1 - most).exp()).sum();
+                        for c in 0..3 {
+                            let weighted =
+                                |(at, e): &(usize, f64)| (e - most).exp() * f64::from(image[c * n + at]);
+                            let want = taps.iter().map(weighted).sum::<f64>() / sum;
+                            let got = f64::from(output[c * n + y * size.w + x]);
+                            assert!(
+                                (got - want).abs() < 1e-4 * want,
+                                "{tier:?} ({x}, {y}): {got} for {want}"
+                            );
+                        }
+                    }
                 }
             }
         }
