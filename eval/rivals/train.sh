@@ -15,7 +15,7 @@ for name in "$@"; do
     case $name in
         demc | demc-nofusion) steps=2000 more="--loss relmse --lr 1e-3:5e-5" ;;
         semc) steps=830 more="--loss relmse --lr 1e-3:5e-5" ;;
-        kpcn) steps=780 more="--loss smape --lr 1e-4:2e-5 --patch 64" ;;
+        kpcn) steps=780 more="--loss smape --lr 3e-4:3e-5 --patch 64" ;;
         lbf) steps=780 more="--loss both --lr 1e-2:1e-3 --patch 64" ;;
         *) echo "train.sh: no recipe for $name" >&2; exit 2 ;;
     esac

@@ -77,14 +77,38 @@ pub fn weight_gradient(
         });
     });
 
-    each_kernel(gradient, geometry, g.c, (first, s.c, inputs), |o, i, chunk| {
-        for (t, value) in chunk.iter_mut().enumerate() {
-            let slab = (((o / LANES) * s.planes() + i / LANES) * taps + t) * LANES + i % LANES;
-            for part in 0..parts {
-                *value += partial[part * slabs + slab].0[o % LANES];
-            }
+    // Each sum holds 16 outputs of one input and tap, and is spread over as many kernels.
+    let sum = |output: usize, input: usize, t: usize| {
+        let slab = ((output * s.planes() + input / LANES) * taps + t) * LANES + input % LANES;
+        let mut sum = partial[slab];
+        for part in 1..parts {
+            sum.0.iter_mut().zip(partial[part * slabs + slab].0).for_each(|(sum, v)| *sum += v);
         }
-    });
+        sum
+    };
+    match geometry {
+        Geometry::Same(_) => {
+            gradient.par_chunks_mut(LANES * inputs * taps).enumerate().for_each(|(output, gradient)| {
+                for i in 0..s.c {
+                    for t in 0..taps {
+                        let kernels = gradient[(first + i) * taps + t..].iter_mut().step_by(inputs * taps);
+                        kernels.zip(sum(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
+                    }
+                }
+            });
+        }
+        _ => {
+            let rows = gradient[first * g.c * taps..].par_chunks_mut(g.c * taps).take(s.c);
+            rows.enumerate().for_each(|(i, gradient)| {
+                for (output, gradient) in gradient.chunks_mut(LANES * taps).enumerate() {
+                    for t in 0..taps {
+                        let kernels = gradient[t..].iter_mut().step_by(taps);
+                        kernels.zip(sum(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
+                    }
+                }
+            });
+        }
+    }
 }
 
 /// Calls `visit(output, input of the source, taps)` for every kernel of `weights` that reads one of a
