@@ -9,10 +9,6 @@ use super::{
     simd::{Kernel, Simd, Tier},
 };
 
-/// Lanes of the input that one pass over the pixels serves: 2 output planes x 8 lanes, or 1 x 8,
-/// accumulators stay in registers.
-const CHUNK: usize = 8;
-
 /// Tasks that keep a workstation's threads busy.
 const TASKS: usize = 8;
 
@@ -159,12 +155,16 @@ impl Kernel for Pair<'_> {
         // SAFETY: `weight_gradient` checked the lengths; every task owns its slabs.
         unsafe {
             let (first, end) = self.outputs;
-            if S::TILE.0 == 2 && end - first == 2 {
-                self.taps::<S, 2>(first);
-            } else {
+            // Accumulators stay in registers: of 2 output planes x 8 lanes of the input or of 1 x 8, or of
+            // 1 x 4 where a block takes two registers.
+            if S::TILE.0 == 1 {
                 for output in first..end {
-                    self.taps::<S, 1>(output);
+                    self.taps::<S, 1, 4>(output);
                 }
+            } else if end - first == 2 {
+                self.taps::<S, 2, 8>(first);
+            } else {
+                self.taps::<S, 1, 8>(first);
             }
         }
     }
@@ -172,7 +172,7 @@ impl Kernel for Pair<'_> {
 
 impl Pair<'_> {
     #[inline(always)]
-    unsafe fn taps<S: Simd, const OUT: usize>(&self, output: usize) {
+    unsafe fn taps<S: Simd, const OUT: usize, const CHUNK: usize>(&self, output: usize) {
         let taps = self.geometry.taps();
         let s = self.source.shape;
         let band = match self.geometry {
@@ -198,9 +198,9 @@ impl Pair<'_> {
                         let slabs = slabs.map(|p| p.add(lane));
                         match self.geometry {
                             Geometry::Same(k) => {
-                                self.accumulate::<S, OUT, 1>(n, rows, output, lane, k, t, slabs)
+                                self.accumulate::<S, OUT, CHUNK, 1>(n, rows, output, lane, k, t, slabs)
                             }
-                            _ => self.accumulate::<S, OUT, 2>(n, rows, output, lane, 4, t, slabs),
+                            _ => self.accumulate::<S, OUT, CHUNK, 2>(n, rows, output, lane, 4, t, slabs),
                         }
                     }
                 }
@@ -212,7 +212,7 @@ impl Pair<'_> {
     /// `STEP` gradient pixels an input pixel.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
-    unsafe fn accumulate<S: Simd, const OUT: usize, const STEP: usize>(
+    unsafe fn accumulate<S: Simd, const OUT: usize, const CHUNK: usize, const STEP: usize>(
         &self,
         n: usize,
         rows: (usize, usize),
