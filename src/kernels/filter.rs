@@ -113,24 +113,19 @@ impl<'a> Filter<'a> {
         (self.rows.1 - self.rows.0) * self.size.w
     }
 
-    /// Calls `visit(tap, neighbour row, dx)` for every tap of row `y` of those filtered whose row lies
-    /// inside the image.
-    #[inline(always)]
-    fn taps(&self, y: usize, mut visit: impl FnMut(usize, usize, isize)) {
-        let r = (self.k / 2) as isize;
-        for ky in 0..self.k {
-            let row = (self.rows.0 + y + ky) as isize - r;
-            if row < 0 || row >= self.size.h as isize {
-                continue;
-            }
-            for kx in 0..self.k {
-                let dx = kx as isize - r;
-                // A kernel wider than the image has taps that meet no pixel at all.
-                if dx.unsigned_abs() < self.size.w {
-                    visit(ky * self.k + kx, row as usize, dx);
-                }
-            }
-        }
+    /// Every tap of row `y` of those filtered whose row lies inside the image: its place in the kernel, the row,
+    /// and how far to the right it reads. A list, since closures may be compiled without the tier's
+    /// instructions.
+    fn taps(&self, y: usize) -> Vec<(usize, usize, isize)> {
+        let (k, r) = (self.k, (self.k / 2) as isize);
+        // A kernel wider than the image has taps that meet no pixel at all.
+        let columns = (0..k).filter(|kx| (*kx as isize - r).unsigned_abs() < self.size.w);
+        let rows = (0..k).filter_map(|ky| {
+            let row = (self.rows.0 + y + ky).checked_add_signed(-r)?;
+            (row < self.size.h).then_some((ky, row))
+        });
+        rows.flat_map(|(ky, row)| columns.clone().map(move |kx| (ky * k + kx, row, kx as isize - r)))
+            .collect()
     }
 
     /// Calls `put(pixel, exponent)` on the pixels of row `y` of those filtered that have a neighbour at this tap.
@@ -160,7 +155,9 @@ impl<'a> Filter<'a> {
     fn largest(&self, y: usize, out: &mut [f32]) {
         out.fill(f32::NEG_INFINITY);
         let larger = |out: &mut f32, exponent: f32| *out = if exponent > *out { exponent } else { *out };
-        self.taps(y, |tap, row, dx| self.exponents(y, (tap, row, dx), out, larger));
+        for tap in self.taps(y) {
+            self.exponents(y, tap, out, larger);
+        }
     }
 
     /// The weights of one tap along row `y` of those filtered, columns `x0..x1`, beside that of the `largest`
@@ -233,7 +230,7 @@ impl Kernel for Forward<'_, '_> {
         }
         let (mut weights, mut largest) = (vec![0.0; w], vec![0.0; w]);
         self.filter.largest(self.y, &mut largest);
-        self.filter.taps(self.y, |tap, row, dx| {
+        for (tap, row, dx) in self.filter.taps(self.y) {
             let (x0, x1) = self.filter.weights(self.y, (tap, row, dx), &largest, &mut weights);
             let len = x1 - x0;
             let weights = &weights[x0..x1];
@@ -245,7 +242,7 @@ impl Kernel for Forward<'_, '_> {
                 }
             }
             total[x0..x1].iter_mut().zip(weights).for_each(|(t, w)| *t += w);
-        });
+        }
         for out in [r, g, b] {
             out.iter_mut().zip(&*total).for_each(|(v, t)| *v /= t);
         }
@@ -270,7 +267,7 @@ impl Kernel for Backward<'_, '_> {
         for y in 0..h {
             let total = &self.total[y * w..][..w];
             self.filter.largest(y, &mut largest);
-            self.filter.taps(y, |tap, row, dx| {
+            for (tap, row, dx) in self.filter.taps(y) {
                 let (x0, x1) = self.filter.weights(y, (tap, row, dx), &largest, &mut weights);
                 let len = x1 - x0;
                 let weights = &mut weights[x0..x1];
@@ -299,7 +296,7 @@ impl Kernel for Backward<'_, '_> {
                     let confidence = &mut confidence[from..][..len];
                     confidence.iter_mut().zip(&*slope).for_each(|(c, s)| *c += s);
                 }
-            });
+            }
         }
     }
 }
@@ -386,13 +383,13 @@ mod tests {
                 for y in 0..size.h {
                     for x in 0..size.w {
                         let mut taps = Vec::new();
-                        filter.taps(y, |tap, row, dx| {
+                        for (tap, row, dx) in filter.taps(y) {
                             if let Some(column) = x.checked_add_signed(dx).filter(|column| *column < size.w) {
                                 let at = row * size.w + column;
                                 let trust = confidence.map_or(0.0, |c| f64::from(c[at]));
                                 taps.push((at, trust + f64::from(logits[tap * n + y * size.w + x])));
                             }
-                        });
+                        }
                         let most = taps.iter().map(|tap| tap.1).fold(f64::MIN, f64::max);
                         let sum: f64 = taps.iter().map(|tap| (tap.1 - most).exp()).sum();
                         for c in 0..3 {

@@ -6,7 +6,7 @@
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{CHUNK, Engine, Grid, LANES, Operand, Sums, Term, WIDE, Wide};
+use super::{CHUNK, EIGHTH, Engine, Grid, LANES, Operand, Sums, Term, WIDE, Wide};
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
@@ -217,6 +217,14 @@ pub fn convolve(
     };
     let phases: Vec<Vec<Vec<Term>>> =
         (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();
+    // How much of each term's plane is in use: the same for every phase and image.
+    let eighths: Vec<u8> = {
+        let of_source =
+            |&channels: &usize| (0..channels.div_ceil(WIDE)).map(move |p| (channels - p * WIDE).min(WIDE));
+        let of_plane: Vec<usize> = weights.inputs.iter().flat_map(of_source).collect();
+        let terms = self::terms(geometry, planes.len(), (0, 0)).into_iter();
+        terms.map(|(plane, _)| of_plane[plane].div_ceil(EIGHTH) as u8).collect()
+    };
     // Bands of rows keep every thread busy and their input in the second-level cache.
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands);
@@ -244,6 +252,7 @@ pub fn convolve(
                 bias,
                 epilogue,
                 phases: &phases[n],
+                eighths: &eighths,
                 out,
                 target,
                 n,
@@ -276,6 +285,7 @@ struct Band<'a> {
     bias: &'a [Block],
     epilogue: Epilogue,
     phases: &'a [Vec<Term>],
+    eighths: &'a [u8],
     out: Shape,
     target: Target,
     n: usize,
@@ -298,6 +308,7 @@ impl Kernel for Band<'_> {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
+                        let terms = (&terms[..], self.eighths);
                         self.engine.multiply(terms, position, weights, (outputs, plane_rows), &mut sums);
                         self.store::<S>(
                             &mut sums,

@@ -4,7 +4,7 @@ use std::{fmt, sync::OnceLock};
 
 use half::bf16;
 
-use super::{Block, CHUNK, LANES, Sums, Term, WIDE, Wide};
+use super::{Block, CHUNK, EIGHTH, LANES, Sums, Term, WIDE, Wide};
 
 /// A way to multiply bfloat16 matrices that this processor has.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -76,13 +76,14 @@ impl Engine {
     }
 
     /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]` for 32 positions
-    /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart.
+    /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart. The weights of a term beyond
+    /// its `eighths` times 8 input channels are zero: an engine may leave them out.
     ///
     /// # Safety
     /// Called inside [`Engine::ready`]; every term's 32 rows of input and 16 rows of weights can be read.
     pub(super) unsafe fn multiply(
         self,
-        terms: &[Term],
+        (terms, eighths): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
@@ -93,7 +94,7 @@ impl Engine {
             match self.0 {
                 Unit::Portable => portable::multiply(terms, position, weights, (outputs, plane), sums),
                 #[cfg(target_arch = "x86_64")]
-                Unit::Avx512 => avx512::multiply(terms, position, weights, (outputs, plane), sums),
+                Unit::Avx512 => avx512::multiply((terms, eighths), position, weights, (outputs, plane), sums),
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
                 Unit::Amx => amx::multiply(terms, position, weights, (outputs, plane), sums),
             }
@@ -277,7 +278,7 @@ mod portable {
 mod avx512 {
     use std::arch::x86_64::*;
 
-    use super::{Block, CHUNK, LANES, Sums, Term, Wide, bf16};
+    use super::{Block, CHUNK, EIGHTH, LANES, Sums, Term, Wide, bf16};
     use crate::kernels::simd::{Avx512, Simd};
 
     /// Positions whose sums stay in registers: 2 planes x 8 of them, beside 2 registers of weights.
@@ -285,7 +286,7 @@ mod avx512 {
 
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     pub unsafe fn multiply(
-        terms: &[Term],
+        (terms, eighths): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
@@ -294,9 +295,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<2>(terms, position, weights, plane, sums);
+                tiles::<2>((terms, eighths), position, weights, plane, sums);
             } else {
-                tiles::<1>(terms, position, weights, plane, sums);
+                tiles::<1>((terms, eighths), position, weights, plane, sums);
             }
         }
     }
@@ -304,7 +305,7 @@ mod avx512 {
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     #[inline]
     unsafe fn tiles<const OUT: usize>(
-        terms: &[Term],
+        (terms, eighths): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         plane: usize,
@@ -312,23 +313,25 @@ mod avx512 {
     ) {
         for first in (0..CHUNK).step_by(TILE) {
             let mut acc = [[_mm512_setzero_ps(); TILE]; OUT];
-            for term in terms {
+            for (term, &eighths) in terms.iter().zip(eighths) {
                 // SAFETY: the caller's promise.
                 unsafe {
-                    let x = term.input.add(position + first).cast::<i32>();
-                    let w = weights.byte_add(term.weights);
-                    for pair in 0..LANES {
-                        let w: [__m512bh; OUT] = std::array::from_fn(|o| {
-                            std::mem::transmute(_mm512_load_si512(w.add(o * plane + pair).cast()))
-                        });
-                        for p in 0..TILE {
-                            let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(
-                                *x.add(p * LANES + pair),
-                            ));
-                            for o in 0..OUT {
-                                acc[o][p] = _mm512_dpbf16_ps(acc[o][p], w[o], x);
+                    let mut x = term.input.add(position + first).cast::<i32>();
+                    let mut w = weights.byte_add(term.weights);
+                    for _ in 0..eighths {
+                        for pair in 0..EIGHTH / 2 {
+                            let w: [__m512bh; OUT] = std::array::from_fn(|o| {
+                                std::mem::transmute(_mm512_load_si512(w.add(o * plane + pair).cast()))
+                            });
+                            for p in 0..TILE {
+                                let x = _mm512_set1_epi32(*x.add(p * LANES + pair));
+                                let x = std::mem::transmute::<__m512i, __m512bh>(x);
+                                for o in 0..OUT {
+                                    acc[o][p] = _mm512_dpbf16_ps(acc[o][p], w[o], x);
+                                }
                             }
                         }
+                        (x, w) = (x.add(EIGHTH / 2), w.add(EIGHTH / 2));
                     }
                 }
             }

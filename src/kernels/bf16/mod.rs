@@ -29,6 +29,9 @@ use super::{
 /// Channels in a [`Wide`].
 pub const WIDE: usize = 2 * LANES;
 
+/// Input channels that a product leaves out where a plane does not use them.
+const EIGHTH: usize = 8;
+
 /// Positions that one product serves.
 const CHUNK: usize = 32;
 
