@@ -36,7 +36,7 @@ const CROPS: (usize, usize) = (8, 128);
 const SIZES: [(usize, usize); 6] =
     [(256, 256), (512, 512), (1280, 720), (1920, 1080), (3840, 2160), (7680, 4320)];
 /// The models that are timed: those that read what [`frame`] makes.
-const LADDER: [&str; 2] = ["demc-s", "demc-m"];
+const LADDER: [&str; 3] = ["demc-s", "demc-m", "demc-l"];
 /// The size that others are compared with.
 const USUAL: (usize, usize) = (1280, 720);
 

@@ -15,9 +15,10 @@ use crate::{
 };
 
 /// The built-in weights, name and file: ours, smallest first, then the paper's networks and its rivals.
-pub const BUILT_IN: [(&str, &[u8]); 7] = [
+pub const BUILT_IN: [(&str, &[u8]); 8] = [
     ("demc-s", include_bytes!("weights/demc-s.safetensors")),
     ("demc-m", include_bytes!("weights/demc-m.safetensors")),
+    ("demc-l", include_bytes!("weights/demc-l.safetensors")),
     ("demc", include_bytes!("weights/demc.safetensors")),
     ("demc-nofusion", include_bytes!("weights/demc-nofusion.safetensors")),
     ("semc", include_bytes!("weights/semc.safetensors")),

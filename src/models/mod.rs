@@ -152,7 +152,7 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     vec![
         ("demc-s", pyramid([32, 48, 64, 80])),
         ("demc-m", pyramid([96, 96, 96, 112])),
-        ("demc-l", pyramid([128, 144, 160, 160])),
+        ("demc-l", pyramid([112, 128, 128, 128])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),

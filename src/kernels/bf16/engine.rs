@@ -130,12 +130,9 @@ impl Engine {
 
     /// Rounds 32 channels, the upper 16 of which may be absent, to bfloat16, block by block.
     pub(super) fn narrow(self, low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
-        match self.0 {
-            Unit::Portable => portable::narrow(low, high, out),
-            // SAFETY: an engine is only made after its instructions were detected.
-            #[cfg(target_arch = "x86_64")]
-            _ => unsafe { avx512::narrow(low, high, out) },
-        }
+        assert!(low.len() <= out.len());
+        // SAFETY: as many values are written as there are blocks.
+        unsafe { self.narrow_spread(low, high, out.as_mut_ptr(), 1) }
     }
 
     /// [`Engine::narrow`], writing every `step`th value from `out` on.
@@ -149,14 +146,13 @@ impl Engine {
         out: *mut Wide,
         step: usize,
     ) {
-        // SAFETY: the caller's promise.
+        assert!(high.is_none_or(|high| high.len() == low.len()));
+        // SAFETY: the caller's promise; an engine is only made after its instructions were detected.
         unsafe {
-            if step == 1 {
-                return self.narrow(low, high, std::slice::from_raw_parts_mut(out, low.len()));
-            }
-            for (i, block) in low.iter().enumerate() {
-                let high = high.map(|h| &h[i..=i]);
-                self.narrow(std::slice::from_ref(block), high, std::slice::from_mut(&mut *out.add(i * step)));
+            match self.0 {
+                Unit::Portable => portable::narrow_spread(low, high, out, step),
+                #[cfg(target_arch = "x86_64")]
+                _ => avx512::narrow_spread(low, high, out, step),
             }
         }
     }
@@ -245,12 +241,15 @@ mod portable {
         }
     }
 
-    pub fn narrow(low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
-        for (i, (out, low)) in out.iter_mut().zip(low).enumerate() {
+    pub unsafe fn narrow_spread(low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
+        for (i, low) in low.iter().enumerate() {
+            let mut both = Wide::ZERO;
             for l in 0..LANES {
-                out.0[l] = bf16::from_f32(low.0[l]);
-                out.0[LANES + l] = high.map_or(bf16::ZERO, |h| bf16::from_f32(h[i].0[l]));
+                both.0[l] = bf16::from_f32(low.0[l]);
+                both.0[LANES + l] = high.map_or(bf16::ZERO, |h| bf16::from_f32(h[i].0[l]));
             }
+            // SAFETY: the caller's promise.
+            unsafe { out.add(i * step).write(both) };
         }
     }
 
@@ -402,14 +401,14 @@ mod avx512 {
     }
 
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    pub unsafe fn narrow(low: &[Block], high: Option<&[Block]>, out: &mut [Wide]) {
-        for (i, (out, low)) in out.iter_mut().zip(low).enumerate() {
-            // SAFETY: blocks and wides are 64 bytes, aligned to as many.
+    pub unsafe fn narrow_spread(low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
+        for (i, low) in low.iter().enumerate() {
+            // SAFETY: the caller's promise; blocks and wides are 64 bytes, aligned to as many.
             unsafe {
                 let low = _mm512_load_ps(low.0.as_ptr());
                 let high = high.map_or(_mm512_setzero_ps(), |h| _mm512_load_ps(h[i].0.as_ptr()));
                 let both: __m512i = std::mem::transmute(_mm512_cvtne2ps_pbh(high, low));
-                _mm512_store_si512(out.0.as_mut_ptr().cast(), both);
+                _mm512_store_si512(out.add(i * step).cast(), both);
             }
         }
     }
