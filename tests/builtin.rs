@@ -280,7 +280,9 @@ fn arithmetic_can_be_chosen_and_changes_little() {
 fn every_built_in_weights_file_is_sound_and_small() {
     assert!(learned::BUILT_IN.iter().any(|(name, _)| *name == "demc-m"), "the default model");
     for (name, bytes) in learned::BUILT_IN {
-        assert!(bytes.len() < 5 << 20, "{name}: {} bytes", bytes.len());
+        // The README beside the weights says why the largest may be larger.
+        let limit = if name == "demc-l" { 8 << 20 } else { 5 << 20 };
+        assert!(bytes.len() < limit, "{name}: {} bytes", bytes.len());
         let mut model = learned::Learned::built_in(name).unwrap();
         let config = |name| models::trainable().into_iter().find(|(n, _)| *n == name);
         let mut expected = config(name).expect("it is trainable").1;
