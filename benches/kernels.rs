@@ -84,6 +84,12 @@ fn forward_bf16(bencher: Bencher, layer: Layer, geometry: Geometry) {
     });
 }
 
+fn input_gradient_of(bencher: Bencher, (n, i, o, h, w): Layer, geometry: Geometry) {
+    let (oh, ow) = geometry.output(h, w);
+    let add = Epilogue { relu: false, accumulate: true };
+    convolution(bencher, (n, o, i, oh, ow), geometry.backward(), add);
+}
+
 fn weight_gradient_of(bencher: Bencher, layer: Layer, geometry: Geometry) {
     let (n, i, o, h, w) = layer;
     let (oh, ow) = geometry.output(h, w);
@@ -102,9 +108,8 @@ fn conv3x3(bencher: Bencher, layer: Layer) {
 }
 
 #[divan::bench(args = LAYERS)]
-fn conv3x3_input_gradient(bencher: Bencher, (n, i, o, h, w): Layer) {
-    let add = Epilogue { relu: false, accumulate: true };
-    convolution(bencher, (n, o, i, h, w), Geometry::Same(3).backward(), add);
+fn conv3x3_input_gradient(bencher: Bencher, layer: Layer) {
+    input_gradient_of(bencher, layer, Geometry::Same(3));
 }
 
 #[divan::bench(args = LAYERS)]
@@ -128,9 +133,8 @@ fn transposed4x4(bencher: Bencher, layer: Layer) {
 }
 
 #[divan::bench(args = &LAYERS[..4])]
-fn transposed4x4_input_gradient(bencher: Bencher, (n, i, o, h, w): Layer) {
-    let add = Epilogue { relu: false, accumulate: true };
-    convolution(bencher, (n, o, i, 2 * h, 2 * w), Geometry::Transposed.backward(), add);
+fn transposed4x4_input_gradient(bencher: Bencher, layer: Layer) {
+    input_gradient_of(bencher, layer, Geometry::Transposed);
 }
 
 #[divan::bench(args = &LAYERS[..4])]

@@ -150,12 +150,12 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// The largest exponent of each pixel of row `y` of those filtered.
+    /// The largest exponent of each pixel of row `y` of those filtered, whose taps these are.
     #[inline(always)]
-    fn largest(&self, y: usize, out: &mut [f32]) {
+    fn largest(&self, y: usize, taps: &[(usize, usize, isize)], out: &mut [f32]) {
         out.fill(f32::NEG_INFINITY);
         let larger = |out: &mut f32, exponent: f32| *out = if exponent > *out { exponent } else { *out };
-        for tap in self.taps(y) {
+        for &tap in taps {
             self.exponents(y, tap, out, larger);
         }
     }
@@ -229,8 +229,9 @@ impl Kernel for Forward<'_, '_> {
             out.fill(0.0);
         }
         let (mut weights, mut largest) = (vec![0.0; w], vec![0.0; w]);
-        self.filter.largest(self.y, &mut largest);
-        for (tap, row, dx) in self.filter.taps(self.y) {
+        let taps = self.filter.taps(self.y);
+        self.filter.largest(self.y, &taps, &mut largest);
+        for (tap, row, dx) in taps {
             let (x0, x1) = self.filter.weights(self.y, (tap, row, dx), &largest, &mut weights);
             let len = x1 - x0;
             let weights = &weights[x0..x1];
@@ -266,8 +267,9 @@ impl Kernel for Backward<'_, '_> {
         let (mut weights, mut slope, mut largest) = (vec![0.0; w], vec![0.0; w], vec![0.0; w]);
         for y in 0..h {
             let total = &self.total[y * w..][..w];
-            self.filter.largest(y, &mut largest);
-            for (tap, row, dx) in self.filter.taps(y) {
+            let taps = self.filter.taps(y);
+            self.filter.largest(y, &taps, &mut largest);
+            for (tap, row, dx) in taps {
                 let (x0, x1) = self.filter.weights(y, (tap, row, dx), &largest, &mut weights);
                 let len = x1 - x0;
                 let weights = &mut weights[x0..x1];

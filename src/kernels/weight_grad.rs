@@ -73,67 +73,53 @@ pub fn weight_gradient(
         });
     });
 
-    // Each sum holds 16 outputs of one input and tap, and is spread over as many kernels.
-    let sum = |output: usize, input: usize, t: usize| {
-        let slab = ((output * s.planes() + input / LANES) * taps + t) * LANES + input % LANES;
-        let mut sum = partial[slab];
+    add_sums(gradient, geometry, g.c, (first, s.c, inputs), parts, |part, output, i, t| {
+        &partial[part * slabs + ((output * s.planes() + i / LANES) * taps + t) * LANES + i % LANES]
+    });
+}
+
+/// Adds `sum(part, output plane, input of the source, tap)`, over all parts, to the weights that they are sums
+/// for: a block holds those of 16 outputs, which are spread over as many kernels. The source's `channels` are
+/// the inputs from `first` on of `inputs` in all.
+pub(super) fn add_sums<'a>(
+    weights: &mut [f32],
+    geometry: Geometry,
+    outputs: usize,
+    (first, channels, inputs): (usize, usize, usize),
+    parts: usize,
+    sum: impl Fn(usize, usize, usize, usize) -> &'a Block + Sync,
+) {
+    let taps = geometry.taps();
+    let total = |output: usize, input: usize, t: usize| {
+        let mut total = *sum(0, output, input, t);
         for part in 1..parts {
-            sum.0.iter_mut().zip(partial[part * slabs + slab].0).for_each(|(sum, v)| *sum += v);
+            total.0.iter_mut().zip(sum(part, output, input, t).0).for_each(|(total, v)| *total += v);
         }
-        sum
+        total
     };
     match geometry {
         Geometry::Same(_) => {
-            gradient.par_chunks_mut(LANES * inputs * taps).enumerate().for_each(|(output, gradient)| {
-                for i in 0..s.c {
+            weights.par_chunks_mut(LANES * inputs * taps).enumerate().for_each(|(output, weights)| {
+                for i in 0..channels {
                     for t in 0..taps {
-                        let kernels = gradient[(first + i) * taps + t..].iter_mut().step_by(inputs * taps);
-                        kernels.zip(sum(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
+                        let kernels = weights[(first + i) * taps + t..].iter_mut().step_by(inputs * taps);
+                        kernels.zip(total(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
                     }
                 }
             });
         }
         _ => {
-            let rows = gradient[first * g.c * taps..].par_chunks_mut(g.c * taps).take(s.c);
-            rows.enumerate().for_each(|(i, gradient)| {
-                for (output, gradient) in gradient.chunks_mut(LANES * taps).enumerate() {
+            let rows = weights[first * outputs * taps..].par_chunks_mut(outputs * taps).take(channels);
+            rows.enumerate().for_each(|(i, weights)| {
+                for (output, weights) in weights.chunks_mut(LANES * taps).enumerate() {
                     for t in 0..taps {
-                        let kernels = gradient[t..].iter_mut().step_by(taps);
-                        kernels.zip(sum(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
+                        let kernels = weights[t..].iter_mut().step_by(taps);
+                        kernels.zip(total(output, i, t).0).for_each(|(kernel, v)| *kernel += v);
                     }
                 }
             });
         }
     }
-}
-
-/// Calls `visit(output, input of the source, taps)` for every kernel of `weights` that reads one of a
-/// source's `channels`, the inputs from `first` on of `inputs` in all.
-pub(super) fn each_kernel(
-    weights: &mut [f32],
-    geometry: Geometry,
-    outputs: usize,
-    (first, channels, inputs): (usize, usize, usize),
-    visit: impl Fn(usize, usize, &mut [f32]) + Sync,
-) {
-    let taps = geometry.taps();
-    let same = matches!(geometry, Geometry::Same(_));
-    let columns = if same { inputs } else { outputs };
-    // A plane of outputs by a plane of inputs at a time, whose sums then stay in the first-level cache.
-    weights.par_chunks_mut(LANES * columns * taps).enumerate().for_each(|(rows, weights)| {
-        for tile in (0..columns).step_by(LANES) {
-            for (row, weights) in weights.chunks_mut(columns * taps).enumerate() {
-                let tiles = weights[tile * taps..].chunks_mut(taps).take(LANES);
-                for (column, chunk) in (tile..).zip(tiles) {
-                    let row = rows * LANES + row;
-                    let (o, i) = if same { (row, column) } else { (column, row) };
-                    if (first..first + channels).contains(&i) {
-                        visit(o, i - first, chunk);
-                    }
-                }
-            }
-        }
-    });
 }
 
 /// One input plane against one or two output planes.

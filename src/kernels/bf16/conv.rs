@@ -73,6 +73,8 @@ fn terms(geometry: Geometry, planes: usize, phase: (usize, usize)) -> Vec<(usize
 #[derive(Debug)]
 pub struct Weights {
     rows: Vec<Wide>,
+    /// How much of its plane each term of a phase reads; the same for every phase.
+    eighths: Vec<u8>,
     geometry: Geometry,
     /// Channels of every source read.
     inputs: Vec<usize>,
@@ -145,7 +147,9 @@ impl Weights {
                 }
             }
         });
-        Self { rows, geometry, inputs, outputs }
+        let of_phase = &terms[..terms.len() / (spread * spread)];
+        let eighths = of_phase.iter().map(|&(input, _)| planes[input].1.div_ceil(EIGHTH) as u8).collect();
+        Self { rows, eighths, geometry, inputs, outputs }
     }
 }
 
@@ -217,14 +221,6 @@ pub fn convolve(
     };
     let phases: Vec<Vec<Vec<Term>>> =
         (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();
-    // How much of each term's plane is in use: the same for every phase and image.
-    let eighths: Vec<u8> = {
-        let of_source =
-            |&channels: &usize| (0..channels.div_ceil(WIDE)).map(move |p| (channels - p * WIDE).min(WIDE));
-        let of_plane: Vec<usize> = weights.inputs.iter().flat_map(of_source).collect();
-        let terms = self::terms(geometry, planes.len(), (0, 0)).into_iter();
-        terms.map(|(plane, _)| of_plane[plane].div_ceil(EIGHTH) as u8).collect()
-    };
     // Bands of rows keep every thread busy and their input in the second-level cache.
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands);
@@ -252,7 +248,6 @@ pub fn convolve(
                 bias,
                 epilogue,
                 phases: &phases[n],
-                eighths: &eighths,
                 out,
                 target,
                 n,
@@ -285,7 +280,6 @@ struct Band<'a> {
     bias: &'a [Block],
     epilogue: Epilogue,
     phases: &'a [Vec<Term>],
-    eighths: &'a [u8],
     out: Shape,
     target: Target,
     n: usize,
@@ -308,7 +302,7 @@ impl Kernel for Band<'_> {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
-                        let terms = (&terms[..], self.eighths);
+                        let terms = (&terms[..], &self.weights.eighths[..]);
                         self.engine.multiply(terms, position, weights, (outputs, plane_rows), &mut sums);
                         self.store::<S>(
                             &mut sums,

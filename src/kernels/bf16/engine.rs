@@ -315,30 +315,56 @@ mod avx512 {
             for (term, &eighths) in terms.iter().zip(eighths) {
                 // SAFETY: the caller's promise.
                 unsafe {
-                    let mut x = term.input.add(position + first).cast::<i32>();
+                    let mut x = term.input.add(position + first).cast::<bf16>();
                     let mut w = weights.byte_add(term.weights);
                     for _ in 0..eighths {
                         for pair in 0..EIGHTH / 2 {
-                            let w: [__m512bh; OUT] = std::array::from_fn(|o| {
-                                std::mem::transmute(_mm512_load_si512(w.add(o * plane + pair).cast()))
-                            });
-                            for p in 0..TILE {
-                                let x = _mm512_set1_epi32(*x.add(p * LANES + pair));
-                                let x = std::mem::transmute::<__m512i, __m512bh>(x);
-                                for o in 0..OUT {
-                                    acc[o][p] = _mm512_dpbf16_ps(acc[o][p], w[o], x);
-                                }
-                            }
+                            add_pair(&mut acc, x.add(2 * pair), size_of::<Wide>(), w.add(pair), plane);
                         }
-                        (x, w) = (x.add(EIGHTH / 2), w.add(EIGHTH / 2));
+                        (x, w) = (x.add(EIGHTH), w.add(EIGHTH / 2));
                     }
                 }
             }
-            for (acc, sums) in acc.iter().zip(&mut sums.0) {
-                for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
-                    // SAFETY: a block is 64 bytes, aligned to as many.
-                    unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), *acc) };
+            store(&acc, sums, first);
+        }
+    }
+
+    /// Adds the products of a pair of values in each of a tile's rows, `stride` bytes apart from `x` on, with
+    /// those in `w` of each output plane, `plane` rows apart.
+    ///
+    /// # Safety
+    /// All of them can be read.
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    #[inline]
+    unsafe fn add_pair<const OUT: usize>(
+        acc: &mut [[__m512; TILE]; OUT],
+        x: *const bf16,
+        stride: usize,
+        w: *const Wide,
+        plane: usize,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let w: [__m512bh; OUT] =
+                std::array::from_fn(|o| std::mem::transmute(_mm512_load_si512(w.add(o * plane).cast())));
+            for row in 0..TILE {
+                let x = x.byte_add(row * stride).cast::<i32>().read_unaligned();
+                let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(x));
+                for o in 0..OUT {
+                    acc[o][row] = _mm512_dpbf16_ps(acc[o][row], w[o], x);
                 }
+            }
+        }
+    }
+
+    /// Stores a tile whose first row is row `first` of the sums.
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    #[inline]
+    fn store<const OUT: usize>(acc: &[[__m512; TILE]; OUT], sums: &mut Sums, first: usize) {
+        for (acc, sums) in acc.iter().zip(&mut sums.0) {
+            for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
+                // SAFETY: a block is 64 bytes, aligned to as many.
+                unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), *acc) };
             }
         }
     }
@@ -380,22 +406,9 @@ mod avx512 {
                 });
                 let rows = channels.byte_add(first * stride);
                 for pair in 0..steps * CHUNK / 2 {
-                    let g: [__m512bh; OUT] = std::array::from_fn(|o| {
-                        std::mem::transmute(_mm512_load_si512(pairs.add(o * plane + pair).cast()))
-                    });
-                    for c in 0..TILE {
-                        let x = rows.byte_add(c * stride).add(2 * pair).cast::<i32>().read_unaligned();
-                        let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(x));
-                        for o in 0..OUT {
-                            acc[o][c] = _mm512_dpbf16_ps(acc[o][c], g[o], x);
-                        }
-                    }
+                    add_pair(&mut acc, rows.add(2 * pair), stride, pairs.add(pair), plane);
                 }
-                for (acc, sums) in acc.iter().zip(&mut sums.0) {
-                    for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
-                        _mm512_store_ps(sum.0.as_mut_ptr(), *acc);
-                    }
-                }
+                store(&acc, sums, first);
             }
         }
     }

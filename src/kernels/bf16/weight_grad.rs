@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::{
     Block, CHUNK, Engine, Geometry, Grid, LANES, Pooled, Shape, Sums, View, WIDE, Wide, allocate, halves,
 };
-use crate::kernels::weight_grad::each_kernel;
+use crate::kernels::weight_grad::add_sums;
 
 /// Products of 32 positions that keep both factors in the first-level cache over all taps.
 const STEPS: usize = 8;
@@ -172,13 +172,8 @@ pub fn weight_gradient(
     };
     let sums: Vec<Vec<Sums>> = (0..parts * wide * groups).into_par_iter().map(task_sums).collect();
 
-    each_kernel(gradient, geometry, g.c, (first, s.c, inputs), |o, i, chunk| {
-        let (plane, lane) = (o / LANES, o % LANES);
-        for part in 0..parts {
-            let sums = &sums[(part * groups + plane / 2) * wide + i / WIDE];
-            for (value, sums) in chunk.iter_mut().zip(sums) {
-                *value += sums.0[plane % 2][i % WIDE].0[lane];
-            }
-        }
+    add_sums(gradient, geometry, g.c, (first, s.c, inputs), parts, |part, output, i, t| {
+        let sums = &sums[(part * groups + output / 2) * wide + i / WIDE][t];
+        &sums.0[output % 2][i % WIDE]
     });
 }
