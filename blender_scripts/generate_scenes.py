@@ -202,7 +202,8 @@ def build(options, library, seed, kind):
 
 
 def render_crop(options, scene, region, crop, seed, partial):
-    """Renders a crop: noisy images with all passes, then the reference with Combined alone."""
+    """Renders a crop: noisy images with all passes, then the reference: Combined, and where it is denoised also
+    what it was denoised from (Noisy Image and the guides)."""
     layers = [layer for layer in scene.view_layers if layer.use][:1]
     with Edits() as edits:
         rendering.set_region(edits, scene, region)
@@ -221,6 +222,8 @@ def render_crop(options, scene, region, crop, seed, partial):
                                    options.ref_noise, _LEAST_SAMPLES if options.denoise_references else 0)
             if options.denoise_references:
                 rendering.denoise(passes, scene, layers)
+                for layer in layers:
+                    passes.set(layer.cycles, "denoising_store_passes", True)
             render_compact(scene, os.path.join(options.out, names.reference_name(crop)), partial)
 
 

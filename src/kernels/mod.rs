@@ -15,6 +15,7 @@ pub mod bf16;
 pub mod blend;
 pub mod conv;
 pub mod cross_bilateral;
+pub mod divide;
 pub mod filter;
 pub mod layout;
 pub mod memory;
