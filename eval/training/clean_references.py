@@ -45,18 +45,27 @@ def read_pfm(path):
     return values[::-1]
 
 
+def denoise(oidn, folder, output, *flags, **images):
+    """What oidnDenoise, quality high, makes of the images of some options (`--hdr`, `--alb`, `--nrm`), as an image
+    and as `output`.pfm in `folder`; an image may be the name of such a file."""
+    path = lambda name: os.path.join(folder, name + ".pfm")
+    arguments = []
+    for option, image in images.items():
+        name = image if isinstance(image, str) else output + option
+        if not isinstance(image, str):
+            write_pfm(path(name), image)
+        arguments += [option, path(name)]
+    command = [oidn, "-d", "cpu", "-q", "high", *arguments, *flags, "-o", path(output)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return read_pfm(path(output))
+
+
 def clean(oidn, folder, reference, albedo, normal):
     """The reference without its noise."""
-    path = lambda name: os.path.join(folder, name + ".pfm")
-    run = lambda *arguments: subprocess.run(
-        [oidn, "-d", "cpu", "-q", "high", *arguments], check=True, stdout=subprocess.DEVNULL)
-    for name, image in (("reference", reference), ("albedo", albedo), ("normal", normal)):
-        write_pfm(path(name), image)
-    run("--alb", path("albedo"), "-o", path("clean_albedo"))
-    run("--nrm", path("normal"), "-o", path("clean_normal"))
-    run("--hdr", path("reference"), "--alb", path("clean_albedo"), "--nrm", path("clean_normal"), "--clean_aux",
-        "-o", path("clean"))
-    return read_pfm(path("clean"))
+    denoise(oidn, folder, "albedo", **{"--alb": albedo})
+    denoise(oidn, folder, "normal", **{"--nrm": normal})
+    guides = {"--alb": "albedo", "--nrm": "normal"}
+    return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": reference}, **guides)
 
 
 def main():

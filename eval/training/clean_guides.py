@@ -1,0 +1,57 @@
+"""Copies a test set with its guides denoised: what a better filter of the albedo could gain, at most.
+
+    python clean_guides.py '../shared/data/val/*_0004spp.exr' OUT --oidn PATH/oidnDenoise --guides albedo
+
+The noisy frames keep their Combined pass; the passes named by --guides are replaced by what Open Image Denoise,
+quality high, makes of them. References are copied. With --keep-quotient, Combined is scaled by clean over noisy
+albedo, so that a model that divides by the albedo it is given divides by the noisy one in effect.
+"""
+
+import argparse
+import glob
+import os
+import shutil
+import tempfile
+
+import numpy as np
+
+from clean_references import denoise, exr, planes
+
+GUIDES = {"albedo": ("Denoising Albedo", "RGB", "--alb"), "normal": ("Denoising Normal", "XYZ", "--nrm")}
+ALBEDO_FLOOR = 0.05  # src/features.rs
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="clean_guides.py", description="Denoises the guides of noisy frames.")
+    parser.add_argument("frames", help="quoted glob of <scene>_<spp>spp.exr, beside <scene>_ref.exr")
+    parser.add_argument("out", help="folder for the frames with clean guides")
+    parser.add_argument("--guides", default="albedo,normal", help="albedo, normal or both (default)")
+    parser.add_argument("--keep-quotient", action="store_true", help="leave radiance over albedo as it is")
+    parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    options = parser.parse_args()
+    os.makedirs(options.out, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for source in sorted(glob.glob(options.frames)):
+            scene = os.path.basename(source).rsplit("_", 1)[0]
+            reference = os.path.join(os.path.dirname(source), scene + "_ref.exr")
+            channels = exr.read(source)
+            for guide in options.guides.split(","):
+                ending, letters, option = GUIDES[guide]
+                noisy, names = planes(channels, ending, letters)
+                clean = denoise(options.oidn, folder, "clean", **{option: noisy})
+                channels.update({name: clean[..., c] for c, name in enumerate(names)})
+                if guide == "albedo" and options.keep_quotient:
+                    floored = lambda albedo: np.clip(albedo, 0.0, 1.0) + ALBEDO_FLOOR
+                    radiance, names = planes(channels, "Combined", "RGB")
+                    radiance = radiance * floored(clean) / floored(noisy)
+                    channels.update({name: radiance[..., c] for c, name in enumerate(names)})
+            target = os.path.join(options.out, os.path.basename(source))
+            exr.write_half(target + ".tmp", channels)
+            os.replace(target + ".tmp", target)
+            shutil.copy(reference, options.out)
+            print(scene, flush=True)
+
+
+if __name__ == "__main__":
+    main()
