@@ -99,9 +99,9 @@ pub fn pairs(spec: &str) -> Result<Vec<Pair>> {
     Ok(set.pairs)
 }
 
-/// The test set that `spec` (directory, manifest or glob) names.
+/// The test set that `spec` (directory, manifest, glob or one EXR file) names.
 ///
-/// A glob picks noisy renders, references or both; a reference that it leaves out is looked for
+/// A glob or a file picks noisy renders, references or both; a reference that it leaves out is looked for
 /// beside its noisy render.
 ///
 /// # Errors
@@ -115,6 +115,8 @@ pub fn read(spec: &str) -> Result<TestSet> {
             .collect::<Result<Vec<_>, _>>()
             .map_err(Error::io("read", path))?;
         match_files(files.into_iter().filter(|f| f.is_file()), true)
+    } else if path.is_file() && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
+        match_files([path.to_path_buf()], false)
     } else if path.is_file() {
         manifest(path)?
     } else if spec.contains(['*', '?', '[']) {
@@ -364,6 +366,8 @@ mod tests {
         let set = read(&format!("{}/*.exr", dir.path().display())).unwrap();
         assert_eq!(ids(&set), ["a_0004spp", "a_0016spp", "b_0004spp"]);
         assert!(set.unmatched.is_empty());
+        let set = read(dir.path().join("b_0004spp.exr").to_str().unwrap()).unwrap();
+        assert_eq!(ids(&set), ["b_0004spp"]);
     }
 
     #[test]
