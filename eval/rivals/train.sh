@@ -1,8 +1,8 @@
 #!/bin/sh
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
 #   eval/rivals/train.sh DATA OUT SECONDS [NAME...]
-# Learning rates fall over STEPS, which fit 480 seconds of one core with bfloat16 matrix units; scale them
-# with the budget by the environment variable SCALE (2 for twice the steps). One thread each, one after
+# Learning rates fall over STEPS, which fit 480 seconds of one thread with AVX512-BF16 beside a busy one; scale
+# them with the budget by the environment variable SCALE (2 for twice the steps). One thread each, one after
 # another. A run that is cut by the budget keeps the best weights so far in OUT/NAME/best.safetensors.
 set -eu
 data=$1 out=$2 seconds=$3
@@ -13,9 +13,10 @@ mkdir -p "$out"
 
 for name in "$@"; do
     case $name in
-        demc | demc-nofusion) steps=2000 more="--loss relmse --lr 1e-3:5e-5" ;;
-        semc) steps=830 more="--loss relmse --lr 1e-3:5e-5" ;;
-        kpcn) steps=780 more="--loss smape --lr 3e-4:3e-5 --patch 64" ;;
+        demc) steps=1500 more="--loss relmse --lr 1e-3:5e-5" ;;
+        demc-nofusion) steps=1750 more="--loss relmse --lr 1e-3:5e-5" ;;
+        semc) steps=720 more="--loss relmse --lr 1e-3:5e-5" ;;
+        kpcn) steps=360 more="--loss smape --lr 3e-4:3e-5 --patch 64" ;;
         lbf) steps=780 more="--loss both --lr 1e-2:1e-3 --patch 64" ;;
         *) echo "train.sh: no recipe for $name" >&2; exit 2 ;;
     esac

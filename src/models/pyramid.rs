@@ -230,7 +230,8 @@ impl Pyramid {
         }
     }
 
-    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
+    /// Denoised radiance and the filtered albedo.
+    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> (Field<T>, Field<T>) {
         let [irradiance, albedo, radiance_input, guide_input] = &batch[..] else {
             unreachable!("`inputs` makes four planes")
         };
@@ -265,7 +266,9 @@ impl Pyramid {
         let noisy = field(albedo);
         let albedo = filtered(noisy.fork(), of_albedo, FILTERED[1].kernel);
         let irradiance = field(irradiance).redivide(&noisy, albedo.fork(), divisor);
-        filtered(irradiance, of_irradiance, FILTERED[0].kernel).product(albedo).into_images()
+        let irradiance = filtered(irradiance, of_irradiance, FILTERED[0].kernel);
+        let second = albedo.fork(); // the tape goes with the radiance
+        (irradiance.product(albedo), second)
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.
@@ -345,11 +348,16 @@ impl Network for Pyramid {
     }
 
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
-        self.run::<NoneTape>(batch)
+        self.run::<NoneTape>(batch).0.into_images()
     }
 
-    fn forward_taped(&self, batch: &Batch, _: &mut Stats) -> Images<Taped> {
-        self.run::<Taped>(batch)
+    fn forward_taped(&self, batch: &Batch, stats: &mut Stats) -> Images<Taped> {
+        self.forward_with_albedo(batch, stats).0
+    }
+
+    fn forward_with_albedo(&self, batch: &Batch, _: &mut Stats) -> (Images<Taped>, Option<Images<Taped>>) {
+        let (image, albedo) = self.run::<Taped>(batch);
+        (image.into_images(), Some(albedo.into_images()))
     }
 
     fn macs_per_pixel(&self) -> f64 {
