@@ -171,7 +171,7 @@ fn draw(dataset: &Dataset, options: &Options, step: usize) -> Vec<Sample> {
 
 /// How much the error of a network's albedo counts beside that of its radiance: noise in the albedo is a small
 /// part of the latter, and would be learned last.
-const ALBEDO_LOSS: f32 = 2.0;
+const ALBEDO_LOSS: f32 = 8.0;
 
 /// Falls geometrically from the first step to the last.
 fn learning_rate(options: &Options, step: usize) -> f64 {
