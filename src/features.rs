@@ -96,12 +96,7 @@ fn z_score(channel: &mut [f32]) {
 pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo];
 
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
-pub const ALBEDO_FLOOR: f32 = 0.05;
-
-/// Emitters write their radiance into the albedo pass; brighter than white says nothing about texture.
-pub fn clamp_albedo(albedo: f32) -> f32 {
-    albedo.clamp(0.0, 1.0)
-}
+const ALBEDO_FLOOR: f32 = 0.05;
 
 /// The log-average luminance that exposure-normalised radiance has: photography's middle grey.
 const MIDDLE_GREY: f64 = 0.18;
@@ -129,7 +124,8 @@ pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Resul
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
-    albedo.data.iter_mut().for_each(|a| *a = clamp_albedo(*a));
+    // Emitters write their radiance here; brighter than white says nothing about texture.
+    albedo.data.iter_mut().for_each(|a| *a = a.clamp(0.0, 1.0));
     let guide = Planes::from_vec(
         6,
         passes.width,

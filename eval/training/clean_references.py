@@ -3,8 +3,7 @@
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
 Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the scene's
-noisy frame as guides, denoised first; that albedo is kept in the reference, for networks that filter albedo
-to learn from. Noisy frames are copied as they are. What is there already is kept.
+noisy frame as guides, denoised first. Noisy frames are copied as they are. What is there already is kept.
 """
 
 import argparse
@@ -62,11 +61,11 @@ def denoise(oidn, folder, output, *flags, **images):
 
 
 def clean(oidn, folder, reference, albedo, normal):
-    """The reference and its albedo without their noise."""
-    clean_albedo = denoise(oidn, folder, "albedo", **{"--alb": albedo})
+    """The reference without its noise."""
+    denoise(oidn, folder, "albedo", **{"--alb": albedo})
     denoise(oidn, folder, "normal", **{"--nrm": normal})
     guides = {"--alb": "albedo", "--nrm": "normal"}
-    return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": reference}, **guides), clean_albedo
+    return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": reference}, **guides)
 
 
 def main():
@@ -88,11 +87,10 @@ def main():
                 shutil.copy(path, options.out)
             channels, guides = exr.read(source), exr.read(noisy[0])
             reference, names = planes(channels, "Combined", "RGB")
-            albedo, albedo_names = planes(guides, "Denoising Albedo", "RGB")
+            albedo, _ = planes(guides, "Denoising Albedo", "RGB")
             normal, _ = planes(guides, "Denoising Normal", "XYZ")
-            cleaned, clean_albedo = clean(options.oidn, folder, reference, albedo, normal)
+            cleaned = clean(options.oidn, folder, reference, albedo, normal)
             channels.update({name: cleaned[..., c] for c, name in enumerate(names)})
-            channels.update({name: clean_albedo[..., c] for c, name in enumerate(albedo_names)})
             exr.write_half(target + ".tmp", channels)
             os.replace(target + ".tmp", target)
             print(scene, flush=True)

@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{Size, exp, sigmoid},
+    filter::{Size, exp},
     simd::{Kernel, Simd, Tier},
 };
 
@@ -18,6 +18,12 @@ pub const CORNERS: usize = 4;
 
 /// Their bilinear weights: nearest, beside it in the row, beside it in the column, across.
 const BILINEAR: [f32; CORNERS] = [0.5625, 0.1875, 0.1875, 0.0625];
+
+/// The logistic function, which keeps a blend between its two images.
+#[inline(always)]
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
 
 /// The coarse row (or column) of `n` that fine one `i` lies in, and the next nearest, the edge repeated.
 #[inline(always)]

@@ -15,7 +15,6 @@ pub mod bf16;
 pub mod blend;
 pub mod conv;
 pub mod cross_bilateral;
-pub mod divide;
 pub mod filter;
 pub mod layout;
 pub mod memory;

@@ -131,16 +131,6 @@ pub trait Network: Send + Sync {
     /// [`Network::forward`] on a tape.
     fn forward_taped(&self, batch: &Batch, stats: &mut Stats) -> Images<Taped>;
 
-    /// [`Network::forward_taped`], and the albedo that it estimates on the way where it does, (N, 3, H, W),
-    /// with [`crate::features::ALBEDO_FLOOR`] in it: training supervises both.
-    fn forward_with_albedo(
-        &self,
-        batch: &Batch,
-        stats: &mut Stats,
-    ) -> (Images<Taped>, Option<Images<Taped>>) {
-        (self.forward_taped(batch, stats), None)
-    }
-
     /// Multiply-accumulates for one pixel of the frame.
     fn macs_per_pixel(&self) -> f64;
 

@@ -5,10 +5,9 @@
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
 //! al. 2018), after it was corrected by what filtering changed in the level below: a level's own kernels
 //! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
-//! by a filtered albedo last, so texture is never blurred with the noise. The albedo has a pyramid of its own:
-//! depth of field, rough glass and edges leave noise in it at 4 samples, as coarse as the radiance's. Each
-//! pixel has its divisor between the noisy and the filtered albedo (see [`crate::kernels::divide`]). A
-//! confidence for every pixel and level lets a firefly take itself out of all kernels at once.
+//! by a filtered albedo last, so texture is never blurred with the noise, and noise in the albedo (depth
+//! of field, 4 spp edges) is removed. A confidence for every pixel and level lets a firefly take itself
+//! out of all kernels at once.
 //!
 //! A network that outputs kernels cannot invent a colour, and scales with its input exactly.
 
@@ -29,50 +28,20 @@ use crate::{
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
 pub const LEVELS: usize = 4;
 
-/// An image that the network filters: the size of its kernels, and where a head's channels for it begin.
-struct Filtered {
-    /// Rows and columns of the kernels.
-    kernel: usize,
-    /// First channels in the head of a trunk level, and in that of full resolution for one pixel.
-    of_level: Channels,
-    of_full: Channels,
-}
+/// Rows and columns of the radiance kernels.
+const KERNEL: usize = 5;
 
-/// The first channels of what is predicted for one level of an image's pyramid.
-struct Channels {
-    kernel: usize,
-    confidence: usize,
-    mask: usize,
-    corners: usize,
-}
+/// Rows and columns of the albedo kernels.
+const ALBEDO_KERNEL: usize = 3;
 
-/// Radiance over albedo, and albedo. The order of channels is that in which they were added: a head takes
-/// over the weights of an older one that had fewer.
-const FILTERED: [Filtered; 2] = [
-    Filtered {
-        kernel: 5,
-        of_level: Channels { kernel: 0, confidence: 25, mask: 26, corners: 27 },
-        of_full: Channels { kernel: 0, confidence: 25, mask: 26, corners: 36 },
-    },
-    Filtered {
-        kernel: 3,
-        of_level: Channels { kernel: 31, confidence: 40, mask: 41, corners: 42 },
-        of_full: Channels { kernel: 27, confidence: 40, mask: 41, corners: 42 },
-    },
-];
+/// Channels of a radiance level's head: kernel, confidence, and the mask that blends the level below.
+const HEAD: usize = KERNEL * KERNEL + 2;
 
-/// Channels of a trunk level's head.
-const HEAD: usize = 46;
+/// Channels of a trunk level's head: also the corners from which the level below is upsampled.
+const LEVEL_HEAD: usize = HEAD + CORNERS;
 
-/// The channel of the full-resolution head that says how far the filtered albedo is the divisor.
-const DIVISOR: usize = 46;
-
-/// Channels of that head for one pixel.
-const FULL_HEAD: usize = 47;
-
-/// The albedo is mostly right as it is: its masks begin with 5% of what the level below says, and 5% of the
-/// divisor is filtered.
-const ALBEDO_BIAS: f32 = -3.0;
+/// Channels of the full-resolution head for one pixel: also the albedo kernel.
+const FULL_HEAD: usize = LEVEL_HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -91,7 +60,7 @@ pub struct Pyramid {
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
-    /// Full resolution, four pixels at once.
+    /// Full resolution: radiance kernels, confidence, mask and albedo kernels of four pixels.
     full: Conv,
     /// One head a trunk level, finest first.
     heads: Vec<Conv>,
@@ -112,9 +81,9 @@ struct Level {
     refine: Conv,
 }
 
-/// What a head says of one level of an image's pyramid.
+/// What a head says of one level of the radiance pyramid.
 struct Prediction<T> {
-    /// Logits of the kernels, (N, k*k, H, W).
+    /// Logits of the kernels, (N, 25, H, W).
     kernel: Field<T>,
     /// How far each pixel is to be trusted, (N, 1, H, W).
     confidence: Field<T>,
@@ -125,35 +94,28 @@ struct Prediction<T> {
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
-    /// What the head of a trunk level says of that level of each image.
-    fn of_level(head: Activation<T>) -> [Self; 2] {
-        let [irradiance, albedo] = &FILTERED;
-        [
-            Self::split(head.fork(), irradiance.kernel, &irradiance.of_level, 1),
-            Self::split(head, albedo.kernel, &albedo.of_level, 1),
-        ]
+    /// What a trunk level's head says.
+    fn of_level(head: Activation<T>) -> Self {
+        Self::split(head, 1, 0)
     }
 
-    /// What the head of full resolution says of each image, and the filtered albedo's share of the divisor,
-    /// (N, 1, H, W).
-    fn of_full(head: Activation<T>) -> ([Self; 2], Field<T>) {
-        let [irradiance, albedo] = &FILTERED;
-        let divisor = Field::from_activation(head.fork(), 4 * DIVISOR, 4, 2);
-        let irradiance = Self::split(head.fork(), irradiance.kernel, &irradiance.of_full, 2);
-        ([irradiance, Self::split(head, albedo.kernel, &albedo.of_full, 2)], divisor)
+    /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W).
+    fn of_full(head: Activation<T>) -> (Self, Field<T>) {
+        let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
+        let albedo_kernel = Field::from_activation(head.fork(), 4 * HEAD, albedo_taps, 2);
+        (Self::split(head, 2, albedo_taps), albedo_kernel)
     }
 
-    /// `factor` is 2 where each 2x2 square of pixels shares one pixel of the trunk.
-    fn split(head: Activation<T>, k: usize, first: &Channels, factor: usize) -> Self {
+    /// Parts a head's channels; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
+    /// `between` are the channels before the corners that are not of this.
+    fn split(head: Activation<T>, factor: usize, between: usize) -> Self {
         let area = factor * factor;
-        let field = |head, first: usize, count: usize| {
-            Field::from_activation(head, first * area, count * area, factor)
-        };
+        let taps = KERNEL * KERNEL * area;
         Self {
-            kernel: field(head.fork(), first.kernel, k * k),
-            confidence: field(head.fork(), first.confidence, 1),
-            mask: field(head.fork(), first.mask, 1),
-            corners: field(head, first.corners, CORNERS), // with the tape
+            kernel: Field::from_activation(head.fork(), 0, taps, factor),
+            confidence: Field::from_activation(head.fork(), taps, area, factor),
+            mask: Field::from_activation(head.fork(), taps + area, area, factor),
+            corners: Field::from_activation(head, HEAD * area + between, CORNERS * area, factor),
         }
     }
 }
@@ -217,21 +179,18 @@ impl Pyramid {
         });
         let decoder = decoder.collect();
         let mut head = |name: String, width: usize, channels: usize| {
-            let conv = Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).linear();
-            let (area, mask) = (channels / HEAD, FILTERED[1].of_level.mask);
-            conv.with_bias(mask * area..(mask + 1) * area, ALBEDO_BIAS).with_bias(HEAD * area.., ALBEDO_BIAS)
+            Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).linear()
         };
         Self {
             full: head("head.full".into(), decoder_width(0), 4 * FULL_HEAD),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), HEAD)).collect(),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
             config: config.clone(),
             encoders,
             decoder,
         }
     }
 
-    /// Denoised radiance and the filtered albedo.
-    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> (Field<T>, Field<T>) {
+    fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
         let [irradiance, albedo, radiance_input, guide_input] = &batch[..] else {
             unreachable!("`inputs` makes four planes")
         };
@@ -250,25 +209,45 @@ impl Pyramid {
                 sources.push(up.forward(vec![below])); // (N, K', H, W) -> (N, K, 2H, 2W)
             }
             let fused = level.refine.forward(vec![level.fuse.forward(sources)]);
-            heads.push(head.forward(vec![fused.fork()])); // (N, K, H, W) -> (N, 46, H, W)
+            heads.push(head.forward(vec![fused.fork()])); // (N, K, H, W) -> (N, 27, H, W)
             x = Some(fused);
         }
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
-        // What is predicted for every level of each image's pyramid, full resolution first.
-        let (finest, divisor) = Prediction::of_full(full);
-        let [mut of_irradiance, mut of_albedo] = finest.map(|finest| vec![finest]);
-        for head in heads.into_iter().rev() {
-            let [irradiance, albedo] = Prediction::of_level(head);
-            of_irradiance.push(irradiance);
-            of_albedo.push(albedo);
+        // What is predicted for every pyramid level, full resolution first.
+        let (finest, albedo_kernel) = Prediction::of_full(full);
+        let mut levels = vec![finest];
+        levels.extend(heads.into_iter().rev().map(Prediction::of_level));
+
+        // The radiance pyramid, finest level first; then, from the coarsest up, each level is corrected by
+        // what filtering changed in the one below, and filtered.
+        let mut image = field(irradiance);
+        let mut pyramid = Vec::with_capacity(levels.len());
+        let last = levels.len() - 1;
+        for (level, predicted) in levels.into_iter().enumerate() {
+            let below = (level < last).then(|| image.fork().reduce(predicted.confidence.fork()));
+            pyramid.push((image, predicted));
+            match below {
+                Some(below) => image = below,
+                None => break,
+            }
         }
-        let noisy = field(albedo);
-        let albedo = filtered(noisy.fork(), of_albedo, FILTERED[1].kernel);
-        let irradiance = field(irradiance).redivide(&noisy, albedo.fork(), divisor);
-        let irradiance = filtered(irradiance, of_irradiance, FILTERED[0].kernel);
-        let second = albedo.fork(); // the tape goes with the radiance
-        (irradiance.product(albedo), second)
+        let mut correction: Option<Field<T>> = None;
+        loop {
+            let (noisy, predicted) = pyramid.pop().expect("there are levels");
+            let Prediction { kernel, confidence, mask, corners } = predicted;
+            let corrected = match correction.take() {
+                None => noisy.fork(),
+                // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+                Some(correction) => noisy.fork().blend(correction, mask, corners),
+            };
+            let filtered = corrected.filter(KERNEL, kernel, Some(confidence));
+            if pyramid.is_empty() {
+                let albedo = field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None);
+                return filtered.product(albedo).into_images();
+            }
+            correction = Some(filtered.minus(noisy));
+        }
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.
@@ -284,38 +263,6 @@ impl Pyramid {
             .flat_map(|(level, l)| l.up.iter().chain([&l.fuse, &l.refine]).map(move |c| (c, level + 1)));
         let heads = self.heads.iter().enumerate().map(|(level, c)| (c, level + 1));
         encoders.chain(decoder).chain(heads).chain([(&self.full, 1)])
-    }
-}
-
-/// Filters an image, (N, 3, H, W), by k x k kernels on all levels of its pyramid; `levels` says how, full
-/// resolution first. From the coarsest level up, each is corrected by what filtering changed in the one below,
-/// and filtered.
-fn filtered<T: Tape<f32, Cpu> + Merge<T>>(image: Field<T>, levels: Vec<Prediction<T>>, k: usize) -> Field<T> {
-    let mut image = image;
-    let mut pyramid = Vec::with_capacity(levels.len());
-    let last = levels.len() - 1;
-    for (level, predicted) in levels.into_iter().enumerate() {
-        let below = (level < last).then(|| image.fork().reduce(predicted.confidence.fork()));
-        pyramid.push((image, predicted));
-        match below {
-            Some(below) => image = below,
-            None => break,
-        }
-    }
-    let mut correction: Option<Field<T>> = None;
-    loop {
-        let (noisy, Prediction { kernel, confidence, mask, corners }) =
-            pyramid.pop().expect("there are levels");
-        let corrected = match correction.take() {
-            None => noisy.fork(),
-            // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
-            Some(correction) => noisy.fork().blend(correction, mask, corners),
-        };
-        let filtered = corrected.filter(k, kernel, Some(confidence));
-        if pyramid.is_empty() {
-            return filtered;
-        }
-        correction = Some(filtered.minus(noisy));
     }
 }
 
@@ -348,16 +295,11 @@ impl Network for Pyramid {
     }
 
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {
-        self.run::<NoneTape>(batch).0.into_images()
+        self.run::<NoneTape>(batch)
     }
 
-    fn forward_taped(&self, batch: &Batch, stats: &mut Stats) -> Images<Taped> {
-        self.forward_with_albedo(batch, stats).0
-    }
-
-    fn forward_with_albedo(&self, batch: &Batch, _: &mut Stats) -> (Images<Taped>, Option<Images<Taped>>) {
-        let (image, albedo) = self.run::<Taped>(batch);
-        (image.into_images(), Some(albedo.into_images()))
+    fn forward_taped(&self, batch: &Batch, _: &mut Stats) -> Images<Taped> {
+        self.run::<Taped>(batch)
     }
 
     fn macs_per_pixel(&self) -> f64 {
@@ -365,18 +307,15 @@ impl Network for Pyramid {
             .convolution_levels()
             .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
             .sum();
-        // Three channels and the sum of weights, at every level of both pyramids.
-        let taps: usize = FILTERED.iter().map(|image| image.kernel * image.kernel).sum();
-        let filters: f64 = (0..=LEVELS).map(|l| (4 * taps) as f64 / 4f64.powi(l as i32)).sum();
-        convolutions + filters
+        // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
+        let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
+        convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64
     }
 
     fn reach(&self) -> usize {
-        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels of one
-        // image's pyramid, which reads what those of the other's made.
+        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
         let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
-        let kernels = FILTERED.iter().flat_map(|image| (0..=LEVELS).map(|l| (image.kernel / 2 + 1) << l));
-        trunk + kernels.sum::<usize>()
+        trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>()
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {

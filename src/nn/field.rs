@@ -11,7 +11,6 @@ use super::{
 };
 use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
-    divide::{Division, redivide, redivide_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     layout::{from_blocked_shuffled, to_blocked_shuffled},
     simd::Tier,
@@ -357,44 +356,6 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Divides the field, (N, 3, H, W), which is a quotient by `albedo`, by something between `albedo` and
-    /// `filtered` instead; the latter's share before its logistic is `share`, (N, 1, H, W). No gradient flows
-    /// into quotient and `albedo`, which are inputs. See [`redivide`].
-    pub fn redivide(self, albedo: &Self, filtered: Self, share: Self) -> Self {
-        let (images, _, h, w) = self.extent();
-        let pixels = h * w;
-        let tape = self.tape.merge(filtered.tape).merge(share.tape);
-        let (filtered, share) = (filtered.saved, share.saved);
-        let values =
-            [self.saved.values, albedo.saved.values.clone(), filtered.values.clone(), share.values.clone()];
-        let mut output = plane_buffer(images * 3 * pixels);
-        for (n, output) in output.chunks_mut(3 * pixels).enumerate() {
-            redivide(division_of(&values, n), output);
-        }
-        let (mut field, out) = Self::output((images, 3, h, w), output, tape);
-        if T::OWNS_TAPE {
-            field.tape.add_backward_op(move |_| {
-                let Some(gradient) = out.take() else { return Ok(()) };
-                const LEARNED: &str = "what divides was filtered or predicted";
-                filtered.accumulate(|filtered| {
-                    share.accumulate(|share| {
-                        filtered
-                            .expect(LEARNED)
-                            .par_chunks_mut(3 * pixels)
-                            .zip(share.expect(LEARNED).par_chunks_mut(pixels))
-                            .zip(gradient.par_chunks(3 * pixels))
-                            .enumerate()
-                            .for_each(|(n, ((filtered, share), gradient))| {
-                                redivide_gradient(division_of(&values, n), gradient, filtered, share);
-                            });
-                    });
-                });
-                Ok(())
-            });
-        }
-        field
-    }
-
     /// The values as a dfdx tensor, (N, C, H, W), with the tape.
     pub fn into_images(self) -> Images<T> {
         let images: Images =
@@ -455,12 +416,6 @@ fn combine(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32, f3
 /// What was predicted for the blend of image `n`.
 fn masks_of((alpha, corners): &(Values, Values), n: usize) -> Masks<'_> {
     Masks { alpha: alpha.image(n), corners: corners.image(n) }
-}
-
-/// The division of image `n`.
-fn division_of(values: &[Values; 4], n: usize) -> Division<'_> {
-    let [quotient, albedo, filtered, share] = values.each_ref().map(|values| values.image(n));
-    Division { quotient, albedo, filtered, share }
 }
 
 /// The forward problem of image `n`.

@@ -3,7 +3,7 @@
 //! Each splits the tape off its input, computes, and pushes one backward operation, as dfdx's own
 //! operations do.
 
-use std::{ops::RangeBounds, sync::Arc};
+use std::sync::Arc;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
@@ -73,11 +73,9 @@ impl Conv {
         Self { relu: false, ..self }
     }
 
-    /// The same layer with the bias of `channels` at `value`.
-    pub fn with_bias(mut self, channels: impl RangeBounds<usize>, value: f32) -> Self {
-        let mut biases = self.bias.values();
-        biases[(channels.start_bound().cloned(), channels.end_bound().cloned())].fill(value);
-        self.bias.set(&biases);
+    /// The same layer with every bias at `value`.
+    pub fn with_bias(mut self, value: f32) -> Self {
+        self.bias.set(&vec![value; self.arithmetic.outputs]);
         self
     }
 

@@ -57,7 +57,6 @@ impl Augment {
         }
         sample.passes = new;
         sample.reference = self.pass(Pass::Combined, &sample.reference);
-        sample.albedo = sample.albedo.take().map(|albedo| self.pass(Pass::DenoisingAlbedo, &albedo));
     }
 
     fn pass(&self, pass: Pass, planes: &Planes) -> Planes {

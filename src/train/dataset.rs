@@ -27,18 +27,15 @@ struct Stored {
     height: usize,
     passes: Vec<(Pass, Vec<f16>)>,
     reference: Vec<f16>,
-    albedo: Option<Vec<f16>>,
 }
 
-/// A crop: noisy passes and what they should become.
+/// A crop: noisy passes and the reference radiance, (3, H, W).
 #[derive(Clone, Debug)]
 pub struct Sample {
     /// The noisy passes.
     pub passes: PassSet,
-    /// The reference radiance, (3, H, W).
+    /// The reference.
     pub reference: Planes,
-    /// The reference's albedo, (3, H, W), where it holds one.
-    pub albedo: Option<Planes>,
 }
 
 /// Largest finite half: brighter values are clipped in the training copy.
@@ -138,7 +135,6 @@ impl Stored {
             height: noisy.height,
             passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
             reference: to_half(&target.data),
-            albedo: reference.get(Pass::DenoisingAlbedo).map(|albedo| to_half(&albedo.data)),
         })
     }
 
@@ -156,7 +152,6 @@ impl Stored {
         for (pass, data) in &self.passes {
             passes.insert(*pass, cut(data, pass.channels()));
         }
-        let albedo = self.albedo.as_ref().map(|albedo| cut(albedo, 3));
-        Sample { passes, reference: cut(&self.reference, 3), albedo }
+        Sample { passes, reference: cut(&self.reference, 3) }
     }
 }

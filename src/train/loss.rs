@@ -9,11 +9,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    features::{ALBEDO_FLOOR, clamp_albedo},
     metrics::error::{RELMSE_EPSILON, SMAPE_EPSILON},
     models::network::Taped,
     nn::Images,
-    planes::Planes,
 };
 
 /// What training minimises.
@@ -84,26 +82,6 @@ fn relmse(image: Images<Taped>, reference: Vec<f32>, scale: &[f32]) -> Tensor<Ra
     let weight: Images = device.tensor_from_vec(weight, shape);
     let reference: Images = device.tensor_from_vec(reference, shape);
     (square(image - reference) * weight).mean()
-}
-
-/// The squared relative error of a network's albedo, (N, 3, H, W), with its floor, over the images that have one
-/// to compare it with. The square makes noise in those references harmless: it has no bias.
-pub fn of_albedo(albedo: Images<Taped>, references: &[Option<&Planes>]) -> Tensor<Rank0, f32, Cpu, Taped> {
-    let (device, shape) = (Cpu::default(), *albedo.shape());
-    let values = shape.1 * shape.2 * shape.3;
-    let (mut target, mut weight) = (vec![0.0; shape.0 * values], vec![0.0; shape.0 * values]);
-    for (n, reference) in references.iter().enumerate() {
-        let Some(reference) = reference else { continue };
-        let of_image = n * values..(n + 1) * values;
-        let into = target[of_image.clone()].iter_mut().zip(&mut weight[of_image]);
-        for ((target, weight), v) in into.zip(&reference.data) {
-            *target = clamp_albedo(*v) + ALBEDO_FLOOR;
-            *weight = (*target * *target).recip();
-        }
-    }
-    let (target, weight): (Images, Images) =
-        (device.tensor_from_vec(target, shape), device.tensor_from_vec(weight, shape));
-    (square(albedo - target) * weight).mean()
 }
 
 fn smape(image: Images<Taped>, reference: Vec<f32>) -> Tensor<Rank0, f32, Cpu, Taped> {

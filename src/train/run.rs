@@ -169,10 +169,6 @@ fn draw(dataset: &Dataset, options: &Options, step: usize) -> Vec<Sample> {
         .collect()
 }
 
-/// How much the error of a network's albedo counts beside that of its radiance: noise in the albedo is a small
-/// part of the latter, and would be learned last.
-const ALBEDO_LOSS: f32 = 8.0;
-
 /// Falls geometrically from the first step to the last.
 fn learning_rate(options: &Options, step: usize) -> f64 {
     let (first, last) = options.lr;
@@ -194,12 +190,8 @@ fn step(
         .flat_map(|(sample, scale)| sample.reference.data.iter().map(move |v| v / scale))
         .collect();
     let mut stats = Stats::Batch(Vec::new());
-    let (image, albedo) = network.forward_with_albedo(&stack(&inputs), &mut stats);
-    let mut loss = options.loss.of(image, reference, &scales);
-    let albedos: Vec<_> = samples.iter().map(|sample| sample.albedo.as_ref()).collect();
-    if let Some(albedo) = albedo.filter(|_| albedos.iter().any(Option::is_some)) {
-        loss = loss + super::loss::of_albedo(albedo, &albedos) * ALBEDO_LOSS;
-    }
+    let image = network.forward_taped(&stack(&inputs), &mut stats);
+    let loss = options.loss.of(image, reference, &scales);
     let value = f64::from(loss.as_vec()[0]);
     let mut gradients = loss.backward();
     let norm = adam.update(step, lr, network.params(), &mut gradients);

@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{FILTERED, LEVELS, Prediction, Pyramid};
+use super::{ALBEDO_KERNEL, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
     features::{Inputs, exposure, guides_exposed},
@@ -70,13 +70,11 @@ struct Frame<'a> {
     encoders: [Vec<Encoded>; 2],
     /// Finest level first.
     decoder: Vec<Decoded>,
-    /// Radiance over the noisy albedo, and the filtered albedo's share of the divisor.
-    quotient: Line<Field>,
-    divisor: Line<Field>,
-    /// Irradiance and albedo, each full resolution first.
-    images: [Vec<Scale>; 2],
-    /// Rows handed out.
-    done: usize,
+    /// Full resolution first.
+    scales: Vec<Scale>,
+    albedo: Line<Field>,
+    /// One for each kernel of full resolution.
+    albedo_kernels: VecDeque<Field>,
 }
 
 /// A level of an encoder.
@@ -93,10 +91,8 @@ struct Decoded {
     refined: Line<Maps>,
 }
 
-/// A level of an image's pyramid.
+/// A level of the radiance pyramid.
 struct Scale {
-    /// Rows and columns of the kernels.
-    k: usize,
     image: Line<Field>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet corrected, and for those not yet filtered.
@@ -104,8 +100,10 @@ struct Scale {
     kernels: VecDeque<(Range<usize>, Field)>,
     /// The image, corrected by the level below.
     corrected: Line<Field>,
-    /// The image, filtered; but for full resolution, what filtering changed: the correction of the level above.
-    filtered: Line<Field>,
+    /// What filtering changed: the correction of the level above.
+    correction: Line<Field>,
+    /// Rows filtered.
+    filtered: usize,
 }
 
 impl<'a> Frame<'a> {
@@ -121,24 +119,23 @@ impl<'a> Frame<'a> {
         };
         let decoded =
             |l| Decoded { up: Line::new(rows(l)), fused: Line::new(rows(l)), refined: Line::new(rows(l)) };
-        let scale = |s: usize, k: usize| Scale {
-            k,
+        let scale = |s: usize| Scale {
             image: Line::new(height >> s),
             confidence: Line::new(height >> s),
             masks: VecDeque::new(),
             kernels: VecDeque::new(),
             corrected: Line::new(height >> s),
-            filtered: Line::new(height >> s),
+            correction: Line::new(height >> s),
+            filtered: 0,
         };
         Self {
             network,
             band,
             encoders: [encoder(), encoder()],
             decoder: (0..LEVELS).map(decoded).collect(),
-            quotient: Line::new(height),
-            divisor: Line::new(height),
-            images: FILTERED.each_ref().map(|image| (0..=LEVELS).map(|s| scale(s, image.kernel)).collect()),
-            done: 0,
+            scales: (0..=LEVELS).map(scale).collect(),
+            albedo: Line::new(height),
+            albedo_kernels: VecDeque::new(),
         }
     }
 
@@ -148,8 +145,8 @@ impl<'a> Frame<'a> {
             unreachable!("`inputs` makes four planes")
         };
         let field = |p: &Planes| Field::input((1, p.channels, p.height, p.width), &p.data);
-        self.quotient.push(field(irradiance));
-        self.images[1][0].image.push(field(albedo));
+        self.scales[0].image.push(field(irradiance));
+        self.albedo.push(field(albedo));
         for (encoder, planes) in self.encoders.iter_mut().zip([radiance, guide]) {
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
             encoder[0].input.push(Maps::input_halved(shape, &planes.data));
@@ -158,12 +155,12 @@ impl<'a> Frame<'a> {
 
     /// Whether all inputs are there.
     fn is_whole(&self) -> bool {
-        self.quotient.end() == self.quotient.total()
+        self.albedo.end() == self.albedo.total()
     }
 
     /// Whether everything is computed.
     fn is_done(&self) -> bool {
-        self.done == self.quotient.total()
+        self.scales[0].filtered == self.albedo.total()
     }
 
     /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
@@ -171,21 +168,10 @@ impl<'a> Frame<'a> {
     fn advance(&mut self, done: &mut impl FnMut(usize, &Field)) {
         self.encode();
         self.decode();
-        let [irradiance, albedo] = &mut self.images;
-        filter(albedo);
-        let Scale { image: noisy, filtered: albedo, .. } = &albedo[0];
-        while let Some(end) = albedo.band_end(irradiance[0].image.end()) {
-            let rows = irradiance[0].image.end()..end;
-            let [quotient, divisor] = [&self.quotient, &self.divisor].map(|line| line.rows(rows.clone()));
-            let albedo = albedo.rows(rows.clone());
-            irradiance[0].image.push(quotient.redivide(&noisy.rows(rows), albedo, divisor));
-        }
-        filter(irradiance);
-        let irradiance = &irradiance[0].filtered;
-        while let Some(end) = irradiance.band_end(self.done) {
-            let rows = self.done..end;
-            done(rows.start, &irradiance.rows(rows.clone()).product(albedo.rows(rows)));
-            self.done = end;
+        self.reduce();
+        for scale in (0..=LEVELS).rev() {
+            self.correct(scale);
+            self.filter(scale, done);
         }
         self.forget();
     }
@@ -238,17 +224,67 @@ impl<'a> Frame<'a> {
                 continue;
             }
             let head = self.network.heads[level].forward(vec![refined.rows(rows.clone())]);
-            for (scales, prediction) in self.images.iter_mut().zip(Prediction::of_level(head)) {
-                scales[level + 1].predicted(rows.clone(), prediction);
-            }
+            self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (predictions, divisor) = Prediction::of_full(head);
-                self.divisor.push(divisor);
-                for (scales, prediction) in self.images.iter_mut().zip(predictions) {
-                    scales[0].predicted(2 * rows.start..2 * rows.end, prediction);
-                }
+                let (prediction, albedo_kernel) = Prediction::of_full(head);
+                self.albedo_kernels.push_back(albedo_kernel);
+                self.scales[0].predicted(2 * rows.start..2 * rows.end, prediction);
             }
+        }
+    }
+
+    /// Builds the radiance pyramid.
+    fn reduce(&mut self) {
+        for scale in 0..LEVELS {
+            let [fine, coarse] = &mut self.scales[scale..scale + 2] else { unreachable!("two scales") };
+            let (from, to) = (coarse.image.end(), fine.image.end().min(fine.confidence.end()) / 2);
+            if from < to {
+                let rows = 2 * from..2 * to;
+                coarse.image.push(fine.image.rows(rows.clone()).reduce(fine.confidence.rows(rows)));
+            }
+        }
+    }
+
+    /// Adds the correction of the scale below to the image.
+    fn correct(&mut self, scale: usize) {
+        let (finer, coarser) = self.scales.split_at_mut(scale + 1);
+        let Scale { image, masks, corrected, .. } = &mut finer[scale];
+        let Some(below) = coarser.first().map(|c| &c.correction) else { return };
+        while let Some((rows, _, _)) = masks.front() {
+            if image.end() < rows.end || 2 * below.settled(1) < rows.end {
+                break;
+            }
+            let (rows, mask, corners) = masks.pop_front().expect("there is one");
+            let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
+            let place = Place { first: rows.start, total: image.total(), coarse: near.start };
+            corrected.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
+        }
+    }
+
+    /// Filters the image; at full resolution, hands out what becomes of it.
+    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field)) {
+        const REACH: usize = KERNEL / 2;
+        let Scale { image, confidence, kernels, corrected, correction, filtered, .. } =
+            &mut self.scales[scale];
+        let source = if scale == LEVELS { &*image } else { &*corrected };
+        while let Some((rows, _)) = kernels.front() {
+            if source.settled(REACH).min(confidence.settled(REACH)) < rows.end {
+                break;
+            }
+            let (rows, kernel) = kernels.pop_front().expect("there is one");
+            let (near, inside) = around(&rows, REACH, source.total());
+            let (source, trust) = (source.rows(near.clone()), confidence.rows(near));
+            let smooth = source.filter_rows(inside, KERNEL, &kernel, Some(&trust));
+            *filtered = rows.end;
+            if scale > 0 {
+                correction.push(smooth.minus(image.rows(rows)));
+                continue;
+            }
+            let kernel = self.albedo_kernels.pop_front().expect("there is one for each kernel");
+            let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
+            let albedo = self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None);
+            done(rows.start, &smooth.product(albedo));
         }
     }
 
@@ -269,83 +305,21 @@ impl<'a> Frame<'a> {
             fused.forget(refined.end().saturating_sub(1));
             refined.forget(above.min(refined.end()).saturating_sub(1));
         }
-        let divided = self.images[0][0].image.end();
-        self.quotient.forget(divided);
-        self.divisor.forget(divided);
-        for scales in &mut self.images {
-            for scale in 0..=LEVELS {
-                let reduced = scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.image.end());
-                let used = match scale.checked_sub(1) {
-                    Some(above) => (scales[above].corrected.end() / 2).saturating_sub(1),
-                    None => self.done,
-                };
-                let Scale { k, image, confidence, corrected, filtered, .. } = &mut scales[scale];
-                let reach = filtered.end().saturating_sub(*k / 2);
-                image.forget(reach.min(reduced).min(if scale == 0 { divided } else { usize::MAX }));
-                confidence.forget(reach.min(reduced));
-                corrected.forget(reach);
-                filtered.forget(used);
-            }
+        for scale in 0..=LEVELS {
+            let reduced = self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.image.end());
+            let above = scale.checked_sub(1).map_or(0, |above| self.scales[above].corrected.end() / 2);
+            let Scale { image, confidence, corrected, correction, filtered, .. } = &mut self.scales[scale];
+            let reach = filtered.saturating_sub(KERNEL / 2);
+            image.forget(reach.min(reduced));
+            confidence.forget(reach.min(reduced));
+            corrected.forget(reach);
+            correction.forget(above.saturating_sub(1));
         }
-    }
-}
-
-/// Filters an image, coarsest scale first, as far down as the rows that are there allow.
-fn filter(scales: &mut [Scale]) {
-    reduce(scales);
-    for scale in (0..=LEVELS).rev() {
-        correct(scales, scale);
-        scales[scale].filter(scale);
-    }
-}
-
-/// Builds an image's pyramid.
-fn reduce(scales: &mut [Scale]) {
-    for scale in 0..LEVELS {
-        let [fine, coarse] = &mut scales[scale..scale + 2] else { unreachable!("two scales") };
-        let (from, to) = (coarse.image.end(), fine.image.end().min(fine.confidence.end()) / 2);
-        if from < to {
-            let rows = 2 * from..2 * to;
-            coarse.image.push(fine.image.rows(rows.clone()).reduce(fine.confidence.rows(rows)));
-        }
-    }
-}
-
-/// Adds the correction of the scale below to the image of scale `scale`.
-fn correct(scales: &mut [Scale], scale: usize) {
-    let (finer, coarser) = scales.split_at_mut(scale + 1);
-    let Scale { image, masks, corrected, .. } = &mut finer[scale];
-    let Some(below) = coarser.first().map(|c| &c.filtered) else { return };
-    while let Some((rows, _, _)) = masks.front() {
-        if image.end() < rows.end || 2 * below.settled(1) < rows.end {
-            break;
-        }
-        let (rows, mask, corners) = masks.pop_front().expect("there is one");
-        let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
-        let place = Place { first: rows.start, total: image.total(), coarse: near.start };
-        corrected.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
+        self.albedo.forget(self.scales[0].filtered.saturating_sub(ALBEDO_KERNEL / 2));
     }
 }
 
 impl Scale {
-    /// Filters the image of scale `scale`.
-    fn filter(&mut self, scale: usize) {
-        let Self { k, image, confidence, kernels, corrected, filtered, .. } = self;
-        // Nothing lies below the coarsest level, which so is not corrected.
-        let source = if scale == LEVELS { &*image } else { &*corrected };
-        let reach = *k / 2;
-        while let Some((rows, _)) = kernels.front() {
-            if source.settled(reach).min(confidence.settled(reach)) < rows.end {
-                break;
-            }
-            let (rows, kernel) = kernels.pop_front().expect("there is one");
-            let (near, inside) = around(&rows, reach, source.total());
-            let smooth =
-                source.rows(near.clone()).filter_rows(inside, *k, &kernel, Some(&confidence.rows(near)));
-            filtered.push(if scale == 0 { smooth } else { smooth.minus(image.rows(rows)) });
-        }
-    }
-
     /// Takes in what a head predicted for `rows`.
     fn predicted(&mut self, rows: Range<usize>, prediction: Prediction<NoneTape>) {
         let Prediction { kernel, confidence, mask, corners } = prediction;
