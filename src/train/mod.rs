@@ -6,6 +6,7 @@
 
 mod augment;
 mod checkpoint;
+mod compose;
 mod dataset;
 mod log;
 mod loss;
