@@ -49,9 +49,6 @@ pub struct Args {
     /// Rows and columns of a crop, a multiple of 32
     #[arg(long, default_value_t = 128)]
     patch: usize,
-    /// Share of crops that are composed of two, cut along random outlines: edges that no training scene has
-    #[arg(long, default_value_t = 0.0)]
-    composed: f64,
     /// Learning rate of the first and last step
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
@@ -166,9 +163,6 @@ impl Args {
         if !(0.0..1.0).contains(&self.average) {
             return Err(usage("--average must be at least 0 and less than 1"));
         }
-        if !(0.0..=1.0).contains(&self.composed) {
-            return Err(usage("--composed must be from 0 to 1"));
-        }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
             pairs.into_iter().partition(|p| held_out(&p.reference))
@@ -200,7 +194,6 @@ impl Args {
             steps: self.steps,
             batch: self.batch,
             patch: self.patch,
-            composed: self.composed,
             lr: self.lr,
             loss: self.loss,
             precision: self.precision.unwrap_or_else(Precision::fastest),

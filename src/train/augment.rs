@@ -122,7 +122,7 @@ impl Augment {
 }
 
 /// Whether a pass scales with the light in the scene.
-pub(super) fn carries_radiance(pass: Pass) -> bool {
+fn carries_radiance(pass: Pass) -> bool {
     use Pass::*;
     matches!(
         pass,

@@ -3,7 +3,7 @@
 use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
-use super::{Augment, compose};
+use super::Augment;
 use crate::{
     Error, Result,
     frame::Frame,
@@ -81,31 +81,16 @@ impl Dataset {
         (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
-    /// A random square crop of `patch` pixels, augmented, with a probability of `composed` composed of two; all
-    /// of it decided by `rng`. A frame is drawn as often as it is large.
-    pub fn draw(&self, patch: usize, composed: f64, rng: &mut Rng) -> Sample {
-        let (mut sample, spp) = self.draw_plain(patch, rng);
-        if f64::from(rng.uniform()) < composed {
-            // Half the edges are between surfaces, the others within one.
-            let other = match rng.below(4) {
-                0 => compose::relit(&sample, rng),
-                1 => compose::repainted(&sample, rng),
-                _ => self.draw_plain(patch, rng).0,
-            };
-            compose::compose(&mut sample, &other, spp, rng);
-        }
-        sample
-    }
-
-    /// An augmented crop, and the samples per pixel of its frame.
-    fn draw_plain(&self, patch: usize, rng: &mut Rng) -> (Sample, usize) {
+    /// A random square crop of `patch` pixels, augmented; all of it decided by `rng`. A frame is drawn as
+    /// often as it is large.
+    pub fn draw(&self, patch: usize, rng: &mut Rng) -> Sample {
         let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
         let stored = &self.frames[self.pixels.partition_point(|&end| end <= pixel)];
         let x = rng.below(stored.width - patch + 1);
         let y = rng.below(stored.height - patch + 1);
         let mut sample = stored.crop(x, y, patch, patch);
         Augment::draw(rng).apply(&mut sample);
-        (sample, stored.pair.spp as usize)
+        sample
     }
 }
 

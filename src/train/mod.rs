@@ -6,7 +6,6 @@
 
 mod augment;
 mod checkpoint;
-mod compose;
 mod dataset;
 mod log;
 mod loss;

@@ -43,9 +43,6 @@ pub struct Options {
     pub batch: usize,
     /// Rows and columns of a crop.
     pub patch: usize,
-    /// The share of crops that are composed of two.
-    #[serde(default)]
-    pub composed: f64,
     /// Learning rate of the first and of the last step; it falls geometrically.
     pub lr: (f64, f64),
     /// What is minimised.
@@ -168,7 +165,7 @@ fn draw(dataset: &Dataset, options: &Options, step: usize) -> Vec<Sample> {
     // Stream 0 made the initial weights.
     streams
         .into_par_iter()
-        .map(|stream| dataset.draw(options.patch, options.composed, &mut Rng::new(options.seed, 1 + stream as u64)))
+        .map(|stream| dataset.draw(options.patch, &mut Rng::new(options.seed, 1 + stream as u64)))
         .collect()
 }
 
