@@ -95,12 +95,6 @@ fn z_score(channel: &mut [f32]) {
 /// The passes of the built-in models' inputs: what Blender's "Denoising Data" switch stores.
 pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo];
 
-/// A pass that the built-in models make use of where it is there: that switch stores it too.
-pub const GUIDE_OPTIONAL: [Pass; 1] = [Pass::DenoisingDepth];
-
-/// Channels of the guide encoder's input: albedo, normal, [`depth_steps`].
-pub const GUIDE_CHANNELS: usize = 7;
-
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
 const ALBEDO_FLOOR: f32 = 0.05;
 
@@ -113,85 +107,37 @@ const EXPOSURE_SQUARE: usize = 16;
 
 /// The built-in models' inputs, in this order:
 /// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
-/// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo, camera-space
-/// normal and steps of depth (7, H, W). The scale is the inverse of the exposure.
+/// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
+/// camera-space normal (6, H, W). The scale is the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
 pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
-    let exposure = exposure(passes.require(Pass::Combined, needed_by)?);
-    guides_of_rows(passes, 0..passes.height, exposure, needed_by)
+    guides_exposed(passes, exposure(passes.require(Pass::Combined, needed_by)?), needed_by)
 }
 
-/// [`guides`] of some rows of a frame, whose exposure was found before.
+/// [`guides`] with an exposure that was found before: for some rows of a frame.
 ///
 /// # Errors
 /// As [`guides`].
-pub fn guides_of_rows(
-    frame: &PassSet,
-    rows: std::ops::Range<usize>,
-    exposure: f32,
-    needed_by: &str,
-) -> Result<Inputs> {
-    let passes = &frame.rows(&GUIDE_PASSES, rows.clone());
+pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
     // Emitters write their radiance here; brighter than white says nothing about texture.
     albedo.data.iter_mut().for_each(|a| *a = a.clamp(0.0, 1.0));
-    let mut guide: Vec<f32> = albedo.data.iter().chain(&normal.data).map(|v| v.clamp(-1.0, 1.0)).collect();
-    match frame.get(Pass::DenoisingDepth) {
-        Some(depth) => guide.extend(depth_steps(depth, rows)),
-        None => guide.resize(guide.len() + passes.width * passes.height, 0.0),
-    }
-    let guide = Planes::from_vec(GUIDE_CHANNELS, passes.width, passes.height, guide);
+    let guide = Planes::from_vec(
+        6,
+        passes.width,
+        passes.height,
+        albedo.data.iter().chain(&normal.data).map(|v| v.clamp(-1.0, 1.0)).collect(),
+    );
     albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
     let mut irradiance = radiance.clone();
     irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
     let mut encoded = irradiance.clone();
     encoded.data.par_iter_mut().for_each(|v| *v = log_transfer(*v));
     Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
-}
-
-/// Where depth breaks, for some rows of a frame: an edge that neither normal nor albedo shows lies between
-/// parallel surfaces of one colour.
-///
-/// The inverse of depth is linear in the picture over any plane (projective geometry), so the value is the
-/// second difference of the inverse, over both axes, relative to the inverse and compressed: 0 on every flat
-/// surface however slanted, positive on the near side of a step and negative on its far side, in -1..1. At
-/// the frame's borders, an axis that lacks a neighbour counts as flat.
-fn depth_steps(depth: &Planes, rows: std::ops::Range<usize>) -> Vec<f32> {
-    /// A step of `1 / STEEPNESS` of the depth comes to half of the largest.
-    const STEEPNESS: f32 = 64.0;
-    /// Steps are rare and small: as large as this, training takes them in as soon as other guides.
-    const LARGEST: f32 = 4.0;
-    /// Nothing was hit: Cycles leaves 0 in this pass.
-    const NOWHERE: f32 = 0.0;
-    let (w, h) = (depth.width, depth.height);
-    let inverse = |y: usize, x: usize| match depth.data[y * w + x] {
-        depth if depth > NOWHERE => depth.recip(),
-        _ => 0.0,
-    };
-    let mut out = vec![0.0; rows.len() * w];
-    out.par_chunks_mut(w.max(1)).zip(rows).for_each(|(out, y)| {
-        for (x, out) in out.iter_mut().enumerate() {
-            let here = inverse(y, x);
-            let (mut step, mut scale) = (0.0, here);
-            let mut axis = |before: f32, after: f32| {
-                step += here - 0.5 * (before + after);
-                scale = scale.max(before).max(after);
-            };
-            if x > 0 && x + 1 < w {
-                axis(inverse(y, x - 1), inverse(y, x + 1));
-            }
-            if y > 0 && y + 1 < h {
-                axis(inverse(y - 1, x), inverse(y + 1, x));
-            }
-            let relative = STEEPNESS * step / scale.max(f32::MIN_POSITIVE);
-            *out = LARGEST * relative / (1.0 + relative.abs());
-        }
-    });
-    out
 }
 
 /// Logarithm of exposed radiance for a network to read: 0 for black, about 1 for white. Nothing is
@@ -299,25 +245,6 @@ mod tests {
         let mut flat = [7.0; 9];
         z_score(&mut flat);
         assert_eq!(flat, [0.0; 9]);
-    }
-
-    #[test]
-    fn depth_breaks_at_steps_and_not_on_slanted_planes() {
-        // A plane whose inverse depth rises to the right and falls downwards.
-        let plane = |y: usize, x: usize| (0.2 + 0.01 * x as f32 - 0.007 * y as f32).recip();
-        let (w, h) = (8, 6);
-        let mut depth = Planes::new(1, w, h);
-        (0..w * h).for_each(|i| depth.data[i] = plane(i / w, i % w));
-        assert!(depth_steps(&depth, 0..h).iter().all(|s| s.abs() < 1e-3));
-        // The right half lies one part in sixteen farther; the last pixel of all sees the sky.
-        (0..w * h).filter(|i| i % w >= 4).for_each(|i| depth.data[i] *= 17.0 / 16.0);
-        depth.data[w * h - 1] = 0.0;
-        let steps = depth_steps(&depth, 0..h);
-        assert!((steps[w + 3] - 2.0 / 3.0).abs() < 0.05, "near side, half of 4: {}", steps[w + 3]);
-        assert!(steps[w + 4] < -0.5 && steps[w + 1].abs() < 1e-3);
-        assert!(steps[w * h - 2] > 0.9, "before the sky: {}", steps[w * h - 2]);
-        // Some rows are the same as in the whole.
-        assert_eq!(depth_steps(&depth, 2..4), steps[2 * w..4 * w]);
     }
 
     #[test]

@@ -18,7 +18,7 @@ use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
-    features::{GUIDE_CHANNELS, GUIDE_OPTIONAL, GUIDE_PASSES, Inputs, guides},
+    features::{GUIDE_PASSES, Inputs, guides},
     kernels::blend::CORNERS,
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
     passes::{Pass, PassSet},
@@ -49,8 +49,9 @@ const DECODER_EXTRA: usize = 16;
 /// Heads begin this much smaller than Xavier: kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
-/// Channels of the radiance encoder's input, before space to depth.
+/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth.
 const RADIANCE_CHANNELS: usize = 3;
+const GUIDE_CHANNELS: usize = 6;
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]
@@ -272,10 +273,6 @@ impl Network for Pyramid {
 
     fn passes(&self) -> &'static [Pass] {
         &GUIDE_PASSES
-    }
-
-    fn optional_passes(&self) -> &'static [Pass] {
-        &GUIDE_OPTIONAL
     }
 
     fn multiple(&self) -> usize {

@@ -75,9 +75,9 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
     parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
 }
 
-/// Reads the network `config` from a weights file that holds it, or a narrower one of the same design, or one
-/// that read fewer guides: the wider network then begins as the same function (see `Conv::widen_from`), its
-/// further channels as `seed` draws them.
+/// Reads the network `config` from a weights file that holds it, or a narrower one of the same design:
+/// the wider network then begins as the same function (see `Conv::widen_from`), its further channels as
+/// `seed` draws them.
 ///
 /// # Errors
 /// As [`read`], or the file holds another network.
@@ -97,10 +97,7 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
         network.convolutions().into_iter().zip(narrow.convolutions()).all(|(wide, narrow)| {
             let (weight, bias) = (find(&wide.weight.name), find(&wide.bias.name));
             weight.zip(bias).is_some_and(|(weight, bias)| {
-                let mut held = Arithmetic { outputs: bias.values.len(), ..narrow.arithmetic().clone() };
-                if let [inputs] = &mut held.inputs[..] {
-                    *inputs = weight.values.len() / (held.outputs * held.geometry.taps()).max(1);
-                }
+                let held = Arithmetic { outputs: bias.values.len(), ..narrow.arithmetic().clone() };
                 wide.widen_from(&held, &weight.values, &bias.values)
             })
         })

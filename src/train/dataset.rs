@@ -18,8 +18,6 @@ pub struct Dataset {
     frames: Vec<Stored>,
     /// Pixels of all frames up to and with each.
     pixels: Vec<usize>,
-    /// Whether crops may lack depth, as frames of other programs do.
-    depth_optional: bool,
 }
 
 struct Stored {
@@ -39,9 +37,6 @@ pub struct Sample {
     /// The reference.
     pub reference: Planes,
 }
-
-/// One crop in this many goes without a depth that the network could do without.
-const DEPTH_LACKING: usize = 8;
 
 /// Largest finite half: brighter values are clipped in the training copy.
 const HALF_MAX: f32 = 65504.0;
@@ -67,8 +62,7 @@ impl Dataset {
             total += f.width * f.height;
             total
         });
-        let depth_optional = optional.contains(&Pass::DenoisingDepth);
-        Ok(Self { pixels: pixels.collect(), frames, depth_optional })
+        Ok(Self { pixels: pixels.collect(), frames })
     }
 
     /// Frames held.
@@ -96,9 +90,6 @@ impl Dataset {
         let y = rng.below(stored.height - patch + 1);
         let mut sample = stored.crop(x, y, patch, patch);
         Augment::draw(rng).apply(&mut sample);
-        if self.depth_optional && rng.below(DEPTH_LACKING) == 0 {
-            sample.passes.remove(Pass::DenoisingDepth);
-        }
         sample
     }
 }

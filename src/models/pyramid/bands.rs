@@ -11,7 +11,7 @@ use dfdx::tensor::NoneTape;
 use super::{ALBEDO_KERNEL, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
-    features::{Inputs, exposure, guides_of_rows},
+    features::{Inputs, exposure, guides_exposed},
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -38,8 +38,8 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     let mut frame = Frame::new(network, height, rows);
     let mut image = Planes::new(3, passes.width, passes.height);
     for y in (0..height).step_by(rows) {
-        let band = y..(y + rows).min(passes.height);
-        let inputs = guides_of_rows(passes, band, exposure, NEEDED_BY)?.padded(multiple);
+        let band = passes.rows(network.passes(), y..(y + rows).min(passes.height));
+        let inputs = guides_exposed(&band, exposure, NEEDED_BY)?.padded(multiple);
         let mut done = |first: usize, field: &Field| {
             let (_, _, h, w) = field.extent();
             for (c, plane) in field.values().chunks(h * w).enumerate() {
