@@ -26,7 +26,7 @@ use demc::{
     nn::{Precision, Rng, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
-    train::{Adam, Loss},
+    train::{Loss, Optimizer, Rule},
 };
 use dfdx::tensor_ops::Backward;
 
@@ -163,7 +163,7 @@ fn train_step(precision: Precision, (n, size): (usize, usize)) -> Box<dyn FnMut(
     let batch = batch(n, size, size);
     let reference = vec![0.5; n * 3 * size * size];
     let scales = vec![1.0; n];
-    let mut adam = Adam::default();
+    let mut optimizer = Optimizer::new(Rule::Adam);
     let mut step = 0;
     Box::new(move || {
         step += 1;
@@ -171,7 +171,7 @@ fn train_step(precision: Precision, (n, size): (usize, usize)) -> Box<dyn FnMut(
         let image = network.forward_taped(&batch, &mut stats);
         let loss = Loss::Relmse.of(image, reference.clone(), &scales);
         let mut gradients = loss.backward();
-        let norm = adam.update(step, 1e-5, network.params(), &mut gradients);
+        let norm = optimizer.update(step, 1e-5, network.params(), &mut gradients);
         assert!(norm.is_finite(), "the step learns");
     })
 }

@@ -155,7 +155,7 @@ fn a_frame_of_many_samples_is_never_made_worse() {
         .map(|name| passes::load(data(name), None).unwrap());
     let [noisy, reference] = pair.each_ref().map(|set| set.require(Pass::Combined, "this test").unwrap());
     let before = metrics::error::relmse(noisy, reference);
-    for model in ["demc-s", "demc-m"] {
+    for model in ["demc-s", "demc-m", "demc-l"] {
         let after =
             metrics::error::relmse(&models::open(model).unwrap().denoise(&pair[0]).unwrap(), reference);
         assert!(after < before, "{model}: RelMSE {before} became {after}");
@@ -217,13 +217,19 @@ fn passes_without_a_single_number_still_make_a_finite_image() {
 #[test]
 fn radiance_256_times_darker_or_brighter_is_denoised_alike() {
     let plain = window(160, 96);
-    let expected = denoise(&plain);
-    for stops in [-8, 8] {
-        let factor = 2f32.powi(stops);
-        let mut scaled = plain.clone();
-        edit(&mut scaled, Pass::Combined, |v| v.iter_mut().for_each(|v| *v *= factor));
-        for (got, want) in denoise(&scaled).data.iter().zip(&expected.data) {
-            assert!((got / factor - want).abs() <= 0.01 * want.abs(), "2^{stops}: {got} for {want}");
+    for name in ["demc-s", "demc-m", "demc-l"] {
+        let model = models::open(name).unwrap();
+        let expected = model.denoise(&plain).unwrap();
+        for stops in [-8, 8] {
+            let factor = 2f32.powi(stops);
+            let mut scaled = plain.clone();
+            edit(&mut scaled, Pass::Combined, |v| v.iter_mut().for_each(|v| *v *= factor));
+            for (got, want) in model.denoise(&scaled).unwrap().data.iter().zip(&expected.data) {
+                assert!(
+                    (got / factor - want).abs() <= 0.01 * want.abs(),
+                    "{name}, 2^{stops}: {got} for {want}"
+                );
+            }
         }
     }
 }

@@ -214,6 +214,22 @@ fn finished_rows_are_kept_and_missing_ones_run() {
 }
 
 #[test]
+fn what_methods_say_is_on_the_page_and_stays_there() {
+    let out = tempfile::tempdir().unwrap();
+    let set = data("s0010_outdoor_0004spp.exr");
+    let page = || fs::read_to_string(out.path().join("report.html")).unwrap();
+    let run = || eval(&set, out.path(), &["--models", "kpcn", "--no-sheets"]).success();
+    const NOTE: &str = "kpcn: these weights filter Combined as one stream";
+    run().stderr(predicate::str::contains(NOTE));
+    assert_eq!(page().matches(NOTE).count(), 1);
+    // Nothing runs, so nothing is said anew.
+    run().stderr(
+        predicate::str::contains("2 of 2 rows are there already").and(predicate::str::contains(NOTE).not()),
+    );
+    assert_eq!(page().matches(NOTE).count(), 1);
+}
+
+#[test]
 fn a_killed_run_keeps_its_finished_rows_and_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let manifest = dir.path().join("set.csv");

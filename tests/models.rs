@@ -282,6 +282,7 @@ fn a_wider_network_begins_as_the_narrower_one() {
         patch: 16,
         lr: (1.0, 1.0),
         loss: "both".into(),
+        optimizer: "adam".into(),
         seed: 5,
         init: None,
         seconds: 0.0,

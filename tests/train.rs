@@ -85,6 +85,12 @@ fn a_run_leaves_its_folder_and_its_weights_denoise() {
 fn a_run_stopped_by_interrupt_and_by_kill_ends_with_the_same_bits() {
     let dir = tempfile::tempdir().expect("a folder");
     let (whole, cut) = (dir.path().join("whole"), dir.path().join("cut"));
+    // Muon keeps all the state there is: biases and heads go by Adam.
+    let train = |out: &Path, steps| {
+        let mut command = train(out, steps);
+        command.args(["--optimizer", "muon"]);
+        command
+    };
     run(&mut train(&whole, 24)).success();
 
     // Interrupted as soon as the first row of the log is there: a checkpoint is written.
@@ -123,12 +129,16 @@ fn wait_for(path: &Path) {
 #[test]
 fn training_lowers_the_loss() {
     let dir = tempfile::tempdir().expect("a folder");
-    let out = dir.path().join("run");
-    run(train(&out, 200).args(["--loss", "smape", "--lr", "1e-3:1e-4"])).success();
-    let loss = |row: &String| row.split(',').nth(2).expect("a loss").parse::<f64>().expect("a number");
-    let rows = log(&out);
-    let (first, last) = (loss(&rows[1]), loss(rows.last().expect("rows")));
-    assert!(last < 0.8 * first, "the loss went from {first} to {last}");
+    for optimizer in ["adam", "muon"] {
+        let out = dir.path().join(optimizer);
+        let mut command = train(&out, 200);
+        command.args(["--loss", "smape", "--lr", "1e-3:1e-4", "--optimizer", optimizer]);
+        run(&mut command).success();
+        let loss = |row: &String| row.split(',').nth(2).expect("a loss").parse::<f64>().expect("a number");
+        let rows = log(&out);
+        let (first, last) = (loss(&rows[1]), loss(rows.last().expect("rows")));
+        assert!(last < 0.8 * first, "{optimizer}: the loss went from {first} to {last}");
+    }
 }
 
 #[test]
@@ -157,6 +167,7 @@ fn refuses_what_cannot_be_trained() {
         .code(1)
         .stderr(says("trained on and validated on"));
     run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
+    run(train(&out, 4).args(["--optimizer", "sgd"])).code(2).stderr(says("adam or muon"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
     run(&mut train(&out, 4)).success();
     run(&mut train(&out, 4)).code(1).stderr(says("--resume"));

@@ -21,7 +21,7 @@ use crate::{
     passes::{self, Pass},
     report,
     testset::{self, Pair},
-    train::{self, Event, Loss, Options},
+    train::{self, Event, Loss, Options, Rule},
 };
 
 /// Train a network on pairs of noisy and reference frames
@@ -52,9 +52,12 @@ pub struct Args {
     /// Learning rate of the first and last step
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
-    /// What is minimised: relmse, smape, or both summed
+    /// What is minimised: relmse, smape, both summed, or edges, which adds the error of differences
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
+    /// How gradients become updates: adam, or muon, which needs fewer steps
+    #[arg(long, default_value = "adam", value_parser = parse_rule)]
+    optimizer: Rule,
     /// What convolutions round their factors to: f32 (nothing) or bf16; without it, the faster one here
     #[arg(long, value_parser = parse_precision)]
     precision: Option<Precision>,
@@ -96,6 +99,14 @@ fn parse_loss(text: &str) -> Result<Loss, String> {
     let names: Vec<String> = Loss::ALL.iter().map(Loss::to_string).collect();
     let found = Loss::ALL.into_iter().find(|l| l.to_string() == text);
     found.ok_or_else(|| format!("expected {}", names.join(" or ")))
+}
+
+fn parse_rule(text: &str) -> Result<Rule, String> {
+    match text {
+        "adam" => Ok(Rule::Adam),
+        "muon" => Ok(Rule::Muon),
+        _ => Err("expected adam or muon".into()),
+    }
 }
 
 fn parse_precision(text: &str) -> Result<Precision, String> {
@@ -196,6 +207,7 @@ impl Args {
             patch: self.patch,
             lr: self.lr,
             loss: self.loss,
+            optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest),
             average: self.average,
             every: self.every,

@@ -221,7 +221,7 @@ impl Demc {
         });
         let decoder = decoder.collect();
         let output = Conv::new(rng, "output", &[widths[0]], 3, 1, Init::Scaled(OUTPUT_GAIN));
-        let output = output.linear().with_bias(OUTPUT_BIAS);
+        let output = output.head().with_bias(OUTPUT_BIAS);
         Self { config: Config { architecture, widths: widths.into() }, fusion, encoders, decoder, output }
     }
 

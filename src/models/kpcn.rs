@@ -68,7 +68,7 @@ impl Stream {
         };
         let mut layers: Vec<Conv> = (0..LAYERS - 1).map(&mut hidden).collect();
         let last = format!("{name}.{}", LAYERS - 1);
-        layers.push(Conv::new(rng, &last, &[width], KERNEL * KERNEL, TAPS, Init::Scaled(HEAD_GAIN)).linear());
+        layers.push(Conv::new(rng, &last, &[width], KERNEL * KERNEL, TAPS, Init::Scaled(HEAD_GAIN)).head());
         Self { layers }
     }
 

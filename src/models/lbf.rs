@@ -62,7 +62,7 @@ impl Lbf {
         Self {
             config: config.clone(),
             hidden: Conv::new(rng, "hidden", &[LBF_CHANNELS], width, 1, Init::Xavier).linear(),
-            output: Conv::new(rng, "output", &[width], PRECISIONS, 1, Init::Xavier).linear().with_bias(START),
+            output: Conv::new(rng, "output", &[width], PRECISIONS, 1, Init::Xavier).head().with_bias(START),
         }
     }
 

@@ -179,7 +179,7 @@ impl Pyramid {
         });
         let decoder = decoder.collect();
         let mut head = |name: String, width: usize, channels: usize| {
-            Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).linear()
+            Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
             full: head("head.full".into(), decoder_width(0), 4 * FULL_HEAD),

@@ -28,6 +28,9 @@ pub struct Facts {
     pub lr: (f64, f64),
     /// What was minimised.
     pub loss: String,
+    /// How gradients became updates; files from before there was a choice do not say.
+    #[serde(default = "adam")]
+    pub optimizer: String,
     /// The seed of weights, crops and augmentation.
     pub seed: u64,
     /// The weights file it began with, if any.
@@ -41,6 +44,10 @@ pub struct Facts {
     pub validation_relmse: Option<f64>,
     /// Mean SSIM on them.
     pub validation_ssim: Option<f64>,
+}
+
+fn adam() -> String {
+    "adam".into()
 }
 
 /// The metadata of a weights file.

@@ -60,7 +60,7 @@ impl Conv {
         };
         let weights = init.weights(rng, inputs, outputs, k);
         Self {
-            weight: Param::new(&device, format!("{name}.weight"), &shape, weights),
+            weight: Param { hidden: true, ..Param::new(&device, format!("{name}.weight"), &shape, weights) },
             bias: Param::new(&device, format!("{name}.bias"), &[outputs], vec![0.0; outputs]),
             arithmetic: Arithmetic { inputs: inputs.into(), outputs, geometry, precision: Precision::F32 },
             relu: true,
@@ -71,6 +71,12 @@ impl Conv {
     /// The same layer without its ReLU.
     pub fn linear(self) -> Self {
         Self { relu: false, ..self }
+    }
+
+    /// The same layer without its ReLU, as a network's last, whose outputs are read one by one.
+    pub fn head(mut self) -> Self {
+        self.weight.hidden = false;
+        self.linear()
     }
 
     /// The same layer with every bias at `value`.

@@ -11,6 +11,8 @@ pub struct Param {
     pub shape: Vec<usize>,
     /// Whether the optimiser changes it; running statistics are not trainable.
     pub trainable: bool,
+    /// Whether it is the weight of a layer between others: a matrix of outputs by inputs and taps.
+    pub hidden: bool,
     /// Its values, row-major.
     pub tensor: Tensor<(usize,), f32, Cpu>,
 }
@@ -23,13 +25,14 @@ impl Param {
     pub fn new(device: &Cpu, name: String, shape: &[usize], values: Vec<f32>) -> Self {
         assert_eq!(values.len(), shape.iter().product::<usize>(), "{name} has shape {shape:?}");
         let len = (values.len(),);
-        Self { name, shape: shape.into(), trainable: true, tensor: device.tensor_from_vec(values, len) }
+        let tensor = device.tensor_from_vec(values, len);
+        Self { name, shape: shape.into(), trainable: true, hidden: false, tensor }
     }
 
     /// A copy that is another tensor: neither gradients nor moments are shared.
     pub fn duplicate(&self) -> Self {
-        let Self { name, shape, trainable, .. } = self.clone();
-        Self { trainable, ..Self::new(self.tensor.device(), name, &shape, self.values()) }
+        let Self { name, shape, trainable, hidden, .. } = self.clone();
+        Self { trainable, hidden, ..Self::new(self.tensor.device(), name, &shape, self.values()) }
     }
 
     /// Its values, row-major.

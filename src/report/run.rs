@@ -61,10 +61,13 @@ pub fn evaluate(
     fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
     let provenance = Provenance::now();
-    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
+    let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
     let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
     // A row that failed is tried again.
     kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
+    if !kept.is_empty() {
+        now.notes.clone_from(&before.notes);
+    }
     let keep_sheets = !options.overwrite && before.same_methods(&now);
 
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
@@ -81,7 +84,12 @@ pub fn evaluate(
         }
         on(Event::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
-        done.notes.iter().for_each(|note| on(Event::Note(note)));
+        for note in done.notes {
+            on(Event::Note(&note));
+            if now.notes.insert(note) {
+                now.write(&stored)?;
+            }
+        }
         for row in done.rows {
             on(Event::Row(&row));
             table.push(row)?;
@@ -114,6 +122,7 @@ pub fn evaluate(
         summaries: &summaries,
         charts: &charts,
         scenes: &scenes,
+        notes: &now.notes,
         options,
         provenance: &provenance,
     }

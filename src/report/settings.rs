@@ -1,6 +1,10 @@
 //! `run.json`: what the rows in a folder were made with, so that a later run keeps those that hold.
 
-use std::{collections::BTreeMap, fs, path::Path};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs,
+    path::Path,
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -23,6 +27,9 @@ pub struct Settings {
     methods: BTreeMap<String, String>,
     /// Stamp of each pair, by its noisy and reference files.
     pairs: BTreeMap<String, String>,
+    /// What methods said of their treatment of the pairs; those of rows that a later run keeps stay.
+    #[serde(default)]
+    pub notes: BTreeSet<String>,
 }
 
 impl Settings {
@@ -41,6 +48,7 @@ impl Settings {
                     (name(&p.noisy, &p.reference), stamps)
                 })
                 .collect(),
+            notes: BTreeSet::new(),
         }
     }
 

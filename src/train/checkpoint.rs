@@ -1,10 +1,10 @@
-//! The state of a run between two steps: parameters, their average, Adam's moments, counters.
+//! The state of a run between two steps: parameters, their average, the optimiser's moments, counters.
 
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::Adam;
+use super::Optimizer;
 use crate::{
     Error, Result,
     models::network::Network,
@@ -32,7 +32,7 @@ pub fn save(
     progress: &Progress,
     network: &mut dyn Network,
     average: &mut dyn Network,
-    adam: &mut Adam,
+    optimizer: &mut Optimizer,
 ) -> Result<()> {
     let mut tensors = Vec::new();
     let mut push = |prefix: &str, name: &str, shape: &[usize], values: Vec<f32>| {
@@ -41,9 +41,9 @@ pub fn save(
     for param in network.params() {
         push("", &param.name, &param.shape, param.values());
         if param.trainable {
-            let [first, second] = adam.moments(param);
-            push("adam.first.", &param.name, &param.shape, first);
-            push("adam.second.", &param.name, &param.shape, second);
+            let [first, second] = optimizer.moments(param);
+            push("first.", &param.name, &param.shape, first);
+            push("second.", &param.name, &param.shape, second);
         }
     }
     for param in average.params() {
@@ -58,7 +58,7 @@ pub fn load(
     path: &Path,
     network: &mut dyn Network,
     average: &mut dyn Network,
-    adam: &mut Adam,
+    optimizer: &mut Optimizer,
 ) -> Result<Progress> {
     let (metadata, tensors) = weights::read(path)?;
     let progress = serde_json::from_str(&metadata)
@@ -73,9 +73,9 @@ pub fn load(
         let len = param.values().len();
         param.set(find(param.name.clone(), len)?);
         if param.trainable {
-            let first = find(format!("adam.first.{}", param.name), len)?;
-            let second = find(format!("adam.second.{}", param.name), len)?;
-            adam.set_moments(param, [first, second]);
+            let first = find(format!("first.{}", param.name), len)?;
+            let second = find(format!("second.{}", param.name), len)?;
+            optimizer.set_moments(param, [first, second]);
         }
     }
     for param in average.params() {

@@ -16,5 +16,5 @@ pub use augment::Augment;
 pub use dataset::{Dataset, Sample};
 pub use log::Row;
 pub use loss::Loss;
-pub use optimizer::Adam;
+pub use optimizer::{Optimizer, Rule};
 pub use run::{Event, Options, run};

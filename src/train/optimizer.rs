@@ -1,15 +1,43 @@
-//! Adam over a network's parameters, by dfdx's own update, with moments that can be saved.
+//! The optimisers, over a network's parameters, with moments that can be saved.
 
 use dfdx::{
-    tensor::{Cpu, Gradients},
-    tensor_ops::AdamConfig,
+    shapes::Axes2,
+    tensor::{Cpu, Gradients, Tensor, TensorFromVec},
+    tensor_ops::{AdamConfig, PermuteTo, TryMatMul},
 };
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use crate::nn::Param;
 
-/// Adam (Kingma and Ba 2015) with its moments.
-pub struct Adam {
+/// How gradients become updates.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// Adam (Kingma and Ba 2015), by dfdx's own update: what the papers' networks were trained with.
+    #[default]
+    Adam,
+    /// Muon (Jordan et al. 2024) for the weights of convolutions, seen as matrices of outputs by inputs and
+    /// taps: momentum, made orthogonal, so that no few directions take all of a step. Updates have the size of
+    /// Adam's (Liu et al. 2025), so the same learning rates serve. Adam for biases and for the heads, whose
+    /// outputs are no features.
+    Muon,
+}
+
+impl std::fmt::Display for Rule {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Rule::Adam => "adam",
+            Rule::Muon => "muon",
+        })
+    }
+}
+
+/// A rule and its moments.
+pub struct Optimizer {
+    rule: Rule,
     first: Gradients<f32, Cpu>,
+    /// Stays zero where Muon needs none.
     second: Gradients<f32, Cpu>,
 }
 
@@ -17,13 +45,20 @@ pub struct Adam {
 /// one firefly must not undo an hour.
 const CLIP: f64 = 1.0;
 
-impl Default for Adam {
-    fn default() -> Self {
-        Self { first: Gradients::leaky(), second: Gradients::leaky() }
-    }
-}
+/// Weight of the past in Muon's momentum.
+const MOMENTUM: f32 = 0.95;
 
-impl Adam {
+/// Root mean square of an update by Muon at a learning rate of 1: about Adam's.
+const UPDATE_SIZE: f32 = 0.2;
+
+const CPU: &str = "the CPU allocates or aborts";
+
+impl Optimizer {
+    /// One that has seen nothing.
+    pub fn new(rule: Rule) -> Self {
+        Self { rule, first: Gradients::leaky(), second: Gradients::leaky() }
+    }
+
     /// One update; `step` counts from 1. Returns the norm of the gradient before clipping.
     ///
     /// # Panics
@@ -35,7 +70,6 @@ impl Adam {
         params: Vec<&mut Param>,
         gradients: &mut Gradients<f32, Cpu>,
     ) -> f64 {
-        const CPU: &str = "the CPU allocates or aborts";
         let mut squares = 0.0;
         for param in params.iter().filter(|p| p.trainable) {
             let gradient = gradients.get_or_alloc_mut(&param.tensor).expect(CPU);
@@ -48,22 +82,38 @@ impl Adam {
         }
         let scale = (CLIP / norm.max(CLIP)) as f32;
         let config = AdamConfig { lr, ..AdamConfig::default() };
+        let mut matrices: Vec<(&mut Param, Vec<f32>)> = Vec::new();
         for param in params.into_iter().filter(|p| p.trainable) {
             let gradient = gradients.get_or_alloc_mut(&param.tensor).expect(CPU);
             gradient.iter_mut().for_each(|g| *g *= scale);
             let first = self.first.get_or_alloc_mut(&param.tensor).expect(CPU);
+            if self.rule == Rule::Muon && param.hidden {
+                let nesterov = first.iter_mut().zip(gradient.iter()).map(|(m, g)| {
+                    *m = MOMENTUM * *m + g;
+                    MOMENTUM * *m + g
+                });
+                let direction = nesterov.collect();
+                matrices.push((param, direction));
+                continue;
+            }
             let second = self.second.get_or_alloc_mut(&param.tensor).expect(CPU);
             let t = i32::try_from(step).expect("fewer than two billion steps");
             config.try_update(t, &mut param.tensor, first, second, gradient).expect(CPU);
         }
+        matrices.into_par_iter().for_each(|(param, direction)| {
+            let (rows, columns) = (param.shape[0], param.shape[1..].iter().product::<usize>());
+            let rate = lr as f32 * UPDATE_SIZE * (rows.max(columns) as f32).sqrt();
+            let update = orthogonal(direction, rows, columns);
+            let values: Vec<f32> = param.values().iter().zip(&update).map(|(v, u)| v - rate * u).collect();
+            param.set(&values);
+        });
         norm
     }
 
     /// The moments of a parameter, (first, second), for a checkpoint.
     pub fn moments(&mut self, param: &Param) -> [Vec<f32>; 2] {
-        [&mut self.first, &mut self.second].map(|moments| {
-            moments.get_or_alloc_mut(&param.tensor).expect("the CPU allocates or aborts").to_vec()
-        })
+        [&mut self.first, &mut self.second]
+            .map(|moments| moments.get_or_alloc_mut(&param.tensor).expect(CPU).to_vec())
     }
 
     /// Restores the moments of a parameter from a checkpoint.
@@ -72,8 +122,73 @@ impl Adam {
     /// If lengths differ.
     pub fn set_moments(&mut self, param: &Param, [first, second]: [&[f32]; 2]) {
         for (moments, values) in [(&mut self.first, first), (&mut self.second, second)] {
-            let into = moments.get_or_alloc_mut(&param.tensor).expect("the CPU allocates or aborts");
-            into.copy_from_slice(values);
+            moments.get_or_alloc_mut(&param.tensor).expect(CPU).copy_from_slice(values);
         }
+    }
+}
+
+/// Roughly the orthogonal matrix nearest to a row-major one: every singular value becomes one of about 0.7 to
+/// 1.2, by the Newton and Schulz iteration with Jordan's coefficients, which grow small ones fastest.
+fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
+    const ITERATIONS: usize = 5;
+    const COEFFICIENTS: [f32; 3] = [3.4445, -4.7750, 2.0315];
+    type Matrix = Tensor<(usize, usize), f32, Cpu>;
+    let transposed = |m: Matrix| m.permute::<_, Axes2<1, 0>>();
+    let norm = matrix.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let mut x: Matrix = Cpu::default().tensor_from_vec(matrix, (rows, columns)) / norm;
+    // The products are smaller on the shorter side.
+    let tall = rows > columns;
+    if tall {
+        x = transposed(x);
+    }
+    let [a, b, c] = COEFFICIENTS;
+    for _ in 0..ITERATIONS {
+        let gram: Matrix = x.clone().matmul(transposed(x.clone()));
+        let polynomial: Matrix = gram.clone() * b + gram.clone().matmul(gram) * c;
+        x = polynomial.matmul(x.clone()) + x * a;
+    }
+    if tall { transposed(x) } else { x }.as_vec()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::Rng;
+
+    #[test]
+    fn orthogonal_keeps_directions_and_evens_their_lengths() {
+        for (rows, columns) in [(6, 20), (20, 6)] {
+            // Two orthogonal directions, one a hundred times longer than the other.
+            let mut rng = Rng::new(7, 1);
+            let mut unit = |n: usize, even: usize| -> Vec<f32> {
+                let v: Vec<f32> =
+                    (0..n).map(|i| if i % 2 == even { rng.uniform() - 0.5 } else { 0.0 }).collect();
+                let length = v.iter().map(|v| v * v).sum::<f32>().sqrt();
+                v.iter().map(|v| v / length).collect()
+            };
+            let pairs = [0, 1].map(|even| (unit(rows, even), unit(columns, even)));
+            let lengths = [1.0, 0.01];
+            let value = |i: usize| -> f32 {
+                let (r, c) = (i / columns, i % columns);
+                pairs.iter().zip(lengths).map(|((u, v), s)| s * u[r] * v[c]).sum()
+            };
+            let matrix: Vec<f32> = (0..rows * columns).map(value).collect();
+            let out = orthogonal(matrix.clone(), rows, columns);
+            let mut rest = out.clone();
+            for (u, v) in &pairs {
+                let place = |i: usize| u[i / columns] * v[i % columns];
+                let length: f32 = out.iter().enumerate().map(|(i, o)| o * place(i)).sum();
+                assert!((0.6..1.3).contains(&length), "{rows}x{columns}: {length}");
+                rest.iter_mut().enumerate().for_each(|(i, o)| *o -= length * place(i));
+            }
+            assert!(rest.iter().all(|v| v.abs() < 1e-3), "nothing else appears");
+            let scaled = orthogonal(matrix.iter().map(|v| 1e-4 * v).collect(), rows, columns);
+            assert!(scaled.iter().zip(&out).all(|(a, b)| (a - b).abs() < 1e-3));
+        }
+    }
+
+    #[test]
+    fn a_zero_gradient_moves_nothing() {
+        assert!(orthogonal(vec![0.0; 12], 3, 4).iter().all(|v| *v == 0.0));
     }
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Adam, Dataset, Loss, Sample,
+    Dataset, Loss, Optimizer, Rule, Sample,
     checkpoint::{self, Progress},
     log,
 };
@@ -47,6 +47,9 @@ pub struct Options {
     pub lr: (f64, f64),
     /// What is minimised.
     pub loss: Loss,
+    /// How gradients become updates.
+    #[serde(default)]
+    pub optimizer: Rule,
     /// What convolutions round their factors to.
     pub precision: Precision,
     /// Weight of the past in the running average of the weights, which is what is validated and kept.
@@ -96,10 +99,10 @@ pub fn run(
     };
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
-    let mut adam = Adam::default();
+    let mut optimizer = Optimizer::new(options.optimizer);
     let mut progress = Progress::default();
     if resume && checkpoint_path.exists() {
-        progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut adam)?;
+        progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut optimizer)?;
     }
     let mut rows = log::read(&log_path, progress.step)?;
     if progress.step >= options.steps {
@@ -112,7 +115,7 @@ pub fn run(
     while progress.step < options.steps {
         let samples = draw(&training, options, progress.step);
         let lr = learning_rate(options, progress.step);
-        let (loss, finite) = step(&mut *network, &mut adam, options, lr, progress.step + 1, &samples)?;
+        let (loss, finite) = step(&mut *network, &mut optimizer, options, lr, progress.step + 1, &samples)?;
         progress.step += 1;
         if finite {
             progress.losses.0 += loss;
@@ -149,7 +152,7 @@ pub fn run(
         let stopping = stop.load(Ordering::Relaxed);
         if last || stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS {
             progress.seconds += std::mem::replace(&mut since, Instant::now()).elapsed().as_secs_f64();
-            checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut adam)?;
+            checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
             saved = Instant::now();
         }
         if stopping && !last {
@@ -178,7 +181,7 @@ fn learning_rate(options: &Options, step: usize) -> f64 {
 /// One optimiser step. Returns the loss and whether its gradient was finite.
 fn step(
     network: &mut dyn Network,
-    adam: &mut Adam,
+    optimizer: &mut Optimizer,
     options: &Options,
     lr: f64,
     step: usize,
@@ -194,7 +197,7 @@ fn step(
     let loss = options.loss.of(image, reference, &scales);
     let value = f64::from(loss.as_vec()[0]);
     let mut gradients = loss.backward();
-    let norm = adam.update(step, lr, network.params(), &mut gradients);
+    let norm = optimizer.update(step, lr, network.params(), &mut gradients);
     if norm.is_finite()
         && let Stats::Batch(seen) = stats
     {
@@ -245,6 +248,7 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         patch: options.patch,
         lr: options.lr,
         loss: options.loss.to_string(),
+        optimizer: options.optimizer.to_string(),
         seed: options.seed,
         init: options.init.as_ref().map(|p| p.display().to_string()),
         seconds: row.seconds,

@@ -7,7 +7,7 @@
 mod table;
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     path::{Path, PathBuf},
 };
 
@@ -35,6 +35,8 @@ pub struct Page<'a> {
     pub charts: &'a [(&'a str, String)],
     /// The pairs, each with its sheet where there is one.
     pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
+    /// What methods said of their treatment of the renders.
+    pub notes: &'a BTreeSet<String>,
     /// How it was run.
     pub options: &'a Options,
     /// What it was run with and on.
@@ -88,6 +90,9 @@ impl Page<'_> {
                          scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
                     }
                     (self.summary())
+                    @if !self.notes.is_empty() {
+                        ul.faint #notes { @for note in self.notes { li { (note) } } }
+                    }
                     @for (title, svg) in self.charts {
                         h2 { (title) }
                         figure { (PreEscaped(svg)) }
