@@ -169,7 +169,7 @@ fn train_step(precision: Precision, (n, size): (usize, usize)) -> Box<dyn FnMut(
         step += 1;
         let mut stats = Stats::Batch(Vec::new());
         let image = network.forward_taped(&batch, &mut stats);
-        let loss = Loss::Relmse.of(image, reference.clone(), &scales);
+        let loss = Loss::Relmse.of(image, reference.clone(), None, &scales);
         let mut gradients = loss.backward();
         let norm = optimizer.update(step, 1e-5, network.params(), &mut gradients);
         assert!(norm.is_finite(), "the step learns");

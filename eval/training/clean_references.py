@@ -3,7 +3,8 @@
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
 Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the scene's
-noisy frame as guides, denoised first. Noisy frames are copied as they are. What is there already is kept.
+noisy frame as guides, denoised first, and keeps what it was as Noisy Image. Noisy frames are copied as they are. What
+is there already is kept.
 """
 
 import argparse
@@ -90,7 +91,8 @@ def main():
             albedo, _ = planes(guides, "Denoising Albedo", "RGB")
             normal, _ = planes(guides, "Denoising Normal", "XYZ")
             cleaned = clean(options.oidn, folder, reference, albedo, normal)
-            channels.update({name: cleaned[..., c] for c, name in enumerate(names)})
+            for c, name in enumerate(names):
+                channels.update({name: cleaned[..., c], name.replace("Combined", "Noisy Image"): reference[..., c]})
             exr.write_half(target + ".tmp", channels)
             os.replace(target + ".tmp", target)
             print(scene, flush=True)

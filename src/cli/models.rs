@@ -49,11 +49,16 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Some(mut model) => {
                 let t = &model.metadata.training;
                 let trained = format!(
-                    "{} steps of {} crops from {} frames in {:.1} h",
+                    "{} steps of {} crops from {} frames in {:.1} h{}",
                     t.steps,
                     t.batch,
                     t.frames,
-                    t.seconds / 3600.0
+                    t.seconds / 3600.0,
+                    if t.init.is_some() {
+                        ", the last of several runs (eval/training/README.md)"
+                    } else {
+                        ""
+                    }
                 );
                 debug_assert_eq!(model.name(), name);
                 row(name, model.network(), Some(trained))

@@ -55,6 +55,10 @@ pub struct Args {
     /// What is minimised: relmse, smape, both summed, or edges, which adds the error of differences
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
+    /// Take squared errors, not their denominators, against what references were before Blender denoised them,
+    /// where they hold that (generate_scenes.py --denoise-references)
+    #[arg(long)]
+    raw_references: bool,
     /// How gradients become updates: adam, or muon, which needs fewer steps
     #[arg(long, default_value = "adam", value_parser = parse_rule)]
     optimizer: Rule,
@@ -207,6 +211,7 @@ impl Args {
             patch: self.patch,
             lr: self.lr,
             loss: self.loss,
+            raw_references: self.raw_references,
             optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest),
             average: self.average,

@@ -1,7 +1,8 @@
 //! Pixel-wise errors on linear radiance.
 //!
 //! RelMSE: Rousselle, Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error
-//! Minimization" (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels.
+//! Minimization" (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels; also trimmed of its
+//! worst 0.1% of pixels, so that a handful of fireflies in image or reference does not decide (this project's own).
 //! RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al., "Denoising
 //! with Kernel Prediction and Asymmetric Loss Functions" (2018), section 4.
 

@@ -57,6 +57,7 @@ impl Augment {
         }
         sample.passes = new;
         sample.reference = self.pass(Pass::Combined, &sample.reference);
+        sample.raw_reference = sample.raw_reference.take().map(|raw| self.pass(Pass::Combined, &raw));
     }
 
     fn pass(&self, pass: Pass, planes: &Planes) -> Planes {

@@ -27,15 +27,19 @@ struct Stored {
     height: usize,
     passes: Vec<(Pass, Vec<f16>)>,
     reference: Vec<f16>,
+    /// The reference before it was denoised, where its file holds that too.
+    raw_reference: Option<Vec<f16>>,
 }
 
-/// A crop: noisy passes and the reference radiance, (3, H, W).
+/// A crop: noisy passes and the reference radiance.
 #[derive(Clone, Debug)]
 pub struct Sample {
     /// The noisy passes.
     pub passes: PassSet,
-    /// The reference.
+    /// The reference, (3, H, W).
     pub reference: Planes,
+    /// The reference before it was denoised, (3, H, W), where that is known: noisy, but right on average.
+    pub raw_reference: Option<Planes>,
 }
 
 /// Largest finite half: brighter values are clipped in the training copy.
@@ -127,6 +131,7 @@ impl Stored {
                 ),
             ));
         }
+        let raw_reference = reference.get(Pass::NoisyImage).map(|raw| to_half(&raw.data));
         let kept = noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
         Ok(Self {
             pair: pair.clone(),
@@ -135,6 +140,7 @@ impl Stored {
             height: noisy.height,
             passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
             reference: to_half(&target.data),
+            raw_reference,
         })
     }
 
@@ -152,6 +158,7 @@ impl Stored {
         for (pass, data) in &self.passes {
             passes.insert(*pass, cut(data, pass.channels()));
         }
-        Sample { passes, reference: cut(&self.reference, 3) }
+        let raw_reference = self.raw_reference.as_ref().map(|raw| cut(raw, 3));
+        Sample { passes, reference: cut(&self.reference, 3), raw_reference }
     }
 }

@@ -48,30 +48,43 @@ impl Loss {
 
     /// The loss of `image` against `reference`, same shape and scale.
     ///
-    /// `scale` is each image's scene radiance over network radiance: the epsilon of the relative error
-    /// is meant in scene radiance.
+    /// Squared errors are against `raw` where it is given, with the denominators of `reference`: noise in the
+    /// target of a squared error changes no gradient on average (Lehtinen et al. 2018, "Noise2Noise"), which
+    /// noise in a denominator would, and what a denoiser got wrong in `reference` is not learned. `scale` is
+    /// each image's scene radiance over network radiance: the epsilon of the relative error is meant in scene
+    /// radiance.
     pub fn of(
         self,
         image: Images<Taped>,
         reference: Vec<f32>,
+        raw: Option<Vec<f32>>,
         scale: &[f32],
     ) -> Tensor<Rank0, f32, Cpu, Taped> {
         match self {
-            Loss::Relmse => relmse(image, reference, scale),
+            Loss::Relmse => relmse(image, &reference, raw, scale),
             Loss::Smape => smape(image, reference),
             Loss::Both => {
-                let relative = relmse(image.with_empty_tape(), reference.clone(), scale);
+                let relative = relmse(image.with_empty_tape(), &reference, raw, scale);
                 smape(image, reference) + relative
             }
             Loss::Edges => {
                 let differences = edges(image.with_empty_tape(), &reference);
-                Loss::Both.of(image, reference, scale) + differences
+                Loss::Both.of(image, reference, raw, scale) + differences
             }
         }
     }
 }
 
-fn relmse(image: Images<Taped>, reference: Vec<f32>, scale: &[f32]) -> Tensor<Rank0, f32, Cpu, Taped> {
+/// A firefly in a raw reference counts as this many times the clean one at most (and one more, in network
+/// radiance, where that is dark).
+const RAW_LIMIT: f32 = 8.0;
+
+fn relmse(
+    image: Images<Taped>,
+    reference: &[f32],
+    raw: Option<Vec<f32>>,
+    scale: &[f32],
+) -> Tensor<Rank0, f32, Cpu, Taped> {
     let (device, shape) = (Cpu::default(), *image.shape());
     let values = shape.1 * shape.2 * shape.3;
     let weight: Vec<f32> = reference
@@ -80,8 +93,12 @@ fn relmse(image: Images<Taped>, reference: Vec<f32>, scale: &[f32]) -> Tensor<Ra
         .map(|(i, r)| (r * r + RELMSE_EPSILON as f32 / scale[i / values].powi(2)).recip())
         .collect();
     let weight: Images = device.tensor_from_vec(weight, shape);
-    let reference: Images = device.tensor_from_vec(reference, shape);
-    (square(image - reference) * weight).mean()
+    let target = match raw {
+        Some(raw) => raw.iter().zip(reference).map(|(raw, r)| raw.min(RAW_LIMIT * r + 1.0)).collect(),
+        None => reference.to_vec(),
+    };
+    let target: Images = device.tensor_from_vec(target, shape);
+    (square(image - target) * weight).mean()
 }
 
 fn smape(image: Images<Taped>, reference: Vec<f32>) -> Tensor<Rank0, f32, Cpu, Taped> {
@@ -135,4 +152,54 @@ fn edges(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, Cpu, Tap
         Ok(())
     });
     loss.put_tape(tape)
+}
+
+#[cfg(test)]
+mod tests {
+    use dfdx::{
+        tensor::{AsArray, Trace},
+        tensor_ops::Backward,
+    };
+
+    use super::*;
+    use crate::nn::Rng;
+
+    /// The loss of a flat image of `value` and its mean gradient by a pixel, against a flat clean reference of
+    /// 0.5 and, if there is one, a raw one.
+    fn relmse_at(value: f32, raw: Option<Vec<f32>>) -> (f32, f32) {
+        const SHAPE: (usize, usize, usize, usize) = (1, 3, 16, 16);
+        let count = 3 * 16 * 16;
+        let image: Images = Cpu::default().tensor_from_vec(vec![value; count], SHAPE);
+        let loss = Loss::Relmse.of(image.leaky_trace(), vec![0.5; count], raw, &[1.0]);
+        let value = loss.array();
+        (value, loss.backward().get(&image).as_vec().iter().sum())
+    }
+
+    #[test]
+    fn noise_in_a_raw_reference_changes_no_gradient_on_average() {
+        let mut rng = Rng::new(3, 1);
+        // Skewed as render noise is: a tenth of the pixels holds all the light.
+        let mut raw: Vec<f32> =
+            (0..3 * 16 * 16).map(|_| if rng.below(10) == 0 { 3.5 } else { 0.15 }).collect();
+        let mean = raw.iter().sum::<f32>() / raw.len() as f32;
+        raw.iter_mut().for_each(|v| *v *= 0.5 / mean);
+        assert!(raw.iter().all(|v| *v < RAW_LIMIT * 0.5 + 1.0), "nothing is clipped");
+        let (clean_loss, clean) = relmse_at(0.7, None);
+        let (noisy_loss, noisy) = relmse_at(0.7, Some(raw));
+        assert!((clean - noisy).abs() < 1e-3 * clean.abs(), "{clean} and {noisy}");
+        assert!(noisy_loss > 2.0 * clean_loss, "noise adds to the loss itself");
+        assert!(((0.2f32.powi(2) / (0.25 + RELMSE_EPSILON as f32)) - clean_loss).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_firefly_in_a_raw_reference_is_clipped() {
+        let count = 3 * 16 * 16;
+        let with = |firefly: f32| {
+            let mut raw = vec![0.5; count];
+            raw[7] = firefly;
+            relmse_at(0.5, Some(raw)).1
+        };
+        assert_eq!(with(1e6), with(1e3));
+        assert!(with(1e3) < with(2.0), "it still pulls upwards");
+    }
 }

@@ -25,6 +25,7 @@ use crate::{
         weights_file::{self, Facts},
     },
     nn::{Precision, Rng, Stats},
+    planes::Planes,
     testset::Pair,
 };
 
@@ -47,6 +48,9 @@ pub struct Options {
     pub lr: (f64, f64),
     /// What is minimised.
     pub loss: Loss,
+    /// Whether squared errors are against references as they were before they were denoised.
+    #[serde(default)]
+    pub raw_references: bool,
     /// How gradients become updates.
     #[serde(default)]
     pub optimizer: Rule,
@@ -189,12 +193,15 @@ fn step(
 ) -> Result<(f64, bool)> {
     let inputs: Vec<Inputs> = samples.par_iter().map(|s| network.inputs(&s.passes)).collect::<Result<_>>()?;
     let scales: Vec<f32> = inputs.iter().map(|i| i.scale).collect();
-    let reference: Vec<f32> = (samples.iter().zip(&scales))
-        .flat_map(|(sample, scale)| sample.reference.data.iter().map(move |v| v / scale))
-        .collect();
+    let scaled = |planes: fn(&Sample) -> &Planes| -> Vec<f32> {
+        let values = samples.iter().zip(&scales);
+        values.flat_map(|(sample, scale)| planes(sample).data.iter().map(move |v| v / scale)).collect()
+    };
+    let reference = scaled(|sample| &sample.reference);
+    let raw = options.raw_references.then(|| scaled(|s| s.raw_reference.as_ref().unwrap_or(&s.reference)));
     let mut stats = Stats::Batch(Vec::new());
     let image = network.forward_taped(&stack(&inputs), &mut stats);
-    let loss = options.loss.of(image, reference, &scales);
+    let loss = options.loss.of(image, reference, raw, &scales);
     let value = f64::from(loss.as_vec()[0]);
     let mut gradients = loss.backward();
     let norm = optimizer.update(step, lr, network.params(), &mut gradients);
