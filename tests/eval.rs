@@ -227,6 +227,11 @@ fn what_methods_say_is_on_the_page_and_stays_there() {
         predicate::str::contains("2 of 2 rows are there already").and(predicate::str::contains(NOTE).not()),
     );
     assert_eq!(page().matches(NOTE).count(), 1);
+    // A run without the method has nothing of it, whatever rows it keeps.
+    eval(&set, out.path(), &["--models", "noisy", "--no-sheets"])
+        .success()
+        .stderr(predicate::str::contains("1 of 1 rows are there already"));
+    assert_eq!(page().matches(NOTE).count(), 0);
 }
 
 #[test]

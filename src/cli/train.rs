@@ -99,18 +99,19 @@ fn parse_rates(text: &str) -> Result<(f64, f64), String> {
     }
 }
 
+/// The one of `all` that is called `text`.
+fn one_of<T: Copy + ToString>(all: &[T], text: &str) -> Result<T, String> {
+    let names: Vec<String> = all.iter().map(T::to_string).collect();
+    let found = names.iter().position(|name| name == text);
+    found.map(|at| all[at]).ok_or_else(|| format!("expected {}", names.join(" or ")))
+}
+
 fn parse_loss(text: &str) -> Result<Loss, String> {
-    let names: Vec<String> = Loss::ALL.iter().map(Loss::to_string).collect();
-    let found = Loss::ALL.into_iter().find(|l| l.to_string() == text);
-    found.ok_or_else(|| format!("expected {}", names.join(" or ")))
+    one_of(&Loss::ALL, text)
 }
 
 fn parse_rule(text: &str) -> Result<Rule, String> {
-    match text {
-        "adam" => Ok(Rule::Adam),
-        "muon" => Ok(Rule::Muon),
-        _ => Err("expected adam or muon".into()),
-    }
+    one_of(&Rule::ALL, text)
 }
 
 fn parse_precision(text: &str) -> Result<Precision, String> {

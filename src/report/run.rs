@@ -65,9 +65,9 @@ pub fn evaluate(
     let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
     // A row that failed is tried again.
     kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
-    if !kept.is_empty() {
-        now.notes.clone_from(&before.notes);
-    }
+    // What was said of rows that are kept still holds.
+    now.notes = before.notes.clone();
+    now.notes.retain(|method, _| kept.iter().any(|row| row.model == *method));
     let keep_sheets = !options.overwrite && before.same_methods(&now);
 
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
@@ -84,9 +84,9 @@ pub fn evaluate(
         }
         on(Event::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
-        for note in done.notes {
+        for (method, note) in done.notes {
             on(Event::Note(&note));
-            if now.notes.insert(note) {
+            if now.notes.entry(method).or_default().insert(note) {
                 now.write(&stored)?;
             }
         }
@@ -144,8 +144,8 @@ fn sheet_path(pairs: &[Pair], pair: &Pair, options: &Options) -> Option<PathBuf>
 
 /// What running a pair gave.
 struct Done {
-    /// What the methods say about their treatment of the pair.
-    notes: Vec<String>,
+    /// What the methods, by name, say about their treatment of the pair.
+    notes: Vec<(String, String)>,
     /// Rows of the methods that were not finished.
     rows: Vec<Row>,
     /// Images for the sheet, where the pair could be read.
@@ -247,7 +247,7 @@ fn run_pair(
         }
     }
     Done {
-        notes: open().filter_map(|m| m.denoiser.notes(&loaded.passes)).collect(),
+        notes: open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect(),
         rows: rows.into_iter().flatten().collect(),
         scene: shown.then_some(Scene { reference: loaded.reference, images }),
     }

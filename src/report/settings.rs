@@ -27,9 +27,9 @@ pub struct Settings {
     methods: BTreeMap<String, String>,
     /// Stamp of each pair, by its noisy and reference files.
     pairs: BTreeMap<String, String>,
-    /// What methods said of their treatment of the pairs; those of rows that a later run keeps stay.
+    /// What each method, by name, said of its treatment of the pairs.
     #[serde(default)]
-    pub notes: BTreeSet<String>,
+    pub notes: BTreeMap<String, BTreeSet<String>>,
 }
 
 impl Settings {
@@ -48,7 +48,7 @@ impl Settings {
                     (name(&p.noisy, &p.reference), stamps)
                 })
                 .collect(),
-            notes: BTreeSet::new(),
+            notes: BTreeMap::new(),
         }
     }
 

@@ -27,7 +27,7 @@ struct Stored {
     height: usize,
     passes: Vec<(Pass, Vec<f16>)>,
     reference: Vec<f16>,
-    /// The reference before it was denoised, where its file holds that too.
+    /// The reference before it was denoised, where that is wanted and its file holds it.
     raw_reference: Option<Vec<f16>>,
 }
 
@@ -38,7 +38,8 @@ pub struct Sample {
     pub passes: PassSet,
     /// The reference, (3, H, W).
     pub reference: Planes,
-    /// The reference before it was denoised, (3, H, W), where that is known: noisy, but right on average.
+    /// The reference before it was denoised, (3, H, W), where that was asked for and is known: noisy,
+    /// but right on average.
     pub raw_reference: Option<Planes>,
 }
 
@@ -51,15 +52,21 @@ fn to_half(values: &[f32]) -> Vec<f16> {
 }
 
 impl Dataset {
-    /// Decodes of every pair the passes that must be there and those that may. Frames smaller than
-    /// `patch` in either direction are an error, since no crop fits them.
+    /// Decodes of every pair the passes that must be there and those that may, and, if `raw_references`, what
+    /// the references were before they were denoised. Frames smaller than `patch` in either direction are an
+    /// error, since no crop fits them.
     ///
     /// # Errors
     /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
-    pub fn load(pairs: &[Pair], (needed, optional): (&[Pass], &[Pass]), patch: usize) -> Result<Self> {
+    pub fn load(
+        pairs: &[Pair],
+        passes: (&[Pass], &[Pass]),
+        raw_references: bool,
+        patch: usize,
+    ) -> Result<Self> {
         let frames: Vec<Stored> = pairs
             .par_iter()
-            .map(|pair| Stored::load(pair, needed, optional, patch))
+            .map(|pair| Stored::load(pair, passes, raw_references, patch))
             .collect::<Result<_>>()?;
         let mut total = 0;
         let pixels = frames.iter().map(|f| {
@@ -99,7 +106,12 @@ impl Dataset {
 }
 
 impl Stored {
-    fn load(pair: &Pair, needed: &[Pass], optional: &[Pass], patch: usize) -> Result<Self> {
+    fn load(
+        pair: &Pair,
+        (needed, optional): (&[Pass], &[Pass]),
+        raw_references: bool,
+        patch: usize,
+    ) -> Result<Self> {
         let frame = Frame::read(&pair.noisy)?;
         let mut noisy = passes::read(&frame, None)?;
         for &pass in needed {
@@ -131,7 +143,8 @@ impl Stored {
                 ),
             ));
         }
-        let raw_reference = reference.get(Pass::NoisyImage).map(|raw| to_half(&raw.data));
+        let raw_reference =
+            reference.get(Pass::NoisyImage).filter(|_| raw_references).map(|raw| to_half(&raw.data));
         let kept = noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
         Ok(Self {
             pair: pair.clone(),

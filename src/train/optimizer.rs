@@ -24,6 +24,11 @@ pub enum Rule {
     Muon,
 }
 
+impl Rule {
+    /// Every rule, for the command line.
+    pub const ALL: [Rule; 2] = [Rule::Adam, Rule::Muon];
+}
+
 impl std::fmt::Display for Rule {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {

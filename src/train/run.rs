@@ -113,8 +113,8 @@ pub fn run(
         return Ok(());
     }
     let wanted = (network.passes(), network.optional_passes());
-    let training = Dataset::load(&options.train, wanted, options.patch)?;
-    let validation = Dataset::load(&options.validation, wanted, 1)?;
+    let training = Dataset::load(&options.train, wanted, options.raw_references, options.patch)?;
+    let validation = Dataset::load(&options.validation, wanted, false, 1)?;
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
         let samples = draw(&training, options, progress.step);

@@ -35,8 +35,8 @@ pub struct Page<'a> {
     pub charts: &'a [(&'a str, String)],
     /// The pairs, each with its sheet where there is one.
     pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
-    /// What methods said of their treatment of the renders.
-    pub notes: &'a BTreeSet<String>,
+    /// What each method, by name, said of its treatment of the renders.
+    pub notes: &'a BTreeMap<String, BTreeSet<String>>,
     /// How it was run.
     pub options: &'a Options,
     /// What it was run with and on.
@@ -91,7 +91,7 @@ impl Page<'_> {
                     }
                     (self.summary())
                     @if !self.notes.is_empty() {
-                        ul.faint #notes { @for note in self.notes { li { (note) } } }
+                        ul.faint #notes { @for note in self.notes.values().flatten() { li { (note) } } }
                     }
                     @for (title, svg) in self.charts {
                         h2 { (title) }
