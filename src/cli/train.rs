@@ -214,7 +214,7 @@ impl Args {
             loss: self.loss,
             raw_references: self.raw_references,
             optimizer: self.optimizer,
-            precision: self.precision.unwrap_or_else(Precision::fastest),
+            precision: self.precision.unwrap_or_else(Precision::fastest_trained),
             average: self.average,
             every: self.every,
             seed: self.seed,

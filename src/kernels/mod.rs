@@ -11,13 +11,13 @@
 // Loops over lanes and registers index several arrays at once; iterators would hide the arithmetic.
 #![allow(clippy::needless_range_loop)]
 
-pub mod bf16;
 pub mod blend;
 pub mod conv;
 pub mod cross_bilateral;
 pub mod filter;
 pub mod layout;
 pub mod memory;
+pub mod narrow;
 pub mod peak;
 pub mod plane;
 pub mod pool;

@@ -353,7 +353,7 @@ impl Network for Demc {
                 conv.fold(&norm);
             }
         }
-        self.convolutions().into_iter().for_each(Conv::freeze);
+        self.convolutions().into_iter().for_each(|conv| conv.freeze(&[]));
     }
 
     fn batch_norms(&mut self) -> Vec<&mut BatchNorm> {

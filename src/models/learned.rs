@@ -8,7 +8,7 @@ use super::{
     weights_file::{self, Metadata},
 };
 use crate::{
-    Result,
+    Error, Result,
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -52,14 +52,25 @@ impl Learned {
         Ok(Self { name: path.display().to_string(), network, metadata })
     }
 
-    /// The model under another name, with its weights packed for an arithmetic.
-    pub fn with_precision(mut self, name: &str, precision: Precision) -> Self {
+    /// The model under another name, with its weights packed for an arithmetic: that asked for, or the fastest.
+    ///
+    /// # Errors
+    /// 8 bits are asked for, and the model cannot compute in them.
+    pub fn with_precision(mut self, name: &str, precision: Option<Precision>) -> Result<Self> {
+        let quantizable = self.network.is_quantizable();
+        if precision == Some(Precision::Int8) && !quantizable {
+            return Err(Error::Usage(format!(
+                "{name}: no ranges of activations are known for 8 bits; use :bf16 or :f32 (`demc train` measures \
+                 the ranges of demc-s, demc-m and demc-l wherever it validates)"
+            )));
+        }
+        let precision = precision.unwrap_or_else(|| Precision::fastest(quantizable));
         self.name = name.to_string();
         for conv in self.network.convolutions() {
             conv.set_precision(precision);
         }
         self.network.freeze();
-        self
+        Ok(self)
     }
 
     /// The network.

@@ -95,18 +95,22 @@ impl Denoiser for Noisy {
     }
 }
 
-/// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32` or
-/// `:bf16`, which chooses its arithmetic; without it, the faster one that the processor has.
+/// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32`,
+/// `:bf16` or `:int8`, which chooses its arithmetic; without it, the fastest one that network and processor
+/// have.
 ///
 /// # Errors
-/// No built-in method or readable weights file goes by that name.
+/// No built-in method or readable weights file goes by that name, or it has no such arithmetic.
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     let (plain, precision) = match name_or_file.rsplit_once(':') {
-        Some((plain, "f32")) => (plain, Precision::F32),
-        Some((plain, "bf16")) => (plain, Precision::Bf16),
-        _ => (name_or_file, Precision::fastest()),
+        Some((plain, "f32")) => (plain, Some(Precision::F32)),
+        Some((plain, "bf16")) => (plain, Some(Precision::Bf16)),
+        Some((plain, "int8")) => (plain, Some(Precision::Int8)),
+        _ => (name_or_file, None),
     };
-    let learned = |model: learned::Learned| Box::new(model.with_precision(name_or_file, precision));
+    let learned = |model: learned::Learned| -> Result<Box<dyn Denoiser>> {
+        Ok(Box::new(model.with_precision(name_or_file, precision)?))
+    };
     match plain {
         "noisy" => Ok(Box::new(Noisy)),
         nfor::NAME => Ok(Box::new(nfor::Nfor)),
@@ -114,10 +118,10 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
             Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
         }
         other if Path::new(other).extension().is_some_and(|e| e == "safetensors") => {
-            Ok(learned(learned::Learned::from_file(Path::new(other))?))
+            learned(learned::Learned::from_file(Path::new(other))?)
         }
         other => match learned::Learned::built_in(other) {
-            Some(model) => Ok(learned(model)),
+            Some(model) => learned(model),
             None if trainable().iter().any(|(name, _)| *name == other) => Err(Error::Usage(format!(
                 "{other} comes without weights: `demc train --model {other} --data DIR --out RUN` makes them, \
                  and RUN/best.safetensors then names the method"

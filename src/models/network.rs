@@ -117,7 +117,12 @@ pub trait Network: Send + Sync {
     /// Plans for inference: folds batch norms into convolutions and packs weights once. Its parameters are
     /// then no longer those that were trained.
     fn freeze(&mut self) {
-        self.convolutions().into_iter().for_each(Conv::freeze);
+        self.convolutions().into_iter().for_each(|conv| conv.freeze(&[]));
+    }
+
+    /// Whether it can compute in 8 bits: its design has a way to, and the ranges of its activations are known.
+    fn is_quantizable(&mut self) -> bool {
+        false
     }
 
     /// Its batch-norm layers, in the order in which a forward pass records their statistics.

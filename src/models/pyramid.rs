@@ -20,7 +20,7 @@ use crate::{
     Result,
     features::{GUIDE_PASSES, Inputs, guides},
     kernels::blend::CORNERS,
-    nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
+    nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -292,6 +292,39 @@ impl Network for Pyramid {
         let decoder =
             self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
         encoders.chain(decoder).chain([&mut self.full]).chain(&mut self.heads).collect()
+    }
+
+    fn freeze(&mut self) {
+        if self.full.arithmetic().precision != Precision::Int8 {
+            return self.convolutions().into_iter().for_each(|conv| conv.freeze(&[]));
+        }
+        // Every layer takes in the steps of what it reads.
+        for encoder in &mut self.encoders {
+            let mut above = Vec::new();
+            for [first, second] in &mut encoder.levels {
+                first.freeze(&above);
+                second.freeze(&[first.step()]);
+                above = vec![second.step()];
+            }
+        }
+        let mut below = None;
+        for (level, layers) in (0..LEVELS).rev().zip(&mut self.decoder) {
+            let mut sources = self.encoders.each_ref().map(|encoder| encoder.levels[level][1].step()).to_vec();
+            if let (Some(up), Some(below)) = (&mut layers.up, below) {
+                up.freeze(&[below]);
+                sources.push(up.step());
+            }
+            layers.fuse.freeze(&sources);
+            layers.refine.freeze(&[layers.fuse.step()]);
+            let step = layers.refine.step();
+            self.heads[level].freeze(&[step]);
+            below = Some(step);
+        }
+        self.full.freeze(&[below.expect("there are levels")]);
+    }
+
+    fn is_quantizable(&mut self) -> bool {
+        self.convolutions().into_iter().all(|conv| conv.is_quantizable())
     }
 
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {

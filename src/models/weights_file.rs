@@ -1,6 +1,6 @@
 //! Networks on disk: parameters with the configuration and the training facts in the metadata.
 
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 use serde::{Deserialize, Serialize};
 
@@ -57,14 +57,20 @@ pub struct Metadata {
     pub network: Config,
     /// How it was trained.
     pub training: Facts,
+    /// The largest value that each layer's ReLU left on the frames it was validated on, which arithmetic in 8
+    /// bits needs.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub ranges: BTreeMap<String, f32>,
 }
 
-/// Writes a network's parameters in half precision.
+/// Writes a network's parameters, in half precision, and ranges.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()> {
-    let metadata = Metadata { network: network.config(), training: facts.clone() };
+    let ranges = network.convolutions().into_iter().filter_map(|c| Some((c.name().to_string(), c.range?)));
+    let ranges = ranges.collect();
+    let metadata = Metadata { network: network.config(), training: facts.clone(), ranges };
     let metadata = serde_json::to_string(&metadata).expect("metadata serialises");
     let tensors: Vec<Tensor> = network
         .params()
@@ -138,6 +144,9 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> 
     let (metadata, tensors) = metadata(bytes, path)?;
     let mut network = super::build(&metadata.network, 0);
     fill(&mut *network, &tensors, path)?;
+    for conv in network.convolutions() {
+        conv.range = metadata.ranges.get(conv.name()).copied().filter(|range| range.is_finite());
+    }
     Ok((network, metadata))
 }
 

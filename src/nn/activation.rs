@@ -7,19 +7,19 @@ use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 use super::{Images, pool::Buffer};
 use crate::kernels::{
     Block, Shape, View,
-    bf16::Operand,
     layout::{from_blocked, to_blocked, to_blocked_shuffled},
+    narrow::Operand,
 };
 
 /// The gradient of one activation while the tape runs backward; `None` until something flows in.
 pub(super) type Gradient = Rc<RefCell<Option<Buffer>>>;
 
 /// The values of an activation. On a tape they are always f32; without one, layers that compute in
-/// bfloat16 leave them so.
+/// narrower formats leave them so.
 #[derive(Debug)]
 pub(super) enum Data {
     F32(Buffer),
-    Bf16(Operand),
+    Narrow(Operand),
 }
 
 impl Data {
@@ -27,18 +27,18 @@ impl Data {
     pub fn shape(&self) -> Shape {
         match self {
             Data::F32(buffer) => buffer.shape(),
-            Data::Bf16(operand) => operand.shape(),
+            Data::Narrow(operand) => operand.shape(),
         }
     }
 
     /// The values, to read.
     ///
     /// # Panics
-    /// If they are bfloat16; see [`Activation::into_f32`].
+    /// If they are narrower; see [`Activation::into_f32`].
     pub fn view(&self) -> View<'_> {
         match self {
             Data::F32(buffer) => buffer.view(),
-            Data::Bf16(_) => unreachable!("operations that read f32 ask for it"),
+            Data::Narrow(_) => unreachable!("operations that read f32 ask for it"),
         }
     }
 }
@@ -149,12 +149,18 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     pub(super) fn into_f32(self) -> Self {
         match &*self.saved.data {
             Data::F32(_) => self,
-            Data::Bf16(operand) => {
+            Data::Narrow(operand) => {
                 let mut buffer = Buffer::new(operand.shape());
                 operand.widen(buffer.view_mut());
                 Self { saved: Saved { data: Arc::new(Data::F32(buffer)), ..self.saved }, tape: self.tape }
             }
         }
+    }
+
+    /// The largest of the values, or 0.
+    pub(super) fn peak(&self) -> f32 {
+        let values = self.fork().into_f32();
+        values.saved.data.view().data.iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
     /// Wraps the output of an operation.

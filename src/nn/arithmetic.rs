@@ -1,17 +1,17 @@
-//! A convolution and its gradients in either precision: what the layers' passes call.
+//! A convolution and its gradients in any precision: what the layers' passes call.
 
 use serde::{Deserialize, Serialize};
 
 use super::{activation::Data, pool::Buffer};
 use crate::kernels::{
     Block, Shape, View, ViewMut,
-    bf16::{self, Engine, Operand},
     conv::{self, Direction, Epilogue, Geometry},
+    narrow::{self, Engine, Format, Operand},
     simd::Tier,
     weight_grad,
 };
 
-/// What the factors of a convolution are rounded to; sums are always f32.
+/// What the factors of a convolution are rounded to; sums are always f32, or exact.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
@@ -19,12 +19,20 @@ pub enum Precision {
     F32,
     /// To bfloat16 (8 bits of mantissa), as matrix units want them.
     Bf16,
+    /// To 8 bits, in steps that fit the ranges a trained network's activations have; for inference only. A
+    /// network's inputs stay as [`Precision::fastest_trained`] has them.
+    Int8,
 }
 
 impl Precision {
-    /// The faster one on this processor.
-    pub fn fastest() -> Self {
-        if Engine::detect().is_native() { Self::Bf16 } else { Self::F32 }
+    /// The fastest one on this processor in which networks can be trained.
+    pub fn fastest_trained() -> Self {
+        if Engine::detect().has_bf16() { Self::Bf16 } else { Self::F32 }
+    }
+
+    /// The fastest one on this processor for inference; 8 bits only where the ranges are known.
+    pub fn fastest(ranges: bool) -> Self {
+        if ranges && Engine::detect().prefers_int8() { Self::Int8 } else { Self::fastest_trained() }
     }
 }
 
@@ -32,7 +40,7 @@ impl Precision {
 #[derive(Debug)]
 pub(super) enum Packed {
     F32(Vec<Block>),
-    Bf16(bf16::conv::Weights),
+    Narrow(narrow::conv::Weights),
 }
 
 /// What a convolution is, apart from its weights.
@@ -49,10 +57,19 @@ pub struct Arithmetic {
 }
 
 impl Arithmetic {
-    /// Weights as [`Arithmetic::forward`] wants them.
-    pub(super) fn pack(&self, weights: &[f32]) -> Packed {
+    /// Weights as [`Arithmetic::forward`] wants them. For 8 bits, `steps` are those of the sources; without
+    /// any, the sources are a network's inputs.
+    pub(super) fn pack(&self, weights: &[f32], steps: &[f32]) -> Packed {
         let Self { inputs, outputs, geometry, .. } = self;
         match self.precision {
+            Precision::Int8 if steps.is_empty() => {
+                Self { precision: Precision::fastest_trained(), ..self.clone() }.pack(weights, steps)
+            }
+            Precision::Int8 => {
+                assert_eq!(steps.len(), inputs.len(), "one step a source");
+                let sources: Vec<(usize, f32)> = inputs.iter().copied().zip(steps.iter().copied()).collect();
+                Packed::Narrow(narrow::conv::Weights::quantize(weights, &sources, *outputs, *geometry))
+            }
             Precision::F32 => {
                 let mut packed = vec![Block::default(); conv::packed_len(inputs, *outputs, *geometry)];
                 conv::pack(weights, inputs, *outputs, *geometry, Direction::Forward, 0, &mut packed);
@@ -60,54 +77,56 @@ impl Arithmetic {
             }
             Precision::Bf16 => {
                 let forward = Direction::Forward;
-                Packed::Bf16(bf16::conv::Weights::pack(weights, inputs, *outputs, *geometry, forward, 0))
+                Packed::Narrow(narrow::conv::Weights::pack(weights, inputs, *outputs, *geometry, forward, 0))
             }
         }
     }
 
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for; an output that is to be rounded
-    /// stays bfloat16 where the arithmetic is.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, rounded to a format or not.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
         weights: &Packed,
         bias: &[Block],
         relu: bool,
-        (shape, round): (Shape, bool),
+        (shape, format): (Shape, Option<Format>),
     ) -> Data {
         let epilogue = Epilogue { relu, accumulate: false };
+        let engine = Engine::detect();
         match weights {
             Packed::F32(weights) => {
                 let mut output = Buffer::new(shape);
                 let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
                 let (tier, geometry) = (Tier::detect(), self.geometry);
                 conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
-                Data::F32(output)
+                match format {
+                    Some(Format::Int8 { step }) => Data::Narrow(Operand::quantize(engine, output.view(), step)),
+                    _ => Data::F32(output),
+                }
             }
-            Packed::Bf16(weights) => {
-                let engine = Engine::detect();
+            Packed::Narrow(weights) => {
                 let narrowed: Vec<Option<Operand>> = sources
                     .iter()
                     .map(|source| match source {
                         Data::F32(buffer) => Some(Operand::narrow(engine, buffer.view(), self.geometry)),
-                        Data::Bf16(_) => None,
+                        Data::Narrow(_) => None,
                     })
                     .collect();
                 let operands: Vec<&Operand> = (sources.iter().zip(&narrowed))
                     .map(|(source, narrowed)| match source {
-                        Data::Bf16(operand) => operand,
+                        Data::Narrow(operand) => operand,
                         Data::F32(_) => narrowed.as_ref().expect("f32 sources were narrowed"),
                     })
                     .collect();
-                if round {
-                    let mut output = Operand::new(shape);
-                    let to = bf16::conv::Output::Bf16(&mut output);
-                    bf16::conv::convolve(engine, &operands, weights, bias, epilogue, to);
-                    Data::Bf16(output)
+                if let Some(format) = format {
+                    let mut output = Operand::new(shape, format);
+                    let to = narrow::conv::Output::Narrow(&mut output);
+                    narrow::conv::convolve(engine, &operands, weights, bias, epilogue, to);
+                    Data::Narrow(output)
                 } else {
                     let mut output = Buffer::new(shape);
-                    let to = bf16::conv::Output::F32(output.view_mut());
-                    bf16::conv::convolve(engine, &operands, weights, bias, epilogue, to);
+                    let to = narrow::conv::Output::F32(output.view_mut());
+                    narrow::conv::convolve(engine, &operands, weights, bias, epilogue, to);
                     Data::F32(output)
                 }
             }
@@ -119,7 +138,7 @@ impl Arithmetic {
         let total = self.inputs.iter().sum();
         let engine = Engine::detect();
         let pairs = (self.precision == Precision::Bf16)
-            .then(|| bf16::weight_grad::Pairs::new(engine, gradient, self.geometry));
+            .then(|| narrow::weight_grad::Pairs::new(engine, gradient, self.geometry));
         let mut first = 0;
         for source in sources {
             match &pairs {
@@ -132,8 +151,8 @@ impl Arithmetic {
                     into,
                 ),
                 Some(pairs) => {
-                    let channels = bf16::weight_grad::Channels::new(engine, *source);
-                    bf16::weight_grad::weight_gradient(engine, &channels, pairs, (first, total), into);
+                    let channels = narrow::weight_grad::Channels::new(engine, *source);
+                    narrow::weight_grad::weight_gradient(engine, &channels, pairs, (first, total), into);
                 }
             }
             first += source.shape.c;
@@ -146,7 +165,7 @@ impl Arithmetic {
         let back = self.geometry.backward();
         let engine = Engine::detect();
         let operand =
-            (self.precision == Precision::Bf16).then(|| bf16::Operand::narrow(engine, gradient, back));
+            (self.precision == Precision::Bf16).then(|| narrow::Operand::narrow(engine, gradient, back));
         move |index, into, accumulate| {
             let Self { inputs, outputs, geometry, .. } = self;
             let epilogue = Epilogue { relu: false, accumulate };
@@ -159,7 +178,7 @@ impl Arithmetic {
                     conv::convolve(Tier::detect(), &[gradient], &packed, &zero, back, epilogue, into);
                 }
                 Some(operand) => {
-                    let packed = bf16::conv::Weights::pack(
+                    let packed = narrow::conv::Weights::pack(
                         weights,
                         inputs,
                         *outputs,
@@ -167,8 +186,8 @@ impl Arithmetic {
                         Direction::Backward,
                         index,
                     );
-                    let into = bf16::conv::Output::F32(into);
-                    bf16::conv::convolve(engine, &[operand], &packed, &zero, epilogue, into);
+                    let into = narrow::conv::Output::F32(into);
+                    narrow::conv::convolve(engine, &[operand], &packed, &zero, epilogue, into);
                 }
             }
         }

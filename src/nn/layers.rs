@@ -3,7 +3,10 @@
 //! Each splits the tape off its input, computes, and pushes one backward operation, as dfdx's own
 //! operations do.
 
-use std::sync::Arc;
+use std::sync::{
+    Arc,
+    atomic::{AtomicU32, Ordering},
+};
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
@@ -14,8 +17,9 @@ use super::{
     pool::Buffer,
 };
 use crate::kernels::{
-    Block, LANES, bf16,
+    Block, LANES,
     conv::{Geometry, weight_index},
+    narrow::{self, Format},
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
     weight_grad::bias_gradient,
 };
@@ -27,11 +31,19 @@ pub struct Conv {
     pub weight: Param,
     /// `(O)`.
     pub bias: Param,
+    /// The largest value that its ReLU left, as far as was observed; 8 bits reach from zero to some way beyond.
+    pub range: Option<f32>,
     arithmetic: Arithmetic,
     relu: bool,
     /// The packed weights of a frozen layer.
     frozen: Option<Arc<Packed>>,
+    /// The bits of the largest value so far, while it is observed.
+    observed: Option<Arc<AtomicU32>>,
 }
+
+/// How far beyond the range that was observed 8 bits reach: a brighter frame must not be cut off, and
+/// coarser steps were found to cost nothing.
+const RANGE_MARGIN: f32 = 2.0;
 
 impl Conv {
     /// A k x k convolution with ReLU from sources of `inputs` channels to `outputs`.
@@ -63,8 +75,10 @@ impl Conv {
             weight: Param { hidden: true, ..Param::new(&device, format!("{name}.weight"), &shape, weights) },
             bias: Param::new(&device, format!("{name}.bias"), &[outputs], vec![0.0; outputs]),
             arithmetic: Arithmetic { inputs: inputs.into(), outputs, geometry, precision: Precision::F32 },
+            range: None,
             relu: true,
             frozen: None,
+            observed: None,
         }
     }
 
@@ -120,6 +134,11 @@ impl Conv {
         true
     }
 
+    /// Its path in the network, `decoder.0.up`.
+    pub fn name(&self) -> &str {
+        self.weight.name.strip_suffix(".weight").expect("`Conv::new` named it so")
+    }
+
     /// What the layer computes, apart from its weights.
     pub fn arithmetic(&self) -> &Arithmetic {
         &self.arithmetic
@@ -154,9 +173,35 @@ impl Conv {
         self.frozen = None;
     }
 
-    /// Packs the weights once for all forward passes to come, until the layer is changed again.
-    pub fn freeze(&mut self) {
-        self.frozen = Some(Arc::new(self.arithmetic.pack(&self.weight.values())));
+    /// Packs the weights once for all forward passes to come, until the layer is changed again. For 8 bits,
+    /// `steps` are those of its sources; without any, they are a network's inputs.
+    pub fn freeze(&mut self, steps: &[f32]) {
+        self.frozen = Some(Arc::new(self.arithmetic.pack(&self.weight.values(), steps)));
+    }
+
+    /// The difference between neighbouring values of its output in 8 bits.
+    ///
+    /// # Panics
+    /// If its range is unknown.
+    pub fn step(&self) -> f32 {
+        let range = self.range.expect("only layers of known range are quantized");
+        (RANGE_MARGIN * range).max(f32::MIN_POSITIVE.sqrt()) / narrow::ACTIVATION_STEPS
+    }
+
+    /// Whether it can compute in 8 bits, if its sources can: they are to know their ranges.
+    pub fn is_quantizable(&self) -> bool {
+        !self.relu || self.range.is_some()
+    }
+
+    /// Observes from now on how large its outputs are.
+    pub fn observe(&mut self) {
+        self.observed = Some(Arc::default());
+    }
+
+    /// The largest value that its ReLU left since [`Conv::observe`].
+    pub fn observed(&self) -> Option<f32> {
+        let bits = self.observed.as_ref()?.load(Ordering::Relaxed);
+        self.relu.then(|| f32::from_bits(bits))
     }
 
     /// Multiply-accumulates for one pixel of the layer's output.
@@ -188,13 +233,18 @@ impl Conv {
 
         let weights = match &self.frozen {
             Some(packed) => packed.clone(),
-            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec())),
+            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec(), &[])),
         };
         let bias = to_blocks(&self.bias.tensor.as_vec());
         let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
         // Without a tape, what the next convolution would round anyway is rounded here.
-        let round = !T::OWNS_TAPE && self.relu;
-        let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, (shape_out, round));
+        let format = match self.arithmetic.precision {
+            _ if T::OWNS_TAPE || !self.relu => None,
+            Precision::F32 => None,
+            Precision::Bf16 => Some(Format::Bf16),
+            Precision::Int8 => Some(Format::Int8 { step: self.step() }),
+        };
+        let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, (shape_out, format));
 
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();
@@ -203,6 +253,10 @@ impl Conv {
             tape = tape.merge(source.tape);
         }
         let (mut activation, out) = Activation::output(output, tape);
+        if let Some(observed) = &self.observed {
+            // The bits of non-negative values are ordered as the values are.
+            observed.fetch_max(activation.peak().max(0.0).to_bits(), Ordering::Relaxed);
+        }
         if T::OWNS_TAPE {
             let (weight, bias) = (self.weight.tensor.clone(), self.bias.tensor.clone());
             let (arithmetic, relu) = (self.arithmetic.clone(), self.relu);
@@ -250,8 +304,8 @@ impl MaxPool {
     pub fn forward<T: Tape<f32, Cpu>>(self, input: Activation<T>) -> Activation<T> {
         let shape = input.shape();
         let output = match &*input.saved.data {
-            // Only ReLUs leave bfloat16, so nothing in it is negative.
-            Data::Bf16(operand) => Data::Bf16(bf16::max_pool(operand)),
+            // Only ReLUs leave narrow values, so nothing in them is negative.
+            Data::Narrow(operand) => Data::Narrow(narrow::max_pool(operand)),
             Data::F32(buffer) => {
                 let mut output = Buffer::new(shape.with_size(shape.h / 2, shape.w / 2));
                 max_pool(buffer.view(), output.view_mut());

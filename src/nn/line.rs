@@ -10,7 +10,7 @@ use super::{
     activation::{Data, Saved},
     pool::{Buffer, plane_buffer},
 };
-use crate::kernels::bf16::Operand;
+use crate::kernels::narrow::Operand;
 
 /// Consecutive rows of one image: an activation or a field, without a tape.
 pub trait Rows: Sized {
@@ -44,7 +44,7 @@ impl Rows for Activation<NoneTape> {
         let shape = shape.with_size(rows - usize::from(above) - usize::from(below), shape.w);
         let mut data = match &*parts[0].0.saved.data {
             Data::F32(_) => Data::F32(Buffer::new(shape)),
-            Data::Bf16(_) => Data::Bf16(Operand::new(shape)),
+            Data::Narrow(part) => Data::Narrow(Operand::new(shape, part.format())),
         };
         let mut to = -isize::from(above);
         for (part, rows) in parts {
@@ -52,7 +52,7 @@ impl Rows for Activation<NoneTape> {
                 (Data::F32(into), Data::F32(from)) => {
                     into.copy_rows(to, from, signed(rows.start), rows.len())
                 }
-                (Data::Bf16(into), Data::Bf16(from)) => {
+                (Data::Narrow(into), Data::Narrow(from)) => {
                     into.copy_rows(to, from, signed(rows.start), rows.len());
                 }
                 _ => unreachable!("a layer always writes the same type"),

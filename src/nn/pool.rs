@@ -84,6 +84,6 @@ pub fn zeros(len: usize) -> PlaneBuffer {
 pub fn clear() {
     BLOCKS.clear();
     VALUES.clear();
-    crate::kernels::bf16::clear();
+    crate::kernels::narrow::clear();
     crate::kernels::weight_grad::clear();
 }

@@ -24,7 +24,7 @@ use crate::{
         network::{Config, Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Precision, Rng, Stats},
+    nn::{Conv, Precision, Rng, Stats},
     planes::Planes,
     testset::Pair,
 };
@@ -132,7 +132,7 @@ pub fn run(
         let last = progress.step == options.steps;
         if progress.step % options.every == 0 || last {
             progress.seconds += since.elapsed().as_secs_f64();
-            let score = validate(&*average, &validation)?;
+            let score = validate(&mut *average, &validation)?;
             let (sum, count) = std::mem::take(&mut progress.losses);
             let row = log::Row {
                 step: progress.step,
@@ -224,11 +224,13 @@ fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step
     }
 }
 
-/// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames.
-fn validate(network: &dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
+/// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames. The layers of `trained` learn
+/// what range their outputs have there.
+fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
-    let mut network = network.duplicate();
+    let mut network = trained.duplicate();
     network.freeze();
+    network.convolutions().into_iter().for_each(Conv::observe);
     for index in 0..frames.len() {
         let (name, sample) = frames.frame(index);
         let image = network.infer(&sample.passes, None)?;
@@ -240,6 +242,11 @@ fn validate(network: &dyn Network, frames: &Dataset) -> Result<Option<(f64, Opti
         if let Some(exposure) = metrics::display::exposure(reference) {
             let display = |p| metrics::display::display(p, exposure);
             ssims.extend(metrics::ssim::ssim(&display(image), &display(reference)));
+        }
+    }
+    if frames.len() > 0 {
+        for (layer, observed) in trained.convolutions().into_iter().zip(network.convolutions()) {
+            layer.range = observed.observed();
         }
     }
     let mean = |v: &[f64]| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);

@@ -1,12 +1,13 @@
-//! Convolutions and input gradients in bfloat16, the geometries of [`crate::kernels::conv`].
+//! Convolutions and input gradients of narrow factors, the geometries of [`crate::kernels::conv`].
 //!
-//! Packed weights are `[output plane][phase][term][16 pairs of input channels]`, each row holding the two
-//! channels' weights of 16 outputs side by side; terms follow the planes of the operands, then taps.
+//! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for a
+//! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
+//! then taps.
 
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{CHUNK, EIGHTH, Engine, Grid, LANES, Operand, Sums, Term, WIDE, Wide};
+use super::{CHUNK, Engine, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIGHT_STEPS, WORD, Wide};
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
@@ -73,12 +74,21 @@ fn terms(geometry: Geometry, planes: usize, phase: (usize, usize)) -> Vec<(usize
 #[derive(Debug)]
 pub struct Weights {
     rows: Vec<Wide>,
-    /// How much of its plane each term of a phase reads; the same for every phase.
-    eighths: Vec<u8>,
+    /// Groups of rows that each term of a phase needs; the same for every phase.
+    groups: Vec<u8>,
     geometry: Geometry,
-    /// Channels of every source read.
-    inputs: Vec<usize>,
+    /// Channels and format of every source read.
+    inputs: Vec<(usize, Format)>,
     outputs: usize,
+    /// What sums are multiplied by, a block an output plane.
+    scale: Vec<Block>,
+}
+
+/// A plane of an operand among the inputs of a layer.
+#[derive(Clone, Copy)]
+struct Channels {
+    first: usize,
+    count: usize,
 }
 
 impl Weights {
@@ -99,12 +109,15 @@ impl Weights {
         let taps = geometry.taps();
         assert_eq!(weights.len(), total * outputs * taps);
         let first: usize = inputs[..source].iter().sum();
+        let bf16 = |channels: &usize| (*channels, Format::Bf16);
         match direction {
-            Direction::Forward => Self::build(geometry, inputs.to_vec(), outputs, |o, i, t| {
-                weights[weight_index(geometry, outputs, total, o, i, t)]
-            }),
+            Direction::Forward => {
+                Self::build(geometry, inputs.iter().map(bf16).collect(), outputs, |o, i, t| {
+                    weights[weight_index(geometry, outputs, total, o, i, t)]
+                })
+            }
             Direction::Backward => {
-                Self::build(geometry.backward(), vec![outputs], inputs[source], |o, i, t| {
+                Self::build(geometry.backward(), vec![bf16(&outputs)], inputs[source], |o, i, t| {
                     // Mirrored for a stride-1 convolution; a strided read visits the taps in order.
                     let t = if matches!(geometry, Geometry::Same(_)) { taps - 1 - t } else { t };
                     weights[weight_index(geometry, outputs, total, i, first + o, t)]
@@ -113,23 +126,49 @@ impl Weights {
         }
     }
 
-    /// Fills the rows from `weight(output, input, tap)`.
+    /// Rounds the weights of a layer to 8 bits and packs them, where each source has channels in 8 bits of some
+    /// step. Steps of sources become part of the weights; each output then has a step of its own, as fine as
+    /// its largest weight allows.
+    ///
+    /// # Panics
+    /// If `weights` has the wrong length.
+    pub fn quantize(weights: &[f32], sources: &[(usize, f32)], outputs: usize, geometry: Geometry) -> Self {
+        let taps = geometry.taps();
+        let steps: Vec<f32> = sources.iter().flat_map(|&(channels, step)| (0..channels).map(move |_| step)).collect();
+        let total = steps.len();
+        assert_eq!(weights.len(), total * outputs * taps);
+        let weight = |o, i, t| weights[weight_index(geometry, outputs, total, o, i, t)] * steps[i];
+        let mut scale = vec![Block::default(); outputs.div_ceil(LANES)];
+        for o in 0..outputs {
+            let all = (0..total).flat_map(|i| (0..taps).map(move |t| (i, t)));
+            let largest = all.fold(0.0f32, |largest, (i, t)| largest.max(weight(o, i, t).abs()));
+            scale[o / LANES].0[o % LANES] = (largest / WEIGHT_STEPS).max(f32::MIN_POSITIVE);
+        }
+        let inputs = sources.iter().map(|&(channels, step)| (channels, Format::Int8 { step })).collect();
+        let packed = Self::build(geometry, inputs, outputs, |o, i, t| weight(o, i, t) / scale[o / LANES].0[o % LANES]);
+        Self { scale, ..packed }
+    }
+
+    /// Fills the rows from `weight(output, input, tap)`, which counts steps where the format has them.
     fn build(
         geometry: Geometry,
-        inputs: Vec<usize>,
+        inputs: Vec<(usize, Format)>,
         outputs: usize,
         weight: impl Fn(usize, usize, usize) -> f32 + Sync,
     ) -> Self {
-        // First channel and number of channels of every plane of 32.
         let mut first = 0;
-        let planes: Vec<(usize, usize)> = inputs
+        let planes: Vec<Channels> = inputs
             .iter()
-            .flat_map(|&c| {
-                let base = first;
-                first += c;
-                (0..c.div_ceil(WIDE)).map(move |p| (base + p * WIDE, (c - p * WIDE).min(WIDE)))
+            .flat_map(|&(channels, format)| {
+                let (base, wide) = (first, format.channels());
+                first += channels;
+                (0..channels.div_ceil(wide))
+                    .map(move |p| Channels { first: base + p * wide, count: (channels - p * wide).min(wide) })
             })
             .collect();
+        let format = inputs[0].1;
+        // Channels of a row of weights.
+        let side = WORD * format.channels() / size_of::<Wide>();
         let spread = spread(geometry);
         let terms: Vec<(usize, Tap)> = (0..spread * spread)
             .flat_map(|phase| terms(geometry, planes.len(), (phase / spread, phase % spread)))
@@ -138,18 +177,23 @@ impl Weights {
         rows.par_chunks_mut(terms.len() * LANES).enumerate().for_each(|(plane, rows)| {
             let lanes = (outputs - plane * LANES).min(LANES);
             for (rows, &(input, tap)) in rows.chunks_mut(LANES).zip(&terms) {
-                let (base, channels) = planes[input];
-                for i in 0..channels {
+                let Channels { first, count } = planes[input];
+                for i in 0..count {
                     for l in 0..lanes {
-                        let value = weight(plane * LANES + l, base + i, tap.index);
-                        rows[i / 2].0[2 * l + i % 2] = bf16::from_f32(value);
+                        let value = weight(plane * LANES + l, first + i, tap.index);
+                        let (row, at) = (&mut rows[i / side], side * l + i % side);
+                        match format {
+                            Format::Bf16 => row.set_bf16(at, bf16::from_f32(value)),
+                            Format::Int8 { .. } => row.0[at] = (value.round_ties_even() as i8).to_ne_bytes()[0],
+                        }
                     }
                 }
             }
         });
         let of_phase = &terms[..terms.len() / (spread * spread)];
-        let eighths = of_phase.iter().map(|&(input, _)| planes[input].1.div_ceil(EIGHTH) as u8).collect();
-        Self { rows, eighths, geometry, inputs, outputs }
+        let groups = of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
+        let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
+        Self { rows, groups, geometry, inputs, outputs, scale }
     }
 }
 
@@ -157,15 +201,16 @@ impl Weights {
 pub enum Output<'a> {
     /// To an f32 activation.
     F32(ViewMut<'a>),
-    /// To a bfloat16 one, without adding to it; its upper half-plane becomes zero where it has no channels.
-    Bf16(&'a mut Operand),
+    /// To a narrow one, without adding to it; the upper 16 of 32 channels become zero where it has none. Only
+    /// a ReLU's output goes into 8 bits.
+    Narrow(&'a mut Operand),
 }
 
 impl Output<'_> {
     fn shape(&self) -> Shape {
         match self {
             Output::F32(view) => view.shape,
-            Output::Bf16(operand) => operand.shape,
+            Output::Narrow(operand) => operand.shape,
         }
     }
 }
@@ -188,8 +233,8 @@ pub fn convolve(
     let spread = spread(geometry);
     assert!(sources.iter().all(|s| s.grid == grid && s.shape.n == out.n), "sources differ in size");
     assert!(
-        sources.iter().map(|s| s.shape.c).eq(weights.inputs.iter().copied()),
-        "sources differ in channels"
+        sources.iter().map(|s| (s.shape.c, s.format)).eq(weights.inputs.iter().copied()),
+        "sources differ in channels or format"
     );
     assert_eq!(grid.split, geometry == Geometry::Strided);
     assert_eq!((out.h, out.w, out.c), (spread * grid.h, spread * grid.w, weights.outputs));
@@ -225,16 +270,26 @@ pub fn convolve(
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands);
     let bands = grid.h.div_ceil(band);
-    let target = match output {
+    let (target, step) = match output {
         Output::F32(view) => {
             assert_eq!(view.data.len(), out.blocks());
-            Target::F32(Shared(view.data.as_mut_ptr()))
+            (Target::F32(Shared(view.data.as_mut_ptr())), 1.0)
         }
-        Output::Bf16(operand) => {
+        Output::Narrow(operand) => {
             assert!(!epilogue.accumulate && !operand.grid.split);
-            Target::Bf16(SharedWide(operand.data.as_mut_ptr()), operand.grid)
+            let step = match operand.format {
+                Format::Bf16 => 1.0,
+                Format::Int8 { step } => {
+                    assert!(epilogue.relu, "8 bits hold nothing negative");
+                    step
+                }
+            };
+            (Target::Narrow(SharedWide(operand.data.as_mut_ptr()), operand.grid, operand.format), step)
         }
     };
+    // What is stored counts steps.
+    let in_steps = |blocks: &[Block]| -> Vec<Block> { blocks.iter().map(|b| Block(b.0.map(|v| v / step))).collect() };
+    let (scale, bias) = (in_steps(&weights.scale), in_steps(bias));
     let tier = Tier::detect();
     (0..out.n * bands).into_par_iter().for_each(|task| {
         let y0 = task % bands * band;
@@ -245,7 +300,8 @@ pub fn convolve(
                 engine,
                 grid,
                 weights,
-                bias,
+                scale: &scale,
+                bias: &bias,
                 epilogue,
                 phases: &phases[n],
                 out,
@@ -269,7 +325,7 @@ unsafe impl Sync for SharedWide {}
 #[derive(Clone, Copy)]
 enum Target {
     F32(Shared),
-    Bf16(SharedWide, Grid),
+    Narrow(SharedWide, Grid, Format),
 }
 
 /// The work of one task: some rows of all output planes of one image.
@@ -277,6 +333,8 @@ struct Band<'a> {
     engine: Engine,
     grid: Grid,
     weights: &'a Weights,
+    /// Of sums, a block an output plane.
+    scale: &'a [Block],
     bias: &'a [Block],
     epilogue: Epilogue,
     phases: &'a [Vec<Term>],
@@ -302,8 +360,9 @@ impl Kernel for Band<'_> {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
-                        let terms = (&terms[..], &self.weights.eighths[..]);
-                        self.engine.multiply(terms, position, weights, (outputs, plane_rows), &mut sums);
+                        let terms = (&terms[..], &self.weights.groups[..]);
+                        let format = self.weights.inputs[0].1;
+                        self.engine.multiply(format, terms, position, weights, (outputs, plane_rows), &mut sums);
                         self.store::<S>(
                             &mut sums,
                             (plane, outputs),
@@ -340,11 +399,14 @@ impl Band<'_> {
             let row = y * spread + phase / spread;
             for o in 0..outputs {
                 // SAFETY: vectors are the tier's.
-                let bias = unsafe { if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane + o]) } };
+                let (scale, bias) = unsafe {
+                    let bias = if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane + o]) };
+                    (S::load(&self.scale[plane + o]), bias)
+                };
                 let finish = |sum: &Block, old: S::V| {
                     // SAFETY: vectors are the tier's.
                     unsafe {
-                        let value = S::add(S::load(sum), old);
+                        let value = S::fma(S::load(sum), scale, old);
                         if relu { S::max(value, S::splat(0.0)) } else { value }
                     }
                 };
@@ -359,7 +421,7 @@ impl Band<'_> {
                         }
                     },
                     // SAFETY: a sum is a block of its own.
-                    Target::Bf16(..) => unsafe {
+                    Target::Narrow(..) => unsafe {
                         for sum in &mut sums.0[o][first..first + run] {
                             let value = finish(sum, bias);
                             S::store(sum, value);
@@ -367,15 +429,22 @@ impl Band<'_> {
                     },
                 }
             }
-            if let Target::Bf16(wides, grid) = self.target {
+            if let Target::Narrow(wides, grid, format) = self.target {
                 let [low, high] = &sums.0;
-                let high = (outputs == 2).then(|| &high[first..first + run]);
-                let plane = self.n * self.out.c.div_ceil(WIDE) + plane / 2;
-                let start = plane * grid.positions() + grid.row(row) + phase % spread;
+                let (low, high) = (&low[first..first + run], (outputs == 2).then(|| &high[first..first + run]));
+                // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
+                let blocks = format.channels() / LANES;
+                let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;
+                let start = wide * grid.positions() + grid.row(row) + phase % spread;
                 // SAFETY: as above.
                 unsafe {
                     let at = wides.0.add(start + column * spread);
-                    self.engine.narrow_spread(&low[first..first + run], high, at, spread);
+                    match format {
+                        Format::Bf16 => self.engine.narrow_spread(low, high, at, spread),
+                        Format::Int8 { .. } => {
+                            self.engine.quantize_spread(low, high, plane % blocks / 2, at, spread);
+                        }
+                    }
                 }
             }
             position += (skip + run).max(1);

@@ -1,22 +1,25 @@
-//! What depends on the processor: two matrix products and two conversions, three times.
+//! What depends on the processor: matrix products and conversions.
 
 use std::{fmt, sync::OnceLock};
 
 use half::bf16;
 
-use super::{Block, CHUNK, EIGHTH, LANES, Sums, Term, WIDE, Wide};
+use super::{ACTIVATION_STEPS, Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide};
 
-/// A way to multiply bfloat16 matrices that this processor has.
+/// A way to multiply narrow matrices that this processor has.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Engine(Unit);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Unit {
     Portable,
-    /// AVX512-BF16: two multiply-accumulates a lane.
+    /// AVX512-VNNI: four multiply-accumulates of 8 bits a lane. bfloat16 is [`Unit::Portable`]'s.
+    #[cfg(target_arch = "x86_64")]
+    Vnni,
+    /// AVX512-BF16 besides: two multiply-accumulates a lane.
     #[cfg(target_arch = "x86_64")]
     Avx512,
-    /// AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction.
+    /// AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. 8 bits are [`Unit::Vnni`]'s.
     #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
     Amx,
 }
@@ -36,31 +39,45 @@ impl Engine {
         #[allow(unused_mut)]
         let mut engines = vec![Engine::PORTABLE];
         #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx512bf16") && is_x86_feature_detected!("avx512bw") {
-            engines.push(Engine(Unit::Avx512));
-            #[cfg(target_os = "linux")]
-            if amx::permitted() {
-                engines.push(Engine(Unit::Amx));
+        if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
+            engines.push(Engine(Unit::Vnni));
+            if is_x86_feature_detected!("avx512bf16") {
+                engines.push(Engine(Unit::Avx512));
+                #[cfg(target_os = "linux")]
+                if amx::permitted() {
+                    engines.push(Engine(Unit::Amx));
+                }
             }
         }
         engines
     }
 
-    /// The fastest engine, found once. The environment variable `DEMC_BF16` (`portable`, `avx512`, `amx`)
-    /// chooses a slower one, to compare them.
+    /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `vnni`, `avx512`,
+    /// `amx`) chooses a slower one, to compare them.
     pub fn detect() -> Engine {
         static CHOICE: OnceLock<Engine> = OnceLock::new();
         *CHOICE.get_or_init(|| {
             let engines = Engine::available();
-            let wanted = std::env::var("DEMC_BF16").unwrap_or_default().to_lowercase();
+            let wanted = std::env::var("DEMC_ENGINE").unwrap_or_default().to_lowercase();
             let named = engines.iter().find(|e| format!("{e:?}").to_lowercase() == wanted);
             *named.or(engines.last()).expect("the portable engine is always available")
         })
     }
 
-    /// Whether its products are faster than those of f32.
-    pub fn is_native(self) -> bool {
-        self != Engine::PORTABLE
+    /// Whether its products of bfloat16 are faster than those of f32.
+    pub fn has_bf16(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return !matches!(self.0, Unit::Portable | Unit::Vnni);
+        #[cfg(not(target_arch = "x86_64"))]
+        false
+    }
+
+    /// Whether its products of 8 bits are faster than all others.
+    pub fn prefers_int8(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return matches!(self.0, Unit::Vnni | Unit::Avx512);
+        #[cfg(not(target_arch = "x86_64"))]
+        false
     }
 
     /// Makes the processor ready for products on this thread while `work` runs.
@@ -76,14 +93,15 @@ impl Engine {
     }
 
     /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]` for 32 positions
-    /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart. The weights of a term beyond
-    /// its `eighths` times 8 input channels are zero: an engine may leave them out.
+    /// and `outputs` (1 or 2) output planes whose weights lie `plane` rows apart, both factors in `format`. The
+    /// weights of a term beyond its `groups` of rows are zero: an engine may leave them out.
     ///
     /// # Safety
     /// Called inside [`Engine::ready`]; every term's 32 rows of input and 16 rows of weights can be read.
     pub(super) unsafe fn multiply(
         self,
-        (terms, eighths): (&[Term], &[u8]),
+        format: Format,
+        (terms, groups): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
@@ -91,12 +109,24 @@ impl Engine {
     ) {
         // SAFETY: an engine is only made after its instructions were detected; the rest is the caller's.
         unsafe {
-            match self.0 {
-                Unit::Portable => portable::multiply(terms, position, weights, (outputs, plane), sums),
+            match (self.0, format) {
                 #[cfg(target_arch = "x86_64")]
-                Unit::Avx512 => avx512::multiply((terms, eighths), position, weights, (outputs, plane), sums),
+                (Unit::Vnni | Unit::Avx512, Format::Int8 { .. }) => {
+                    avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
+                }
+                #[cfg(target_arch = "x86_64")]
+                (Unit::Avx512, Format::Bf16) => {
+                    avx512::multiply_bf16((terms, groups), position, weights, (outputs, plane), sums);
+                }
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-                Unit::Amx => amx::multiply(terms, position, weights, (outputs, plane), sums),
+                (Unit::Amx, Format::Int8 { .. }) => {
+                    avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
+                }
+                #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+                (Unit::Amx, Format::Bf16) => {
+                    amx::multiply(terms, position, weights, (outputs, plane), sums);
+                }
+                _ => portable::multiply(format, terms, position, weights, (outputs, plane), sums),
             }
         }
     }
@@ -119,11 +149,11 @@ impl Engine {
         // SAFETY: as in `multiply`.
         unsafe {
             match self.0 {
-                Unit::Portable => portable::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
                 #[cfg(target_arch = "x86_64")]
                 Unit::Avx512 => avx512::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
                 Unit::Amx => amx::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
+                _ => portable::correlate(steps, channels, stride, pairs, (outputs, plane), sums),
             }
         }
     }
@@ -150,9 +180,34 @@ impl Engine {
         // SAFETY: the caller's promise; an engine is only made after its instructions were detected.
         unsafe {
             match self.0 {
-                Unit::Portable => portable::narrow_spread(low, high, out, step),
                 #[cfg(target_arch = "x86_64")]
-                _ => avx512::narrow_spread(low, high, out, step),
+                _ if self.has_bf16() => avx512::narrow_spread(low, high, out, step),
+                _ => portable::narrow_spread(low, high, out, step),
+            }
+        }
+    }
+
+    /// Rounds 32 channels, none negative, the upper 16 of which may be absent, to 8 bits, block by block: they
+    /// become half `half` of every `step`th value from `out` on.
+    ///
+    /// # Safety
+    /// `out` is valid for as many writes.
+    pub(super) unsafe fn quantize_spread(
+        self,
+        low: &[Block],
+        high: Option<&[Block]>,
+        half: usize,
+        out: *mut Wide,
+        step: usize,
+    ) {
+        assert!(high.is_none_or(|high| high.len() == low.len()) && half < 2);
+        // SAFETY: the caller's promise; an engine is only made after its instructions were detected.
+        unsafe {
+            let out = out.cast::<u8>().add(half * WIDE);
+            match self.0 {
+                Unit::Portable => portable::quantize_spread(low, high, out, step),
+                #[cfg(target_arch = "x86_64")]
+                _ => avx512::quantize_spread(low, high, out, step),
             }
         }
     }
@@ -161,10 +216,10 @@ impl Engine {
     /// `2c + j` of `out[i]`.
     pub(super) fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
         match self.0 {
-            Unit::Portable => portable::interleave(pairs, out),
             // SAFETY: an engine is only made after its instructions were detected.
             #[cfg(target_arch = "x86_64")]
-            _ => unsafe { avx512::interleave(pairs, out) },
+            _ if self.has_bf16() => unsafe { avx512::interleave(pairs, out) },
+            _ => portable::interleave(pairs, out),
         }
     }
 
@@ -177,9 +232,9 @@ impl Engine {
         // SAFETY: the caller's promise; instructions as above.
         unsafe {
             match self.0 {
-                Unit::Portable => portable::transpose(blocks, rows, stride),
                 #[cfg(target_arch = "x86_64")]
-                _ => avx512::transpose(blocks, rows, stride),
+                _ if self.has_bf16() => avx512::transpose(blocks, rows, stride),
+                _ => portable::transpose(blocks, rows, stride),
             }
         }
     }
@@ -190,6 +245,7 @@ mod portable {
     use super::*;
 
     pub unsafe fn multiply(
+        format: Format,
         terms: &[Term],
         position: usize,
         weights: *const Wide,
@@ -197,21 +253,37 @@ mod portable {
         sums: &mut Sums,
     ) {
         for (o, sums) in sums.0[..outputs].iter_mut().enumerate() {
-            sums.fill(Block::default());
-            for term in terms {
-                for (p, sum) in sums.iter_mut().enumerate() {
+            for (p, sum) in sums.iter_mut().enumerate() {
+                let (mut real, mut whole) = ([0.0f32; LANES], [0i32; LANES]);
+                for term in terms {
                     // SAFETY: the caller's promise.
                     let (x, w) = unsafe {
                         let w = weights.byte_add(term.weights).add(o * plane);
                         (&*term.input.add(position + p), std::slice::from_raw_parts(w, LANES))
                     };
-                    for (pair, w) in w.iter().enumerate() {
-                        let (a, b) = (x.0[2 * pair].to_f32(), x.0[2 * pair + 1].to_f32());
+                    for (i, w) in w.iter().enumerate() {
                         for l in 0..LANES {
-                            sum.0[l] += a * w.0[2 * l].to_f32() + b * w.0[2 * l + 1].to_f32();
+                            match format {
+                                Format::Bf16 => {
+                                    let product =
+                                        |i, j| x.bf16(i).to_f32() * w.bf16(j).to_f32();
+                                    real[l] += product(2 * i, 2 * l) + product(2 * i + 1, 2 * l + 1);
+                                }
+                                Format::Int8 { .. } => {
+                                    let product = |c| {
+                                        let w = i8::from_ne_bytes([w.0[WORD * l + c]]);
+                                        i32::from(x.0[WORD * i + c]) * i32::from(w)
+                                    };
+                                    whole[l] += (0..WORD).map(product).sum::<i32>();
+                                }
+                            }
                         }
                     }
                 }
+                sum.0 = match format {
+                    Format::Bf16 => real,
+                    Format::Int8 { .. } => whole.map(|v| v as f32),
+                };
             }
         }
     }
@@ -233,8 +305,8 @@ mod portable {
                         ([row.read_unaligned(), row.add(1).read_unaligned()], &*pairs.add(o * plane + pair))
                     };
                     for l in 0..LANES {
-                        sum.0[l] +=
-                            x[0].to_f32() * g.0[2 * l].to_f32() + x[1].to_f32() * g.0[2 * l + 1].to_f32();
+                        let g = [2 * l, 2 * l + 1].map(|i| g.bf16(i).to_f32());
+                        sum.0[l] += x[0].to_f32() * g[0] + x[1].to_f32() * g[1];
                     }
                 }
             }
@@ -245,19 +317,30 @@ mod portable {
         for (i, low) in low.iter().enumerate() {
             let mut both = Wide::ZERO;
             for l in 0..LANES {
-                both.0[l] = bf16::from_f32(low.0[l]);
-                both.0[LANES + l] = high.map_or(bf16::ZERO, |h| bf16::from_f32(h[i].0[l]));
+                both.set_bf16(l, bf16::from_f32(low.0[l]));
+                both.set_bf16(LANES + l, high.map_or(bf16::ZERO, |h| bf16::from_f32(h[i].0[l])));
             }
             // SAFETY: the caller's promise.
             unsafe { out.add(i * step).write(both) };
         }
     }
 
+    pub unsafe fn quantize_spread(low: &[Block], high: Option<&[Block]>, out: *mut u8, step: usize) {
+        for (i, low) in low.iter().enumerate() {
+            for l in 0..WIDE {
+                let value = if l < LANES { low.0[l] } else { high.map_or(0.0, |h| h[i].0[l - LANES]) };
+                let value = value.round_ties_even().clamp(0.0, ACTIVATION_STEPS) as u8;
+                // SAFETY: the caller's promise.
+                unsafe { out.add(i * step * size_of::<Wide>() + l).write(value) };
+            }
+        }
+    }
+
     pub fn interleave(pairs: &[[Block; 2]], out: &mut [Wide]) {
         for (pair, out) in pairs.iter().zip(out) {
             for l in 0..LANES {
-                out.0[2 * l] = bf16::from_f32(pair[0].0[l]);
-                out.0[2 * l + 1] = bf16::from_f32(pair[1].0[l]);
+                out.set_bf16(2 * l, bf16::from_f32(pair[0].0[l]));
+                out.set_bf16(2 * l + 1, bf16::from_f32(pair[1].0[l]));
             }
         }
     }
@@ -277,15 +360,66 @@ mod portable {
 mod avx512 {
     use std::arch::x86_64::*;
 
-    use super::{Block, CHUNK, EIGHTH, LANES, Sums, Term, Wide, bf16};
+    use super::{Block, CHUNK, GROUP, LANES, Sums, Term, WORD, Wide, bf16};
     use crate::kernels::simd::{Avx512, Simd};
 
     /// Positions whose sums stay in registers: 2 planes x 8 of them, beside 2 registers of weights.
     const TILE: usize = 8;
 
+    /// The products of the pairs or fours of values of a vector, added up for every lane.
+    trait Product {
+        /// `acc[i] + sum over j of x[i][j] w[i][j]`.
+        ///
+        /// # Safety
+        /// The processor has the instructions.
+        unsafe fn add(acc: __m512, x: __m512i, w: __m512i) -> __m512;
+
+        /// Sums as f32.
+        ///
+        /// # Safety
+        /// As above.
+        unsafe fn sums(acc: __m512) -> __m512;
+    }
+
+    /// Pairs of bfloat16.
+    struct Bf16;
+
+    impl Product for Bf16 {
+        #[inline(always)]
+        unsafe fn add(acc: __m512, x: __m512i, w: __m512i) -> __m512 {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let [x, w] = [x, w].map(|v| std::mem::transmute::<__m512i, __m512bh>(v));
+                _mm512_dpbf16_ps(acc, w, x)
+            }
+        }
+
+        #[inline(always)]
+        unsafe fn sums(acc: __m512) -> __m512 {
+            acc
+        }
+    }
+
+    /// Fours of 8 bits, whose sums are whole numbers.
+    struct Int8;
+
+    impl Product for Int8 {
+        #[inline(always)]
+        unsafe fn add(acc: __m512, x: __m512i, w: __m512i) -> __m512 {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_castsi512_ps(_mm512_dpbusd_epi32(_mm512_castps_si512(acc), x, w)) }
+        }
+
+        #[inline(always)]
+        unsafe fn sums(acc: __m512) -> __m512 {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_cvtepi32_ps(_mm512_castps_si512(acc)) }
+        }
+    }
+
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    pub unsafe fn multiply(
-        (terms, eighths): (&[Term], &[u8]),
+    pub unsafe fn multiply_bf16(
+        terms: (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
@@ -294,77 +428,99 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<2>((terms, eighths), position, weights, plane, sums);
+                tiles::<Bf16, 2>(terms, position, weights, plane, sums);
             } else {
-                tiles::<1>((terms, eighths), position, weights, plane, sums);
+                tiles::<Bf16, 1>(terms, position, weights, plane, sums);
             }
         }
     }
 
-    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    #[inline]
-    unsafe fn tiles<const OUT: usize>(
-        (terms, eighths): (&[Term], &[u8]),
+    #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+    pub unsafe fn multiply_int8(
+        terms: (&[Term], &[u8]),
+        position: usize,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            if outputs == 2 {
+                tiles::<Int8, 2>(terms, position, weights, plane, sums);
+            } else {
+                tiles::<Int8, 1>(terms, position, weights, plane, sums);
+            }
+        }
+    }
+
+    /// # Safety
+    /// As [`Engine::multiply`], and the processor has the instructions of `P`.
+    #[inline(always)]
+    unsafe fn tiles<P: Product, const OUT: usize>(
+        (terms, groups): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
         plane: usize,
         sums: &mut Sums,
     ) {
         for first in (0..CHUNK).step_by(TILE) {
-            let mut acc = [[_mm512_setzero_ps(); TILE]; OUT];
-            for (term, &eighths) in terms.iter().zip(eighths) {
-                // SAFETY: the caller's promise.
-                unsafe {
-                    let mut x = term.input.add(position + first).cast::<bf16>();
+            // SAFETY: the caller's promise.
+            unsafe {
+                let mut acc = [[_mm512_setzero_ps(); TILE]; OUT];
+                for (term, &groups) in terms.iter().zip(groups) {
+                    let mut x = term.input.add(position + first).cast::<u8>();
                     let mut w = weights.byte_add(term.weights);
-                    for _ in 0..eighths {
-                        for pair in 0..EIGHTH / 2 {
-                            add_pair(&mut acc, x.add(2 * pair), size_of::<Wide>(), w.add(pair), plane);
+                    for _ in 0..groups {
+                        for row in 0..GROUP {
+                            add_row::<P, OUT>(&mut acc, x.add(WORD * row), size_of::<Wide>(), w.add(row), plane);
                         }
-                        (x, w) = (x.add(EIGHTH), w.add(EIGHTH / 2));
+                        (x, w) = (x.add(WORD * GROUP), w.add(GROUP));
                     }
                 }
+                store::<P, OUT>(&acc, sums, first);
             }
-            store(&acc, sums, first);
         }
     }
 
-    /// Adds the products of a pair of values in each of a tile's rows, `stride` bytes apart from `x` on, with
-    /// those in `w` of each output plane, `plane` rows apart.
+    /// Adds the products of a word of each of a tile's rows, `stride` bytes apart from `x` on, with those in
+    /// `w` of each output plane, `plane` rows apart.
     ///
     /// # Safety
-    /// All of them can be read.
-    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    #[inline]
-    unsafe fn add_pair<const OUT: usize>(
+    /// All of them can be read; the processor has the instructions of `P`.
+    #[inline(always)]
+    unsafe fn add_row<P: Product, const OUT: usize>(
         acc: &mut [[__m512; TILE]; OUT],
-        x: *const bf16,
+        x: *const u8,
         stride: usize,
         w: *const Wide,
         plane: usize,
     ) {
         // SAFETY: the caller's promise.
         unsafe {
-            let w: [__m512bh; OUT] =
-                std::array::from_fn(|o| std::mem::transmute(_mm512_load_si512(w.add(o * plane).cast())));
+            let w: [__m512i; OUT] = std::array::from_fn(|o| _mm512_load_si512(w.add(o * plane).cast()));
             for row in 0..TILE {
-                let x = x.byte_add(row * stride).cast::<i32>().read_unaligned();
-                let x = std::mem::transmute::<__m512i, __m512bh>(_mm512_set1_epi32(x));
+                let x = _mm512_set1_epi32(x.add(row * stride).cast::<i32>().read_unaligned());
                 for o in 0..OUT {
-                    acc[o][row] = _mm512_dpbf16_ps(acc[o][row], w[o], x);
+                    acc[o][row] = P::add(acc[o][row], x, w[o]);
                 }
             }
         }
     }
 
     /// Stores a tile whose first row is row `first` of the sums.
-    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    #[inline]
-    fn store<const OUT: usize>(acc: &[[__m512; TILE]; OUT], sums: &mut Sums, first: usize) {
+    ///
+    /// # Safety
+    /// The processor has the instructions of `P`.
+    #[inline(always)]
+    unsafe fn store<P: Product, const OUT: usize>(
+        acc: &[[__m512; TILE]; OUT],
+        sums: &mut Sums,
+        first: usize,
+    ) {
         for (acc, sums) in acc.iter().zip(&mut sums.0) {
             for (acc, sum) in acc.iter().zip(&mut sums[first..]) {
-                // SAFETY: a block is 64 bytes, aligned to as many.
-                unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), *acc) };
+                // SAFETY: the caller's promise; a block is 64 bytes, aligned to as many.
+                unsafe { _mm512_store_ps(sum.0.as_mut_ptr(), P::sums(*acc)) };
             }
         }
     }
@@ -404,11 +560,11 @@ mod avx512 {
                 let mut acc: [[__m512; TILE]; OUT] = std::array::from_fn(|o| {
                     std::array::from_fn(|c| _mm512_load_ps(sums.0[o][first + c].0.as_ptr()))
                 });
-                let rows = channels.byte_add(first * stride);
+                let rows = channels.byte_add(first * stride).cast::<u8>();
                 for pair in 0..steps * CHUNK / 2 {
-                    add_pair(&mut acc, rows.add(2 * pair), stride, pairs.add(pair), plane);
+                    add_row::<Bf16, OUT>(&mut acc, rows.add(WORD * pair), stride, pairs.add(pair), plane);
                 }
-                store(&acc, sums, first);
+                store::<Bf16, OUT>(&acc, sums, first);
             }
         }
     }
@@ -422,6 +578,24 @@ mod avx512 {
                 let high = high.map_or(_mm512_setzero_ps(), |h| _mm512_load_ps(h[i].0.as_ptr()));
                 let both: __m512i = std::mem::transmute(_mm512_cvtne2ps_pbh(high, low));
                 _mm512_store_si512(out.add(i * step).cast(), both);
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f")]
+    pub unsafe fn quantize_spread(low: &[Block], high: Option<&[Block]>, out: *mut u8, step: usize) {
+        // Rounds to the nearest; what is too large for a byte becomes its largest value.
+        let bytes = |block: &Block| {
+            // SAFETY: a block is 64 bytes, aligned to as many.
+            _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(unsafe { _mm512_load_ps(block.0.as_ptr()) }))
+        };
+        for (i, low) in low.iter().enumerate() {
+            let high = high.map_or(_mm_setzero_si128(), |h| bytes(&h[i]));
+            // SAFETY: the caller's promise.
+            unsafe {
+                let out = out.add(i * step * size_of::<Wide>());
+                _mm_storeu_si128(out.cast(), bytes(low));
+                _mm_storeu_si128(out.add(LANES).cast(), high);
             }
         }
     }

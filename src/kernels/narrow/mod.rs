@@ -1,12 +1,13 @@
-//! Convolutions whose factors are bfloat16 and whose sums are f32: half the memory traffic, and up to
-//! sixteen times the arithmetic rate where the processor multiplies matrix tiles (AMX).
+//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter of
+//! the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
+//! multiplies matrix tiles (AMX).
 //!
-//! A [`Wide`] is 32 consecutive channels of one pixel. A plane of them is one long row of positions,
+//! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
 //! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones.
 //!
-//! [`Engine`] holds all that depends on the processor: two matrix products and two conversions. Its
-//! portable form is the oracle of the others.
+//! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
+//! the oracle of the others.
 
 pub mod conv;
 mod engine;
@@ -26,23 +27,67 @@ use super::{
     plane::Plane,
 };
 
-/// Channels in a [`Wide`].
-pub const WIDE: usize = 2 * LANES;
+/// What activations and weights are rounded to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Format {
+    /// bfloat16: f32 with 8 bits of mantissa.
+    Bf16,
+    /// Eight bits: activations, none negative, in as many `step`s; weights in steps of their own for every
+    /// output, with a sign. Sums are exact.
+    Int8 {
+        /// The difference between neighbouring values of an activation.
+        step: f32,
+    },
+}
 
-/// Input channels that a product leaves out where a plane does not use them.
-const EIGHTH: usize = 8;
+impl Format {
+    /// Channels in a [`Wide`].
+    pub const fn channels(self) -> usize {
+        match self {
+            Format::Bf16 => WIDE,
+            Format::Int8 { .. } => 2 * WIDE,
+        }
+    }
+}
+
+/// Channels of a [`Wide`] in bfloat16; as many are computed at once, in whatever format.
+const WIDE: usize = 2 * LANES;
+
+/// Bytes of a [`Wide`].
+const BYTES: usize = 64;
+
+/// Bytes of input channels that go with one row of weights, and rows that a product takes or leaves out
+/// together where a plane does not use all its channels.
+const WORD: usize = 4;
+const GROUP: usize = 4;
+
+/// Largest weight in steps.
+const WEIGHT_STEPS: f32 = 127.0;
+
+/// Largest activation in steps.
+pub const ACTIVATION_STEPS: f32 = 255.0;
 
 /// Positions that one product serves.
 const CHUNK: usize = 32;
 
-/// Thirty-two bfloat16 values, a row of a matrix tile: the channels of one pixel, or two rows of weights
-/// interleaved.
+/// Sixty-four bytes, a row of a matrix tile: the channels of one pixel, or the weights of 16 outputs for the
+/// channels of one [`WORD`], output by output.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(C, align(64))]
-pub struct Wide(pub [bf16; WIDE]);
+pub struct Wide([u8; BYTES]);
 
 impl Wide {
-    const ZERO: Wide = Wide([bf16::ZERO; WIDE]);
+    const ZERO: Wide = Wide([0; BYTES]);
+
+    /// Value `i` in bfloat16.
+    fn bf16(&self, i: usize) -> bf16 {
+        bf16::from_ne_bytes([self.0[2 * i], self.0[2 * i + 1]])
+    }
+
+    /// Sets value `i` in bfloat16.
+    fn set_bf16(&mut self, i: usize, value: bf16) {
+        self.0[2 * i..][..2].copy_from_slice(&value.to_ne_bytes());
+    }
 }
 
 /// One contribution to a sum: the input at position 0, and where its weights lie, in bytes from the output
@@ -116,35 +161,36 @@ impl Deref for Grid {
     }
 }
 
-/// An activation in bfloat16: the left factor of [`conv::convolve`], and what it can write.
+/// A narrow activation: the left factor of [`conv::convolve`], and what it can write.
 #[derive(Debug)]
 pub struct Operand {
-    /// `[image][plane of 32 channels][phase][position]`, then slack.
+    /// `[image][plane of 32 or 64 channels][phase][position]`, then slack.
     data: Pooled<Wide>,
     grid: Grid,
     shape: Shape,
+    format: Format,
 }
 
 impl Operand {
     /// An activation with zero borders and arbitrary pixels.
-    pub fn new(shape: Shape) -> Self {
-        let grid = Grid::new(shape, false);
-        let mut operand = Self::allocate(shape, grid);
+    pub fn new(shape: Shape, format: Format) -> Self {
+        let mut operand = Self::allocate(shape, Grid::new(shape, false), format);
+        let grid = operand.grid;
         let body = operand.body_mut();
         body.par_chunks_mut(grid.positions()).for_each(|plane| grid.fill_border(plane, Wide::ZERO));
         operand
     }
 
-    fn allocate(shape: Shape, grid: Grid) -> Self {
-        let planes = shape.c.div_ceil(WIDE) * grid.phases();
-        Self { data: allocate(shape.n * planes * grid.positions() + grid.slack()), grid, shape }
+    fn allocate(shape: Shape, grid: Grid, format: Format) -> Self {
+        let planes = shape.c.div_ceil(format.channels()) * grid.phases();
+        Self { data: allocate(shape.n * planes * grid.positions() + grid.slack()), grid, shape, format }
     }
 
     /// An activation rounded to bfloat16. `geometry` is that of the convolution that reads it.
     pub fn narrow(engine: Engine, source: View, geometry: Geometry) -> Self {
         let shape = source.shape;
         let grid = Grid::new(shape, geometry == Geometry::Strided);
-        let mut operand = Self::allocate(shape, grid);
+        let mut operand = Self::allocate(shape, grid, Format::Bf16);
         let planes = operand.planes();
         let body = operand.body_mut();
         // Parts of planes, so that few planes still keep every thread busy.
@@ -168,6 +214,30 @@ impl Operand {
         operand
     }
 
+    /// An activation without negative values, a ReLU's output, in 8 bits.
+    pub fn quantize(engine: Engine, source: View, step: f32) -> Self {
+        let shape = source.shape;
+        let mut operand = Self::new(shape, Format::Int8 { step });
+        let (planes, stride) = (operand.planes(), shape.plane_stride());
+        operand.body_mut().par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
+            for half in 0..2 {
+                let plane = 4 * (i % planes) + 2 * half;
+                if plane >= shape.planes() {
+                    continue;
+                }
+                let (low, high) = halves(source, i / planes, plane / 2);
+                let scaled = |block: &Block| Block(block.0.map(|v| v / step));
+                for p in 0..stride {
+                    let (low, high) = ([scaled(&low[p])], high.map(|high| [scaled(&high[p])]));
+                    let high = high.as_ref().map(<[Block; 1]>::as_slice);
+                    // SAFETY: one value is written where there is one.
+                    unsafe { engine.quantize_spread(&low, high, half, &raw mut out[p], 1) };
+                }
+            }
+        });
+        operand
+    }
+
     /// The values as f32, into an activation of the same shape. Borders are written too.
     ///
     /// # Panics
@@ -175,12 +245,16 @@ impl Operand {
     pub fn widen(&self, output: ViewMut) {
         assert_eq!(output.shape, self.shape);
         let (s, stride) = (self.shape, self.shape.plane_stride());
+        let blocks = self.format.channels() / LANES;
         output.data.par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
             let (n, plane) = (i / s.planes(), i % s.planes());
-            let from = &self.data[(n * self.planes() + plane / 2) * stride..][..stride];
+            let from = &self.data[(n * self.planes() + plane / blocks) * stride..][..stride];
+            let first = plane % blocks * LANES;
             for (out, wide) in out.iter_mut().zip(from) {
-                let half = &wide.0[plane % 2 * LANES..][..LANES];
-                out.0.iter_mut().zip(half).for_each(|(o, h)| *o = h.to_f32());
+                out.0 = std::array::from_fn(|l| match self.format {
+                    Format::Bf16 => wide.bf16(first + l).to_f32(),
+                    Format::Int8 { step } => f32::from(wide.0[first + l]) * step,
+                });
             }
         });
     }
@@ -193,7 +267,7 @@ impl Operand {
     pub fn copy_rows(&mut self, to: isize, source: &Operand, from: isize, count: usize) {
         let (grid, other) = (self.grid, source.grid);
         assert_eq!((self.shape.with_size(0, 0), self.shape.n), (source.shape.with_size(0, 0), 1));
-        assert!(!grid.split && !other.split);
+        assert!(!grid.split && !other.split && self.format == source.format);
         grid.copy_rows((self.body_mut(), to), *other, (source.body(), from), count);
     }
 
@@ -213,9 +287,32 @@ impl Operand {
         self.shape
     }
 
+    /// What its values are rounded to.
+    pub fn format(&self) -> Format {
+        self.format
+    }
+
     /// Planes of an image, phases included.
     fn planes(&self) -> usize {
-        self.shape.c.div_ceil(WIDE) * self.grid.phases()
+        self.shape.c.div_ceil(self.format.channels()) * self.grid.phases()
+    }
+}
+
+impl Format {
+    /// The larger of each two values, none negative.
+    fn max(self, a: &Wide, b: &Wide) -> Wide {
+        match self {
+            // The bits of non-negative values are ordered as the values are.
+            Format::Bf16 => {
+                let [a, b] = [a, b].map(|w| w.0.as_chunks::<2>().0);
+                let mut max = Wide::ZERO;
+                for (max, (a, b)) in max.0.as_chunks_mut::<2>().0.iter_mut().zip(a.iter().zip(b)) {
+                    *max = u16::from_ne_bytes(*a).max(u16::from_ne_bytes(*b)).to_ne_bytes();
+                }
+                max
+            }
+            Format::Int8 { .. } => Wide(std::array::from_fn(|i| a.0[i].max(b.0[i]))),
+        }
     }
 }
 
@@ -229,8 +326,8 @@ const PART: usize = 16384;
 pub fn max_pool(input: &Operand) -> Operand {
     let s = input.shape;
     assert!(s.h.is_multiple_of(2) && s.w.is_multiple_of(2), "only even sizes halve");
-    let mut output = Operand::new(s.with_size(s.h / 2, s.w / 2));
-    let (from, to) = (input.grid, output.grid);
+    let mut output = Operand::new(s.with_size(s.h / 2, s.w / 2), input.format);
+    let (from, to, format) = (input.grid, output.grid, input.format);
     output.body_mut().par_chunks_mut(to.positions()).enumerate().for_each(|(i, out)| {
         let plane = &input.data[i * from.positions()..][..from.positions()];
         for y in 0..to.h {
@@ -238,17 +335,14 @@ pub fn max_pool(input: &Operand) -> Operand {
             let bottom = &plane[from.row(2 * y + 1)..][..from.w];
             let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
             for (out, (top, bottom)) in out[to.row(y)..].iter_mut().zip(squares) {
-                // The bits of non-negative values are ordered as the values are.
-                let bits = |w: &Wide| w.0.map(bf16::to_bits);
-                let [a, b, c, d] = [&top[0], &top[1], &bottom[0], &bottom[1]].map(bits);
-                out.0 = std::array::from_fn(|l| bf16::from_bits(a[l].max(b[l]).max(c[l].max(d[l]))));
+                *out = format.max(&format.max(&top[0], &top[1]), &format.max(&bottom[0], &bottom[1]));
             }
         }
     });
     output
 }
 
-/// The two planes of 16 channels that make up plane `plane` of 32; the second may be absent.
+/// The two planes of 16 channels that make up 32 channels of a source; the second may be absent.
 fn halves<'a>(source: View<'a>, n: usize, plane: usize) -> (&'a [Block], Option<&'a [Block]>) {
     let s = source.shape;
     let blocks = |p: usize| &source.data[(n * s.planes() + p) * s.plane_stride()..][..s.plane_stride()];

@@ -85,7 +85,7 @@ impl Pairs {
                 grid.pixels(g, phase, |to, from| {
                     let to = to - origin;
                     for l in 0..LANES {
-                        out[to / 2].0[2 * l + to % 2] = bf16::from_f32(blocks[from].0[l]);
+                        out[to / 2].set_bf16(2 * l + to % 2, bf16::from_f32(blocks[from].0[l]));
                     }
                 });
             } else {
