@@ -3,11 +3,11 @@
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
-    bf16::{
-        Engine, Operand,
+    conv::{Direction, Epilogue, Geometry, convolve, packed_len},
+    narrow::{
+        Engine, Format, Operand,
         conv::{self, Output, Weights},
     },
-    conv::{Direction, Epilogue, Geometry, convolve, packed_len},
     peak,
     simd::Tier,
     weight_grad::weight_gradient,
@@ -66,23 +66,34 @@ fn forward(bencher: Bencher, layer: Layer, geometry: Geometry) {
     convolution(bencher, layer, geometry, Epilogue { relu: true, accumulate: false });
 }
 
-/// As `forward`, between activations that stay in bfloat16.
-fn forward_bf16(bencher: Bencher, layer: Layer, geometry: Geometry) {
+/// As `forward`, between activations that stay in a narrow format.
+fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Format) {
     let (n, i, o, h, w) = layer;
     let engine = Engine::detect();
     let shape = Shape::new(n, i, h, w);
     let (oh, ow) = geometry.output(h, w);
     let x = blocks(shape.blocks());
-    let x = Operand::narrow(engine, View::new(shape, &x), geometry);
     let weights = vec![0.01; i * o * geometry.taps()];
-    let weights = Weights::pack(&weights, &[i], o, geometry, Direction::Forward, 0);
+    let (x, weights) = match format {
+        Format::Bf16 => (
+            Operand::narrow(engine, View::new(shape, &x), geometry),
+            Weights::pack(&weights, &[i], o, geometry, Direction::Forward, 0),
+        ),
+        Format::Int8 { step } => (
+            Operand::quantize(engine, View::new(shape, &x), step),
+            Weights::quantize(&weights, &[(i, step)], o, geometry),
+        ),
+    };
     let bias = blocks(o.div_ceil(LANES));
-    let mut out = Operand::new(shape.with_channels(o).with_size(oh, ow));
+    let mut out = Operand::new(shape.with_channels(o).with_size(oh, ow), format);
     let relu = Epilogue { relu: true, accumulate: false };
     bencher.counter(flops(layer, geometry)).bench_local(|| {
-        conv::convolve(engine, &[&x], &weights, &bias, relu, Output::Bf16(&mut out));
+        conv::convolve(engine, &[&x], &weights, &bias, relu, Output::Narrow(&mut out));
     });
 }
+
+/// Eight bits of some step.
+const INT8: Format = Format::Int8 { step: 0.01 };
 
 fn input_gradient_of(bencher: Bencher, (n, i, o, h, w): Layer, geometry: Geometry) {
     let (oh, ow) = geometry.output(h, w);
@@ -144,17 +155,32 @@ fn transposed4x4_weight_gradient(bencher: Bencher, layer: Layer) {
 
 #[divan::bench(args = SHIPPED)]
 fn bf16_conv3x3(bencher: Bencher, layer: Layer) {
-    forward_bf16(bencher, layer, Geometry::Same(3));
+    forward_narrow(bencher, layer, Geometry::Same(3), Format::Bf16);
 }
 
 #[divan::bench(args = SHIPPED)]
 fn bf16_fusion1x1(bencher: Bencher, layer: Layer) {
-    forward_bf16(bencher, layer, Geometry::Same(1));
+    forward_narrow(bencher, layer, Geometry::Same(1), Format::Bf16);
 }
 
 #[divan::bench(args = SHIPPED)]
 fn bf16_transposed4x4(bencher: Bencher, layer: Layer) {
-    forward_bf16(bencher, layer, Geometry::Transposed);
+    forward_narrow(bencher, layer, Geometry::Transposed, Format::Bf16);
+}
+
+#[divan::bench(args = SHIPPED)]
+fn int8_conv3x3(bencher: Bencher, layer: Layer) {
+    forward_narrow(bencher, layer, Geometry::Same(3), INT8);
+}
+
+#[divan::bench(args = SHIPPED)]
+fn int8_fusion1x1(bencher: Bencher, layer: Layer) {
+    forward_narrow(bencher, layer, Geometry::Same(1), INT8);
+}
+
+#[divan::bench(args = SHIPPED)]
+fn int8_transposed4x4(bencher: Bencher, layer: Layer) {
+    forward_narrow(bencher, layer, Geometry::Transposed, INT8);
 }
 
 /// Register-to-register FMAs on every thread: what the machine can do at best.

@@ -272,14 +272,27 @@ fn the_number_of_threads_does_not_change_a_bit() {
 #[test]
 fn arithmetic_can_be_chosen_and_changes_little() {
     let passes = window(130, 70);
-    let image = |name: &str| models::open(name).unwrap().denoise(&passes).unwrap().data;
-    let (exact, rounded) = (image("demc-m:f32"), image("demc-m:bf16"));
-    let energy: f32 = exact.iter().map(|v| v * v).sum();
-    let difference: f32 = exact.iter().zip(&rounded).map(|(a, b)| (a - b).powi(2)).sum();
-    assert!(difference > 0.0, "bfloat16 rounds nothing?");
-    assert!(difference < 1e-4 * energy, "rounding changed the image by {}", (difference / energy).sqrt());
-    let own = image("demc-m");
-    assert!(own == exact || own == rounded, "without a choice, one of the two");
+    for name in ["demc-s", "demc-m", "demc-l"] {
+        let image = |name: &str| models::open(name).unwrap().denoise(&passes).unwrap().data;
+        let exact = image(&format!("{name}:f32"));
+        let energy: f32 = exact.iter().map(|v| v * v).sum();
+        let mut all = vec![exact.clone()];
+        for (arithmetic, limit) in [("bf16", 1e-4), ("int8", 4e-4)] {
+            let rounded = image(&format!("{name}:{arithmetic}"));
+            let difference: f32 = exact.iter().zip(&rounded).map(|(a, b)| (a - b).powi(2)).sum();
+            assert!(difference > 0.0, "{name}:{arithmetic} rounds nothing?");
+            let change = difference / energy;
+            assert!(change < limit, "{name}:{arithmetic} changed the image by {}", change.sqrt());
+            all.push(rounded);
+        }
+        assert!(all.contains(&image(name)), "without a choice, one of the three");
+    }
+}
+
+#[test]
+fn eight_bits_need_known_ranges() {
+    let error = models::open("semc:int8").err().expect("the paper's networks have no ranges").to_string();
+    assert!(error.contains("semc:int8") && error.contains(":bf16"), "{error}");
 }
 
 #[test]

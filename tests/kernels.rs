@@ -1,11 +1,11 @@
 //! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
-//! remainders included. The bfloat16 engines get values that bfloat16 holds, and so must be as exact.
+//! remainders included. The engines of narrow formats get values that these hold, and so must be as exact.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
-    bf16::{self, Engine},
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
     layout::{from_blocked, to_blocked},
+    narrow::{self, Engine, Format},
     pool::{max_pool, max_pool_gradient},
     simd::Tier,
     weight_grad::{bias_gradient, weight_gradient},
@@ -113,17 +113,18 @@ impl Arithmetic {
                 convolve(tier, sources, &packed, bias, used, epilogue, output);
             }
             Self::Bf16(engine) => {
-                let packed = bf16::conv::Weights::pack(weights, inputs, outputs, geometry, direction, source);
+                let packed =
+                    narrow::conv::Weights::pack(weights, inputs, outputs, geometry, direction, source);
                 let operands: Vec<_> =
-                    sources.iter().map(|s| bf16::Operand::narrow(engine, *s, used)).collect();
+                    sources.iter().map(|s| narrow::Operand::narrow(engine, *s, used)).collect();
                 let operands: Vec<_> = operands.iter().collect();
                 if !epilogue.accumulate {
                     // What it writes in bfloat16 is what it writes in f32, rounded.
-                    let mut rounded = bf16::Operand::new(output.shape);
-                    let to = bf16::conv::Output::Bf16(&mut rounded);
-                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
-                    let to = bf16::conv::Output::F32(ViewMut::new(output.shape, output.data));
-                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                    let mut rounded = narrow::Operand::new(output.shape, Format::Bf16);
+                    let to = narrow::conv::Output::Narrow(&mut rounded);
+                    narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                    let to = narrow::conv::Output::F32(ViewMut::new(output.shape, output.data));
+                    narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
                     let mut widened = vec![Block::default(); output.data.len()];
                     rounded.widen(ViewMut::new(output.shape, &mut widened));
                     for (rounded, full) in widened.iter().zip(output.data.iter()) {
@@ -132,8 +133,8 @@ impl Arithmetic {
                         }
                     }
                 } else {
-                    let to = bf16::conv::Output::F32(output);
-                    bf16::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                    let to = narrow::conv::Output::F32(output);
+                    narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
                 }
             }
         }
@@ -143,9 +144,9 @@ impl Arithmetic {
         match self {
             Self::F32(tier) => weight_gradient(tier, x, g, geometry, place, dw),
             Self::Bf16(engine) => {
-                let channels = bf16::weight_grad::Channels::new(engine, x);
-                let pairs = bf16::weight_grad::Pairs::new(engine, g, geometry);
-                bf16::weight_grad::weight_gradient(engine, &channels, &pairs, place, dw);
+                let channels = narrow::weight_grad::Channels::new(engine, x);
+                let pairs = narrow::weight_grad::Pairs::new(engine, g, geometry);
+                narrow::weight_grad::weight_gradient(engine, &channels, &pairs, place, dw);
             }
         }
     }
@@ -277,6 +278,100 @@ proptest! {
             for i in at {
                 prop_assert_eq!(dx[i], if i == first { grad } else { 0.0 });
             }
+        }
+    }
+}
+
+/// A layer in 8 bits whose factors are whole steps: exact, whatever the engine.
+fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
+    let steps = [0.5, 0.125];
+    let channels = if split == 0 || split >= shape.c { vec![shape.c] } else { vec![split, shape.c - split] };
+    let sources: Vec<(usize, f32)> = channels.iter().copied().zip(steps).collect();
+    let step_of = |i: usize| if i < channels[0] { steps[0] } else { steps[1] };
+    let (oh, ow) = geometry.output(shape.h, shape.w);
+    let out_shape = shape.with_channels(outputs).with_size(oh, ow);
+    let area = shape.h * shape.w;
+    let x: Vec<f32> = (noise(seed, shape.n * shape.c * area).iter().enumerate())
+        .map(|(i, v)| (v.abs() * 255.0).round() * step_of(i / area % shape.c))
+        .collect();
+    // Each output's largest weight is 127 steps, so that no other weight is rounded.
+    let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];
+    let levels = noise(seed + 1, w.len());
+    for o in 0..outputs {
+        let scale = 2f32.powi(o as i32 % 5 - 6);
+        for i in 0..shape.c {
+            for t in 0..geometry.taps() {
+                let level = if (i, t) == (0, 0) {
+                    -127.0
+                } else {
+                    (levels[(o * shape.c + i) * geometry.taps() + t] * 127.0).round()
+                };
+                w[weight_index(geometry, outputs, shape.c, o, i, t)] = level * scale / step_of(i);
+            }
+        }
+    }
+    let bias: Vec<f32> = noise(seed + 2, outputs).iter().map(|v| 40.0 * v).collect();
+    let mut want: Vec<f64> =
+        (0..shape.n * outputs * oh * ow).map(|i| f64::from(bias[i / (oh * ow) % outputs])).collect();
+    connections(geometry, shape, outputs, |o, i, k| want[o] += f64::from(x[i]) * f64::from(w[k]));
+
+    let mut first = 0;
+    let operands: Vec<narrow::Operand> = (sources.iter())
+        .map(|&(c, step)| {
+            let part = shape.with_channels(c);
+            let values: Vec<f32> =
+                (0..shape.n).flat_map(|n| x[(n * shape.c + first) * area..][..c * area].to_vec()).collect();
+            first += c;
+            let operand = narrow::Operand::quantize(engine, View::new(part, &blocked(part, &values)), step);
+            let mut widened = vec![Block::default(); part.blocks()];
+            operand.widen(ViewMut::new(part, &mut widened));
+            assert_eq!(plain(part, &widened), values, "whole steps are kept");
+            operand
+        })
+        .collect();
+    let operands: Vec<_> = operands.iter().collect();
+    let packed = narrow::conv::Weights::quantize(&w, &sources, outputs, geometry);
+    let mut padded = bias.clone();
+    padded.resize(outputs.next_multiple_of(LANES), 0.0);
+    let bias: Vec<Block> = padded.as_chunks::<LANES>().0.iter().map(|c| Block(*c)).collect();
+    let mut out = vec![Block::default(); out_shape.blocks()];
+    let linear = Epilogue { relu: false, accumulate: false };
+    let to = narrow::conv::Output::F32(ViewMut::new(out_shape, &mut out));
+    narrow::conv::convolve(engine, &operands, &packed, &bias, linear, to);
+    let full = plain(out_shape, &out);
+    assert_close(&full, &want, "8 bits");
+
+    // What it writes in 8 bits is the nearest step, at most half a step off, or the largest.
+    let step = 2.0f32;
+    let mut rounded = narrow::Operand::new(out_shape, Format::Int8 { step });
+    let relu = Epilogue { relu: true, accumulate: false };
+    narrow::conv::convolve(
+        engine,
+        &operands,
+        &packed,
+        &bias,
+        relu,
+        narrow::conv::Output::Narrow(&mut rounded),
+    );
+    let mut widened = vec![Block::default(); out_shape.blocks()];
+    rounded.widen(ViewMut::new(out_shape, &mut widened));
+    for (rounded, full) in plain(out_shape, &widened).iter().zip(&full) {
+        let want = full.clamp(0.0, 255.0 * step);
+        assert!((rounded - want).abs() <= 0.5001 * step && rounded % step == 0.0, "{rounded} for {full}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn eight_bits_equal_the_textbook_sum(
+        (n, c, outputs) in (1usize..3, 1usize..150, 1usize..70),
+        (h, w) in (1usize..7, 1usize..40),
+        split in 0usize..150,
+        geometry in prop::sample::select(vec![Geometry::Same(1), Geometry::Same(3), Geometry::Transposed]),
+        seed in any::<u64>(),
+    ) {
+        for engine in Engine::available() {
+            check_int8(engine, geometry, Shape::new(n, c, h, w), split, outputs, seed % 1000);
         }
     }
 }

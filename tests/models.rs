@@ -125,8 +125,14 @@ fn bands_give_the_same_bits_as_the_whole_frame() {
     let mut network = models::build(&Config { widths: vec![40, 20, 33, 8], ..trainable("demc-s") }, 3);
     let (width, height) = (70, 731);
     let passes = random_passes(width, height, 12);
-    for precision in [Precision::F32, Precision::Bf16] {
-        network.convolutions().into_iter().for_each(|conv| conv.set_precision(precision));
+    for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
+        for conv in network.convolutions() {
+            conv.set_precision(precision);
+            conv.range = Some(3.0);
+        }
+        if precision == Precision::Int8 {
+            network.freeze(); // takes in ranges
+        }
         // The network's own forward pass over all of the frame is what the plan must equal.
         let inputs = network.inputs(&passes).expect("all passes are there").padded(network.multiple());
         let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);

@@ -8,7 +8,11 @@
 
 use rayon::prelude::*;
 
-use super::simd::{Kernel, Simd, Tier};
+use super::{
+    LANES,
+    simd::{Kernel, Simd, Tier},
+    vectorised::{self, Vectorised},
+};
 
 /// Exponents are kept within this of zero: `e^-40` is no weight beside 1.
 const LIMIT: f32 = 40.0;
@@ -220,33 +224,71 @@ struct Forward<'a, 'f> {
 
 impl Kernel for Forward<'_, '_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        let Size { w, .. } = self.filter.size;
-        let n = self.filter.size.pixels();
-        let [r, g, b] = self.output;
-        let total = self.total;
-        for out in [&mut *r, &mut *g, &mut *b, &mut *total] {
-            out.fill(0.0);
-        }
-        let (mut weights, mut largest) = (vec![0.0; w], vec![0.0; w]);
+    unsafe fn run<S: Simd>(mut self) {
+        let (w, reach) = (self.filter.size.w, self.filter.k / 2);
         let taps = self.filter.taps(self.y);
-        self.filter.largest(self.y, &taps, &mut largest);
-        for (tap, row, dx) in taps {
-            let (x0, x1) = self.filter.weights(self.y, (tap, row, dx), &largest, &mut weights);
-            let len = x1 - x0;
-            let weights = &weights[x0..x1];
-            let from = row * w + (x0 as isize + dx) as usize;
-            for (out, c) in [(&mut *r, 0), (&mut *g, 1), (&mut *b, 2)] {
-                let image = &self.filter.image[c * n + from..][..len];
-                for ((out, v), w) in out[x0..x1].iter_mut().zip(image).zip(weights) {
-                    *out += v * w;
+        // Sixteen pixels at a time where all their neighbours lie inside the row, the last of them once more if
+        // need be; one by one beside the ends.
+        let inner = reach..w.saturating_sub(reach);
+        let mut x = 0;
+        while x < w {
+            if inner.start <= x && inner.start + LANES <= inner.end && x < inner.end {
+                self.pixels::<LANES>(x.min(inner.end - LANES), &taps);
+                x = (x + LANES).min(inner.end);
+            } else {
+                self.pixels::<1>(x, &taps);
+                x += 1;
+            }
+        }
+    }
+}
+
+impl Forward<'_, '_> {
+    /// Filters `N` pixels of the row from column `x` on: several only where no tap leaves the row.
+    #[inline(always)]
+    fn pixels<const N: usize>(&mut self, x: usize, taps: &[(usize, usize, isize)]) {
+        let Filter { size, image, logits, confidence, .. } = *self.filter;
+        let (n, at) = (size.pixels(), self.y * size.w + x);
+        let column = |dx: isize| x.checked_add_signed(dx).filter(|column| *column < size.w);
+        let several = |values: &[f32], at: usize| *values[at..].first_chunk::<N>().expect("inside the row");
+        let exponents = |tap: usize, row: usize, column: usize| {
+            let mut exponents = several(logits, tap * self.filter.filtered() + at);
+            if let Some(confidence) = confidence {
+                let confidence = several(confidence, row * size.w + column);
+                (0..N).for_each(|i| exponents[i] += confidence[i]);
+            }
+            exponents
+        };
+        let mut largest = [f32::NEG_INFINITY; N];
+        for &(tap, row, dx) in taps {
+            let Some(column) = column(dx) else { continue };
+            let exponents = exponents(tap, row, column);
+            for i in 0..N {
+                largest[i] = if exponents[i] > largest[i] { exponents[i] } else { largest[i] };
+            }
+        }
+        let (mut sums, mut total) = ([[0.0; N]; 3], [0.0; N]);
+        for &(tap, row, dx) in taps {
+            let Some(column) = column(dx) else { continue };
+            let exponents = exponents(tap, row, column);
+            let mut weights = [0.0; N];
+            for i in 0..N {
+                weights[i] = exp(exponents[i] - largest[i]);
+                total[i] += weights[i];
+            }
+            for (c, sums) in sums.iter_mut().enumerate() {
+                let values = several(image, c * n + row * size.w + column);
+                for i in 0..N {
+                    sums[i] += values[i] * weights[i];
                 }
             }
-            total[x0..x1].iter_mut().zip(weights).for_each(|(t, w)| *t += w);
         }
-        for out in [r, g, b] {
-            out.iter_mut().zip(&*total).for_each(|(v, t)| *v /= t);
+        for (out, sums) in self.output.iter_mut().zip(&sums) {
+            for (i, out) in out[x..][..N].iter_mut().enumerate() {
+                *out = sums[i] / total[i];
+            }
         }
+        self.total[x..][..N].copy_from_slice(&total);
     }
 }
 
@@ -315,22 +357,41 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
         (size.h, size.w, 3 * size.pixels(), size.pixels())
     );
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
-    let n = size.pixels();
-    each_row(w, output, total, |y, output, total| {
-        let at = 2 * y * size.w;
-        let weights: Vec<f32> = confidence[at..][..2 * size.w].iter().map(|c| exp(*c)).collect();
-        let square = |v: &[f32], x: usize| [v[2 * x], v[2 * x + 1], v[size.w + 2 * x], v[size.w + 2 * x + 1]];
-        for (x, total) in total.iter_mut().enumerate() {
-            *total = square(&weights, x).iter().sum();
+    let rows = [image, confidence];
+    each_row(w, output, total, |y, output, total| vectorised::run(Squares { size, y, rows, output, total }));
+}
+
+/// One row of what [`reduce`] makes.
+struct Squares<'a> {
+    size: Size,
+    y: usize,
+    /// The image and the confidence.
+    rows: [&'a [f32]; 2],
+    output: [&'a mut [f32]; 3],
+    total: &'a mut [f32],
+}
+
+impl Vectorised for Squares<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { size: Size { w, .. }, y, rows: [image, confidence], output, total } = self;
+        let (n, at) = (self.size.pixels(), 2 * y * w);
+        let mut weights = confidence[at..][..2 * w].to_vec();
+        weights.iter_mut().for_each(|v| *v = exp(*v));
+        let (top, bottom) = weights.split_at(w);
+        let (top, bottom) = (top.as_chunks::<2>().0, bottom.as_chunks::<2>().0);
+        for ((total, a), b) in total.iter_mut().zip(top).zip(bottom) {
+            *total = a[0] + a[1] + b[0] + b[1];
         }
         for (c, out) in output.into_iter().enumerate() {
-            let image = &image[c * n + at..][..2 * size.w];
-            for (x, out) in out.iter_mut().enumerate() {
-                let (v, k) = (square(image, x), square(&weights, x));
-                *out = (v[0] * k[0] + v[1] * k[1] + v[2] * k[2] + v[3] * k[3]) / total[x];
+            let (first, second) = image[c * n + at..][..2 * w].split_at(w);
+            let values = first.as_chunks::<2>().0.iter().zip(second.as_chunks::<2>().0);
+            let weights = top.iter().zip(bottom).zip(&*total);
+            for ((out, (v, u)), ((a, b), total)) in out.iter_mut().zip(values).zip(weights) {
+                *out = (v[0] * a[0] + v[1] * a[1] + u[0] * b[0] + u[1] * b[1]) / total;
             }
         }
-    });
+    }
 }
 
 /// Adds what [`reduce`]'s output gradient sends back to image and confidence.

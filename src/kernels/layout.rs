@@ -147,23 +147,30 @@ impl Kernel for Unpack<'_> {
         for y in rows {
             let row = &input.data[s.row(n, plane, y)..][..s.w];
             for (x, blocks) in (0..s.w).step_by(LANES).zip(row.chunks(LANES)) {
-                pixels[..blocks.len()].copy_from_slice(blocks);
                 // SAFETY: vectors are the tier's; every value belongs to this task, see `SharedValues`.
                 unsafe {
-                    transpose::<S>(&mut pixels);
+                    transpose::<S>(blocks, &mut pixels);
                     let mut lane = lanes.start;
                     while lane < lanes.end {
                         let out = planes.0.add(map.value(n, plane, lane, y, x));
                         if map.paired(plane, lane, &lanes) {
                             let out = std::slice::from_raw_parts_mut(out, 2 * blocks.len());
                             let (a, b) = (&pixels[lane].0, &pixels[lane + 1].0);
-                            for (i, pair) in out.as_chunks_mut::<2>().0.iter_mut().enumerate() {
-                                *pair = [a[i], b[i]];
+                            let pairs: [f32; 2 * LANES] =
+                                std::array::from_fn(|i| if i % 2 == 0 { a[i / 2] } else { b[i / 2] });
+                            match <&mut [f32; 2 * LANES]>::try_from(&mut *out) {
+                                Ok(out) => *out = pairs,
+                                Err(_) => out.copy_from_slice(&pairs[..2 * blocks.len()]),
                             }
                             lane += 2;
                         } else {
-                            for i in 0..blocks.len() {
-                                *out.add(i * map.factor) = pixels[lane].0[i];
+                            let values = &pixels[lane].0;
+                            if map.factor == 1 && blocks.len() == LANES {
+                                out.cast::<[f32; LANES]>().write(*values);
+                            } else {
+                                for i in 0..blocks.len() {
+                                    *out.add(i * map.factor) = values[i];
+                                }
                             }
                             lane += 1;
                         }
@@ -197,16 +204,20 @@ impl Kernel for Pack<'_> {
                 unsafe {
                     let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y) + x), count);
                     if lanes.len() < LANES {
-                        pixels[..count].copy_from_slice(row);
-                        transpose::<S>(&mut pixels);
+                        transpose::<S>(row, &mut pixels);
                     }
                     let mut lane = lanes.start;
                     while lane < lanes.end {
                         let from = &input[map.value(n, plane, lane, y, x)..];
                         if map.paired(plane, lane, &lanes) {
-                            for (i, pair) in from.as_chunks::<2>().0[..count].iter().enumerate() {
-                                pixels[lane].0[i] = pair[0];
-                                pixels[lane + 1].0[i] = pair[1];
+                            if let (Some(from), LANES) = (from.first_chunk::<{ 2 * LANES }>(), count) {
+                                pixels[lane].0 = std::array::from_fn(|i| from[2 * i]);
+                                pixels[lane + 1].0 = std::array::from_fn(|i| from[2 * i + 1]);
+                            } else {
+                                for (i, pair) in from.as_chunks::<2>().0[..count].iter().enumerate() {
+                                    pixels[lane].0[i] = pair[0];
+                                    pixels[lane + 1].0[i] = pair[1];
+                                }
                             }
                             lane += 2;
                         } else {
@@ -216,25 +227,24 @@ impl Kernel for Pack<'_> {
                             lane += 1;
                         }
                     }
-                    transpose::<S>(&mut pixels);
-                    row.copy_from_slice(&pixels[..count]);
+                    let rows = S::transpose(std::array::from_fn(|i| S::load(&pixels[i])));
+                    row.iter_mut().zip(rows).for_each(|(block, values)| S::store(block, values));
                 }
             }
         }
     }
 }
 
-/// Lanes become pixels and pixels lanes.
+/// The lanes of up to 16 pixels as blocks of pixels; beyond the last pixel values are arbitrary.
 ///
 /// # Safety
 /// The processor has the instructions of `S`.
 #[inline(always)]
-unsafe fn transpose<S: Simd>(blocks: &mut [Block; LANES]) {
+unsafe fn transpose<S: Simd>(pixels: &[Block], lanes: &mut [Block; LANES]) {
     // SAFETY: the caller's promise.
     unsafe {
-        let rows = S::transpose(std::array::from_fn(|i| S::load(&blocks[i])));
-        for (block, row) in blocks.iter_mut().zip(rows) {
-            S::store(block, row);
-        }
+        let last = pixels.len() - 1;
+        let rows = S::transpose(std::array::from_fn(|i| S::load(&pixels[i.min(last)])));
+        lanes.iter_mut().zip(rows).for_each(|(block, values)| S::store(block, values));
     }
 }

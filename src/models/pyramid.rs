@@ -309,7 +309,8 @@ impl Network for Pyramid {
         }
         let mut below = None;
         for (level, layers) in (0..LEVELS).rev().zip(&mut self.decoder) {
-            let mut sources = self.encoders.each_ref().map(|encoder| encoder.levels[level][1].step()).to_vec();
+            let mut sources =
+                self.encoders.each_ref().map(|encoder| encoder.levels[level][1].step()).to_vec();
             if let (Some(up), Some(below)) = (&mut layers.up, below) {
                 up.freeze(&[below]);
                 sources.push(up.step());

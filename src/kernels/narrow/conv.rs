@@ -134,7 +134,8 @@ impl Weights {
     /// If `weights` has the wrong length.
     pub fn quantize(weights: &[f32], sources: &[(usize, f32)], outputs: usize, geometry: Geometry) -> Self {
         let taps = geometry.taps();
-        let steps: Vec<f32> = sources.iter().flat_map(|&(channels, step)| (0..channels).map(move |_| step)).collect();
+        let steps: Vec<f32> =
+            sources.iter().flat_map(|&(channels, step)| (0..channels).map(move |_| step)).collect();
         let total = steps.len();
         assert_eq!(weights.len(), total * outputs * taps);
         let weight = |o, i, t| weights[weight_index(geometry, outputs, total, o, i, t)] * steps[i];
@@ -145,7 +146,8 @@ impl Weights {
             scale[o / LANES].0[o % LANES] = (largest / WEIGHT_STEPS).max(f32::MIN_POSITIVE);
         }
         let inputs = sources.iter().map(|&(channels, step)| (channels, Format::Int8 { step })).collect();
-        let packed = Self::build(geometry, inputs, outputs, |o, i, t| weight(o, i, t) / scale[o / LANES].0[o % LANES]);
+        let packed =
+            Self::build(geometry, inputs, outputs, |o, i, t| weight(o, i, t) / scale[o / LANES].0[o % LANES]);
         Self { scale, ..packed }
     }
 
@@ -184,14 +186,17 @@ impl Weights {
                         let (row, at) = (&mut rows[i / side], side * l + i % side);
                         match format {
                             Format::Bf16 => row.set_bf16(at, bf16::from_f32(value)),
-                            Format::Int8 { .. } => row.0[at] = (value.round_ties_even() as i8).to_ne_bytes()[0],
+                            Format::Int8 { .. } => {
+                                row.0[at] = (value.round_ties_even() as i8).to_ne_bytes()[0]
+                            }
                         }
                     }
                 }
             }
         });
         let of_phase = &terms[..terms.len() / (spread * spread)];
-        let groups = of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
+        let groups =
+            of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
         let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
         Self { rows, groups, geometry, inputs, outputs, scale }
     }
@@ -288,7 +293,8 @@ pub fn convolve(
         }
     };
     // What is stored counts steps.
-    let in_steps = |blocks: &[Block]| -> Vec<Block> { blocks.iter().map(|b| Block(b.0.map(|v| v / step))).collect() };
+    let in_steps =
+        |blocks: &[Block]| -> Vec<Block> { blocks.iter().map(|b| Block(b.0.map(|v| v / step))).collect() };
     let (scale, bias) = (in_steps(&weights.scale), in_steps(bias));
     let tier = Tier::detect();
     (0..out.n * bands).into_par_iter().for_each(|task| {
@@ -362,7 +368,14 @@ impl Kernel for Band<'_> {
                     unsafe {
                         let terms = (&terms[..], &self.weights.groups[..]);
                         let format = self.weights.inputs[0].1;
-                        self.engine.multiply(format, terms, position, weights, (outputs, plane_rows), &mut sums);
+                        self.engine.multiply(
+                            format,
+                            terms,
+                            position,
+                            weights,
+                            (outputs, plane_rows),
+                            &mut sums,
+                        );
                         self.store::<S>(
                             &mut sums,
                             (plane, outputs),
@@ -431,7 +444,8 @@ impl Band<'_> {
             }
             if let Target::Narrow(wides, grid, format) = self.target {
                 let [low, high] = &sums.0;
-                let (low, high) = (&low[first..first + run], (outputs == 2).then(|| &high[first..first + run]));
+                let (low, high) =
+                    (&low[first..first + run], (outputs == 2).then(|| &high[first..first + run]));
                 // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
                 let blocks = format.channels() / LANES;
                 let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;

@@ -265,8 +265,7 @@ mod portable {
                         for l in 0..LANES {
                             match format {
                                 Format::Bf16 => {
-                                    let product =
-                                        |i, j| x.bf16(i).to_f32() * w.bf16(j).to_f32();
+                                    let product = |i, j| x.bf16(i).to_f32() * w.bf16(j).to_f32();
                                     real[l] += product(2 * i, 2 * l) + product(2 * i + 1, 2 * l + 1);
                                 }
                                 Format::Int8 { .. } => {
@@ -472,7 +471,13 @@ mod avx512 {
                     let mut w = weights.byte_add(term.weights);
                     for _ in 0..groups {
                         for row in 0..GROUP {
-                            add_row::<P, OUT>(&mut acc, x.add(WORD * row), size_of::<Wide>(), w.add(row), plane);
+                            add_row::<P, OUT>(
+                                &mut acc,
+                                x.add(WORD * row),
+                                size_of::<Wide>(),
+                                w.add(row),
+                                plane,
+                            );
                         }
                         (x, w) = (x.add(WORD * GROUP), w.add(GROUP));
                     }
