@@ -10,7 +10,11 @@ use std::{
 };
 
 use assert_cmd::cargo::cargo_bin;
-use demc::nn::weights::{self, Tensor};
+use demc::{
+    models::{self, weights_file},
+    nn::weights::{self, Tensor},
+    passes,
+};
 use predicates::prelude::*;
 
 /// Two real pairs: one to train on, one to validate on.
@@ -78,6 +82,27 @@ fn a_run_leaves_its_folder_and_its_weights_denoise() {
     denoise.args(["denoise", &input, "--out"]).arg(&images).arg("--model").arg(out.join("best.safetensors"));
     run(&mut denoise).success();
     assert!(images.join("s0010_outdoor_0004spp.exr").is_file());
+}
+
+#[test]
+fn weights_know_the_ranges_that_eight_bits_need() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(&mut train(&out, 4)).success();
+    let weights = out.join("best.safetensors");
+    let ranges = weights_file::read(&weights).expect("weights").1.ranges;
+    assert_eq!(ranges.len(), 27, "every layer that ends in a ReLU: {ranges:?}");
+    assert!(ranges.values().all(|range| *range > 0.0 && range.is_finite()), "{ranges:?}");
+    let frame = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+    let passes = passes::load(Path::new(&frame), None).expect("a frame");
+    let image = |arithmetic: &str| {
+        let model = models::open(&format!("{}:{arithmetic}", weights.display())).expect("it has ranges");
+        model.denoise(&passes).expect("all passes are there").data
+    };
+    let (exact, rounded) = (image("f32"), image("int8"));
+    let energy: f32 = exact.iter().map(|v| v * v).sum();
+    let difference: f32 = exact.iter().zip(&rounded).map(|(a, b)| (a - b).powi(2)).sum();
+    assert!(difference > 0.0 && difference < 1e-3 * energy, "{}", (difference / energy).sqrt());
 }
 
 #[cfg(unix)]
