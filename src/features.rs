@@ -124,8 +124,7 @@ pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Resul
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
-    // Emitters write their radiance here; brighter than white says nothing about texture.
-    albedo.data.iter_mut().for_each(|a| *a = a.clamp(0.0, 1.0));
+    albedo.data.iter_mut().for_each(|a| *a = texture(*a));
     let guide = Planes::from_vec(
         6,
         passes.width,
@@ -140,6 +139,34 @@ pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Resul
     Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
 }
 
+/// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says
+/// nothing.
+fn texture(albedo: f32) -> f32 {
+    albedo.clamp(0.0, 1.0)
+}
+
+/// A frame whose albedo stands in the place of radiance, as bright as radiance is later divided by, lit evenly
+/// (its own albedo is 1): what a prefilter denoises.
+///
+/// # Errors
+/// A pass is missing.
+pub fn albedo_as_radiance(passes: &PassSet, needed_by: &str) -> Result<PassSet> {
+    let mut frame = passes.rows(&[Pass::DenoisingNormal], 0..passes.height);
+    let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
+    let mut white = Planes::new(3, passes.width, passes.height);
+    white.data.fill(1.0);
+    albedo.data.iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
+    frame.insert(Pass::Combined, albedo);
+    frame.insert(Pass::DenoisingAlbedo, white);
+    Ok(frame)
+}
+
+/// The albedo again from what was made of [`albedo_as_radiance`].
+pub fn radiance_as_albedo(mut radiance: Planes) -> Planes {
+    radiance.data.iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
+    radiance
+}
+
 /// Logarithm of exposed radiance for a network to read: 0 for black, about 1 for white. Nothing is
 /// ever transferred back, because kernels act on radiance itself.
 fn log_transfer(exposed: f32) -> f32 {
@@ -151,15 +178,26 @@ fn log_transfer(exposed: f32) -> f32 {
 /// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
 /// a black frame. Scaling radiance scales it inversely.
 pub fn exposure(radiance: &Planes) -> f32 {
-    let (w, h) = (radiance.width, radiance.height);
-    let (mut sum, mut count) = (0.0, 0usize);
-    for y0 in (0..h).step_by(EXPOSURE_SQUARE) {
+    log_average_exposure(radiance, |v| v.max(0.0))
+}
+
+/// [`exposure`] of the radiance in [`albedo_as_radiance`].
+pub fn albedo_exposure(albedo: &Planes) -> f32 {
+    log_average_exposure(albedo, |v| texture(v) + ALBEDO_FLOOR)
+}
+
+/// [`exposure`] of the radiance that `of` makes of each value.
+fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 {
+    let (w, h) = (planes.width, planes.height);
+    // Of every row of squares the sum of logarithms, and their number.
+    let row = |y0: usize| {
+        let (mut sum, mut count) = (0.0, 0usize);
         for x0 in (0..w).step_by(EXPOSURE_SQUARE) {
             let (mut luminance, mut pixels) = (0.0f64, 0usize);
             for y in y0..h.min(y0 + EXPOSURE_SQUARE) {
                 for x in x0..w.min(x0 + EXPOSURE_SQUARE) {
                     for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
-                        luminance += weight * f64::from(radiance.channel(c)[y * w + x].max(0.0));
+                        luminance += weight * f64::from(of(planes.channel(c)[y * w + x]));
                     }
                     pixels += 1;
                 }
@@ -170,7 +208,12 @@ pub fn exposure(radiance: &Planes) -> f32 {
                 count += 1;
             }
         }
-    }
+        (sum, count)
+    };
+    // Added up in order, whatever the threads do.
+    let rows: Vec<(f64, usize)> =
+        (0..h.div_ceil(EXPOSURE_SQUARE)).into_par_iter().map(|y| row(y * EXPOSURE_SQUARE)).collect();
+    let (sum, count) = rows.into_iter().fold((0.0, 0), |(s, n), (sum, count)| (s + sum, n + count));
     if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
 }
 
@@ -199,15 +242,20 @@ pub struct Inputs {
 impl Inputs {
     /// Grows every input to a multiple of `multiple` in both directions by repeating the last row and column:
     /// what a network that halves its input `log2(multiple)` times needs.
-    pub fn padded(mut self, multiple: usize) -> Self {
-        self.planes = self.planes.into_iter().map(|planes| pad_to_multiple(planes, multiple)).collect();
+    pub fn padded(self, multiple: usize) -> Self {
+        let [width, height] = self.planes.first().map_or([0; 2], |p| [p.width, p.height]);
+        self.padded_to(width.next_multiple_of(multiple), height.next_multiple_of(multiple))
+    }
+
+    /// Grows every input to a size by repeating the last row and column.
+    pub fn padded_to(mut self, width: usize, height: usize) -> Self {
+        self.planes = self.planes.into_iter().map(|planes| pad(planes, (width, height))).collect();
         self
     }
 }
 
-/// What [`Inputs::padded`] does to one input.
-fn pad_to_multiple(planes: Planes, multiple: usize) -> Planes {
-    let (width, height) = (planes.width.next_multiple_of(multiple), planes.height.next_multiple_of(multiple));
+/// What [`Inputs::padded_to`] does to one input.
+fn pad(planes: Planes, (width, height): (usize, usize)) -> Planes {
     if (width, height) == (planes.width, planes.height) {
         return planes;
     }
@@ -256,7 +304,7 @@ mod tests {
     #[test]
     fn padding_repeats_the_edge_and_a_window_undoes_it() {
         let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        let padded = pad_to_multiple(planes.clone(), 4);
+        let padded = pad(planes.clone(), (4, 4));
         assert_eq!((padded.width, padded.height), (4, 4));
         assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
         assert_eq!(padded.window((0, 0), (3, 1)), planes);

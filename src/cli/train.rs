@@ -16,7 +16,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::{
     Error, Result,
     frame::Frame,
-    models::{self, network::Architecture},
+    models::{self, network::Architecture, weights_file},
     nn::Precision,
     passes::{self, Pass},
     report,
@@ -80,6 +80,10 @@ pub struct Args {
     /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
+    /// Weights that denoise the albedo first: a file of `demc train` on albedo in the place of radiance
+    /// (eval/training/albedo_pairs.py), or of a network with a prefilter, or none; without it the built-in ones
+    #[arg(long, value_name = "FILE|none")]
+    prefilter: Option<PathBuf>,
     /// Go on from the run folder's checkpoint, with its config.json
     #[arg(long)]
     resume: bool,
@@ -87,6 +91,9 @@ pub struct Args {
     #[arg(long)]
     threads: Option<usize>,
 }
+
+/// What stands for no prefilter at all.
+const NO_PREFILTER: &str = "none";
 
 /// One scene in this many is held out for validation.
 const HOLD_OUT: u64 = 10;
@@ -166,6 +173,12 @@ impl Args {
         if let Some(widths) = &self.widths {
             network.widths = models::widths(network.architecture, widths);
         }
+        let prefilter = self.prefilter.clone().filter(|path| path != Path::new(NO_PREFILTER));
+        match &prefilter {
+            Some(path) => network.prefilter = weights_file::prefilter_widths(path)?,
+            None if self.prefilter.is_some() => network.prefilter.clear(),
+            None => {}
+        }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
         let multiple = models::build(&network, 0).multiple();
         if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
@@ -219,6 +232,7 @@ impl Args {
             every: self.every,
             seed: self.seed,
             init: self.init.clone(),
+            prefilter,
         })
     }
 }

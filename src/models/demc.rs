@@ -222,7 +222,7 @@ impl Demc {
         let decoder = decoder.collect();
         let output = Conv::new(rng, "output", &[widths[0]], 3, 1, Init::Scaled(OUTPUT_GAIN));
         let output = output.head().with_bias(OUTPUT_BIAS);
-        Self { config: Config { architecture, widths: widths.into() }, fusion, encoders, decoder, output }
+        Self { config: Config::new(architecture, widths), fusion, encoders, decoder, output }
     }
 
     /// The detail map, and each encoder's skips and latent.

@@ -145,24 +145,25 @@ pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
     }
 }
 
+/// Widths of the prefilter of `demc-m` and `demc-l`.
+const PREFILTER: [usize; pyramid::LEVELS] = [16, 24, 32, 40];
+
 /// Names of the networks that can be trained, and the configuration each begins with.
 pub fn trainable() -> Vec<(&'static str, Config)> {
-    let paper = |architecture| Config { architecture, widths: widths(architecture, &PAPER_NARROW) };
-    let pyramid = |widths: [usize; pyramid::LEVELS]| Config {
-        architecture: Architecture::Pyramid,
-        widths: widths.into(),
-    };
-    let kpcn = |architecture| Config { architecture, widths: vec![32] };
+    let paper = |architecture| Config::new(architecture, &widths(architecture, &PAPER_NARROW));
+    let pyramid = |widths: [usize; pyramid::LEVELS]| Config::new(Architecture::Pyramid, &widths);
+    let prefiltered = |widths| Config { prefilter: PREFILTER.into(), ..pyramid(widths) };
+    let kpcn = |architecture| Config::new(architecture, &[32]);
     vec![
         ("demc-s", pyramid([32, 48, 64, 80])),
-        ("demc-m", pyramid([96, 96, 96, 112])),
-        ("demc-l", pyramid([112, 128, 128, 128])),
+        ("demc-m", prefiltered([96, 96, 96, 112])),
+        ("demc-l", prefiltered([112, 128, 128, 128])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),
         ("kpcn", kpcn(Architecture::Kpcn)),
         ("kpcn-combined", kpcn(Architecture::KpcnCombined)),
-        ("lbf", Config { architecture: Architecture::Lbf, widths: vec![lbf::PUBLISHED_WIDTH] }),
+        ("lbf", Config::new(Architecture::Lbf, &[lbf::PUBLISHED_WIDTH])),
     ]
 }
 
@@ -179,7 +180,12 @@ pub fn check(config: &Config) -> Result<(), String> {
     if config.widths.len() != levels {
         return Err(format!("{} widths, but the network takes {levels}", config.widths.len()));
     }
-    if let Some(width) = config.widths.iter().find(|w| !(1..=4096).contains(*w)) {
+    if !config.prefilter.is_empty()
+        && (config.architecture != Architecture::Pyramid || config.prefilter.len() != levels)
+    {
+        return Err("only built-in networks have a prefilter, of as many widths".into());
+    }
+    if let Some(width) = config.widths.iter().chain(&config.prefilter).find(|w| !(1..=4096).contains(*w)) {
         return Err(format!("width {width} is out of range; use 1 to 4096"));
     }
     Ok(())

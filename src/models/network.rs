@@ -22,12 +22,26 @@ pub struct Config {
     pub architecture: Architecture,
     /// Channels at each level, finest first.
     pub widths: Vec<usize>,
+    /// Those of a built-in network's prefilter, which denoises the albedo first; none where it has none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub prefilter: Vec<usize>,
+}
+
+impl Config {
+    /// A network without prefilter.
+    pub fn new(architecture: Architecture, widths: &[usize]) -> Self {
+        Self { architecture, widths: widths.into(), prefilter: Vec::new() }
+    }
 }
 
 impl std::fmt::Display for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let widths: Vec<String> = self.widths.iter().map(usize::to_string).collect();
-        write!(f, "{:?} of widths {}", self.architecture, widths.join(","))
+        let list = |widths: &[usize]| widths.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
+        write!(f, "{:?} of widths {}", self.architecture, list(&self.widths))?;
+        if !self.prefilter.is_empty() {
+            write!(f, " with a prefilter of widths {}", list(&self.prefilter))?;
+        }
+        Ok(())
     }
 }
 

@@ -10,6 +10,9 @@
 //! out of all kernels at once.
 //!
 //! A network that outputs kernels cannot invent a colour, and scales with its input exactly.
+//!
+//! Wider networks read an albedo that a prefilter denoised: a small network of the same kind, which was trained
+//! to denoise albedo in the place of radiance and is not trained any further.
 
 mod bands;
 
@@ -18,7 +21,7 @@ use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
-    features::{GUIDE_PASSES, Inputs, guides},
+    features::{GUIDE_PASSES, Inputs, albedo_as_radiance, guides, radiance_as_albedo},
     kernels::blend::CORNERS,
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
@@ -49,6 +52,12 @@ const DECODER_EXTRA: usize = 16;
 /// Heads begin this much smaller than Xavier: kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
+/// What the names of a prefilter's layers begin with.
+pub const PREFILTER: &str = "prefilter.";
+
+/// Who asks for passes, in messages.
+const NEEDED_BY: &str = "this model";
+
 /// Channels of the radiance encoder's and of the guide encoder's input, before space to depth.
 const RADIANCE_CHANNELS: usize = 3;
 const GUIDE_CHANNELS: usize = 6;
@@ -57,6 +66,8 @@ const GUIDE_CHANNELS: usize = 6;
 #[derive(Clone)]
 pub struct Pyramid {
     config: Config,
+    /// Denoises the albedo.
+    prefilter: Option<Box<Pyramid>>,
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
@@ -155,22 +166,36 @@ impl Pyramid {
     /// # Panics
     /// If `widths` does not hold one width a level.
     pub fn new(config: &Config, seed: u64) -> Self {
+        let rng = &mut Rng::new(seed, 0);
+        let mut network = Self::named("", Config::new(config.architecture, &config.widths), rng);
+        if !config.prefilter.is_empty() {
+            let own = Config::new(config.architecture, &config.prefilter);
+            let mut prefilter = Self::named(PREFILTER, own, rng);
+            prefilter.params().into_iter().for_each(|param| param.trainable = false);
+            network.prefilter = Some(Box::new(prefilter));
+            network.config = config.clone();
+        }
+        network
+    }
+
+    /// A network without prefilter whose layers' names begin with `prefix`.
+    fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
-        let rng = &mut Rng::new(seed, 0);
         let encoders = [
-            Encoder::new(rng, "encoder.radiance", RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, "encoder.guide", GUIDE_CHANNELS, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
         let decoder = (0..LEVELS).rev().map(|level| {
             let (width, skip) = (decoder_width(level), widths[level]);
             let up = (level + 1 < LEVELS).then(|| {
-                Conv::transposed(rng, &format!("decoder.{level}.up"), decoder_width(level + 1), width)
+                let name = format!("{prefix}decoder.{level}.up");
+                Conv::transposed(rng, &name, decoder_width(level + 1), width)
             });
             let mut sources = vec![skip, skip];
             sources.extend(up.iter().map(|_| width));
-            let name = format!("decoder.{level}");
+            let name = format!("{prefix}decoder.{level}");
             Level {
                 up,
                 fuse: Conv::new(rng, &format!("{name}.fuse"), &sources, width, 1, Init::Xavier),
@@ -179,15 +204,25 @@ impl Pyramid {
         });
         let decoder = decoder.collect();
         let mut head = |name: String, width: usize, channels: usize| {
-            Conv::new(rng, &name, &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
+            Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
             full: head("head.full".into(), decoder_width(0), 4 * FULL_HEAD),
             heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
-            config: config.clone(),
+            config,
+            prefilter: None,
             encoders,
             decoder,
         }
+    }
+
+    /// A frame with its albedo denoised, where there is a prefilter.
+    fn prefiltered(&self, passes: &PassSet) -> Result<Option<PassSet>> {
+        let Some(prefilter) = &self.prefilter else { return Ok(None) };
+        let albedo = bands::infer(prefilter, &albedo_as_radiance(passes, NEEDED_BY)?, None)?;
+        let mut passes = passes.rows(self.passes(), 0..passes.height);
+        passes.insert(Pass::DenoisingAlbedo, radiance_as_albedo(albedo));
+        Ok(Some(passes))
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
@@ -280,7 +315,7 @@ impl Network for Pyramid {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
-        guides(passes, "this model")
+        guides(self.prefiltered(passes)?.as_ref().unwrap_or(passes), NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {
@@ -291,12 +326,17 @@ impl Network for Pyramid {
         let encoders = self.encoders.iter_mut().flat_map(|e| e.levels.iter_mut().flatten());
         let decoder =
             self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
-        encoders.chain(decoder).chain([&mut self.full]).chain(&mut self.heads).collect()
+        let heads = [&mut self.full].into_iter().chain(&mut self.heads);
+        let prefilter = self.prefilter.iter_mut().flat_map(|prefilter| prefilter.convolutions());
+        encoders.chain(decoder).chain(heads).chain(prefilter).collect()
     }
 
     fn freeze(&mut self) {
         if self.full.arithmetic().precision != Precision::Int8 {
             return self.convolutions().into_iter().for_each(|conv| conv.freeze(&[]));
+        }
+        if let Some(prefilter) = &mut self.prefilter {
+            prefilter.freeze();
         }
         // Every layer takes in the steps of what it reads.
         for encoder in &mut self.encoders {
@@ -343,13 +383,15 @@ impl Network for Pyramid {
             .sum();
         // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
         let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
-        convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64
+        let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
+        convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64 + prefilter
     }
 
     fn reach(&self) -> usize {
         // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
         let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
-        trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>()
+        let prefilter = self.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
+        trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>() + prefilter
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {

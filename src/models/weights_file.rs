@@ -4,7 +4,10 @@ use std::{collections::BTreeMap, path::Path};
 
 use serde::{Deserialize, Serialize};
 
-use super::network::{Config, Network};
+use super::{
+    network::{Architecture, Config, Network},
+    pyramid::PREFILTER,
+};
 use crate::{
     Error, Result,
     nn::{
@@ -124,6 +127,45 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
         ));
     }
     Ok(network)
+}
+
+/// The widths of the prefilter that a weights file can give: that of its network, or its network itself.
+///
+/// # Errors
+/// As [`read`], or it is no network that can prefilter.
+pub fn prefilter_widths(path: &Path) -> Result<Vec<usize>> {
+    let Config { architecture, widths, prefilter } = config(path)?;
+    if architecture != Architecture::Pyramid {
+        return Err(Error::invalid(path, "cannot prefilter; take weights of demc-s or narrower, trained on albedo"));
+    }
+    Ok(if prefilter.is_empty() { widths } else { prefilter })
+}
+
+/// Gives a network the prefilter that the bytes of a weights file hold; `path` is for messages.
+///
+/// # Errors
+/// As [`read`], or it is not what [`prefilter_widths`] says.
+pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Result<()> {
+    let (_, tensors) = metadata(bytes, path)?;
+    // A network trained on albedo is a prefilter under its own names.
+    let within = tensors.iter().any(|t| t.name.starts_with(PREFILTER));
+    for param in network.params() {
+        let Some(name) = param.name.strip_prefix(PREFILTER) else { continue };
+        let name = if within { &param.name } else { name };
+        match tensors.iter().find(|t| t.name == name && t.shape == param.shape) {
+            Some(tensor) => param.set(&tensor.values),
+            None => return Err(Error::invalid(path, format!("holds no {name} of shape {:?}", param.shape))),
+        }
+    }
+    Ok(())
+}
+
+/// The configuration of the network in a weights file.
+///
+/// # Errors
+/// As [`read`].
+pub fn config(path: &Path) -> Result<Config> {
+    Ok(metadata(&std::fs::read(path).map_err(Error::io("read", path))?, path)?.0.network)
 }
 
 /// The metadata and the tensors of a weights file.

@@ -20,7 +20,7 @@ use crate::{
     features::Inputs,
     metrics,
     models::{
-        self,
+        self, learned,
         network::{Config, Network, stack},
         weights_file::{self, Facts},
     },
@@ -64,6 +64,9 @@ pub struct Options {
     pub seed: u64,
     /// A weights file to begin with, instead of weights drawn from the seed.
     pub init: Option<PathBuf>,
+    /// The weights file whose prefilter the network gets, if not the built-in one or that of `init`.
+    #[serde(default)]
+    pub prefilter: Option<PathBuf>,
 }
 
 /// What the caller hears of.
@@ -101,6 +104,7 @@ pub fn run(
         Some(path) => weights_file::read_as(path, &options.network, options.seed)?,
         None => models::build(&options.network, options.seed),
     };
+    set_prefilter(&mut *network, options)?;
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
     let mut optimizer = Optimizer::new(options.optimizer);
@@ -164,6 +168,29 @@ pub fn run(
         }
     }
     Ok(())
+}
+
+/// The built-in model whose prefilter others get.
+const PREFILTERED: &str = "demc-m";
+
+/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one.
+fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
+    let wanted = &options.network.prefilter;
+    if wanted.is_empty() {
+        return Ok(());
+    }
+    if let Some(path) = &options.prefilter {
+        let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+        return weights_file::set_prefilter(network, &bytes, path);
+    }
+    if let Some(path) = &options.init
+        && weights_file::config(path)?.prefilter == *wanted
+    {
+        return Ok(());
+    }
+    let built_in = learned::BUILT_IN.into_iter().find(|(name, _)| *name == PREFILTERED);
+    let (name, bytes) = built_in.expect("it is built in");
+    weights_file::set_prefilter(network, bytes, Path::new(name))
 }
 
 /// The crops of a step, each from its own stream of the seed.

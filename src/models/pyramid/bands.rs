@@ -8,10 +8,12 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{ALBEDO_KERNEL, KERNEL, LEVELS, Prediction, Pyramid};
+use super::{ALBEDO_KERNEL, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
 use crate::{
     Result,
-    features::{Inputs, exposure, guides_exposed},
+    features::{
+        Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo,
+    },
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -30,37 +32,88 @@ const BAND_PIXELS: usize = 1 << 17;
 /// # Errors
 /// A pass is missing.
 pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<Planes> {
-    let multiple = network.multiple();
     let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
-    let (width, height) = (passes.width.next_multiple_of(multiple), passes.height.next_multiple_of(multiple));
-    let rows = rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple;
-    let rows = rows.max(multiple);
-    let mut frame = Frame::new(network, height, rows);
+    let multiple = network.multiple();
+    let width = passes.width.next_multiple_of(multiple);
+    let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
+    let bands = (0..passes.height).step_by(rows).map(|y| y..(y + rows).min(passes.height));
     let mut image = Planes::new(3, passes.width, passes.height);
-    for y in (0..height).step_by(rows) {
-        let band = passes.rows(network.passes(), y..(y + rows).min(passes.height));
-        let inputs = guides_exposed(&band, exposure, NEEDED_BY)?.padded(multiple);
-        let mut done = |first: usize, field: &Field| {
-            let (_, _, h, w) = field.extent();
-            for (c, plane) in field.values().chunks(h * w).enumerate() {
-                let first = first.min(passes.height) * passes.width;
-                let into = image.channel_mut(c)[first..].chunks_mut(passes.width);
-                for (into, from) in into.zip(plane.chunks(w)) {
-                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * inputs.scale);
-                }
-            }
-        };
-        frame.push(&inputs);
-        frame.advance(&mut done);
-        while frame.is_whole() && !frame.is_done() {
-            frame.advance(&mut done);
+    let mut write = |first: usize, part: Planes| {
+        for c in 0..3 {
+            image.channel_mut(c)[first * part.width..][..part.pixels()].copy_from_slice(part.channel(c));
+        }
+        Ok(())
+    };
+    let mut radiance = Feed::new(network, passes, exposure, rows);
+    if let Some(prefilter) = &network.prefilter {
+        let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+        let mut albedo = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
+        for band in bands {
+            let band = albedo_as_radiance(&passes.rows(network.passes(), band), NEEDED_BY)?;
+            // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
+            albedo.push(&band, &mut |first, clean| {
+                let mut band = passes.rows(network.passes(), first..first + clean.height);
+                band.insert(Pass::DenoisingAlbedo, radiance_as_albedo(clean));
+                radiance.push(&band, &mut write)
+            })?;
+        }
+    } else {
+        for band in bands {
+            radiance.push(&passes.rows(network.passes(), band), &mut write)?;
         }
     }
     Ok(image)
 }
 
-/// Who asks for passes, in messages.
-const NEEDED_BY: &str = "this model";
+/// A frame that comes in band by band and leaves denoised.
+struct Feed<'a> {
+    frame: Frame<'a>,
+    exposure: f32,
+    /// Columns and rows of the frame, and with padding.
+    size: (usize, usize),
+    padded: (usize, usize),
+    /// Rows that have come.
+    rows: usize,
+}
+
+impl<'a> Feed<'a> {
+    fn new(network: &'a Pyramid, passes: &PassSet, exposure: f32, band: usize) -> Self {
+        let size = (passes.width, passes.height);
+        let padded = (size.0.next_multiple_of(network.multiple()), size.1.next_multiple_of(network.multiple()));
+        Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
+    }
+
+    /// Takes in the next rows, an even number unless they are the last, and hands out what is denoised with it:
+    /// its first row, and radiance.
+    fn push(&mut self, band: &PassSet, done: &mut dyn FnMut(usize, Planes) -> Result<()>) -> Result<()> {
+        let before = self.rows;
+        self.rows += band.height;
+        let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
+        let inputs = guides_exposed(band, self.exposure, NEEDED_BY)?.padded_to(self.padded.0, end - before);
+        let (width, height) = self.size;
+        let mut result = Ok(());
+        let mut hand_out = |first: usize, field: &Field| {
+            let (_, _, h, w) = field.extent();
+            let rows = h.min(height.saturating_sub(first));
+            if rows == 0 || result.is_err() {
+                return;
+            }
+            let mut part = Planes::new(3, width, rows);
+            for (c, plane) in field.values().chunks(h * w).enumerate() {
+                for (into, from) in part.channel_mut(c).chunks_mut(width).zip(plane.chunks(w)) {
+                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * inputs.scale);
+                }
+            }
+            result = done(first, part);
+        };
+        self.frame.push(&inputs);
+        self.frame.advance(&mut hand_out);
+        while self.frame.is_whole() && !self.frame.is_done() {
+            self.frame.advance(&mut hand_out);
+        }
+        result
+    }
+}
 
 /// All that is under way in a frame.
 struct Frame<'a> {
