@@ -140,7 +140,7 @@ fn base16(precision: Precision) -> Box<dyn Network> {
 }
 
 fn paper_network(widths: Vec<usize>, precision: Precision) -> Box<dyn Network> {
-    let mut network = models::build(&Config { architecture: Architecture::Demc, widths }, 1);
+    let mut network = models::build(&Config::new(Architecture::Demc, &widths), 1);
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(precision));
     network
 }

@@ -1,7 +1,7 @@
 //! The networks as contracts: sizes of the paper's, reach and scaling of the built-in ones.
 
 use demc::{
-    features::Inputs,
+    features::{self, Inputs},
     models::{
         self,
         demc::{Demc, PAPER_WIDTHS, semc_widths},
@@ -122,29 +122,77 @@ fn tiles_give_the_same_bits_as_the_whole_frame() {
 
 #[test]
 fn bands_give_the_same_bits_as_the_whole_frame() {
-    let mut network = models::build(&Config { widths: vec![40, 20, 33, 8], ..trainable("demc-s") }, 3);
+    let plain = Config { widths: vec![40, 20, 33, 8], ..trainable("demc-s") };
+    let prefiltered = Config { prefilter: vec![9, 16, 8, 8], ..plain.clone() };
     let (width, height) = (70, 731);
     let passes = random_passes(width, height, 12);
-    for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
-        for conv in network.convolutions() {
-            conv.set_precision(precision);
-            conv.range = Some(3.0);
-        }
-        if precision == Precision::Int8 {
-            network.freeze(); // takes in ranges
-        }
-        // The network's own forward pass over all of the frame is what the plan must equal.
-        let inputs = network.inputs(&passes).expect("all passes are there").padded(network.multiple());
-        let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);
-        let whole = network.forward(&stack(std::slice::from_ref(&inputs)), &mut Stats::Running).as_vec();
-        let mut whole = Planes::from_vec(3, w, h, whole).window((0, 0), (width, height));
-        whole.data.iter_mut().for_each(|v| *v *= inputs.scale);
-        network.freeze();
-        for rows in [Some(1), Some(48), Some(300), None] {
-            let image = network.infer(&passes, rows).expect("all passes are there");
-            assert!(image == whole, "bands of {rows:?} rows, {precision:?}");
+    for config in [plain, prefiltered] {
+        let mut network = models::build(&config, 3);
+        for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
+            for conv in network.convolutions() {
+                conv.set_precision(precision);
+                conv.range = Some(3.0);
+            }
+            if precision == Precision::Int8 {
+                network.freeze(); // takes in ranges
+            }
+            // The network's own forward pass over all of the frame is what the plan must equal.
+            let inputs = network.inputs(&passes).expect("all passes are there").padded(network.multiple());
+            let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);
+            let whole = network.forward(&stack(std::slice::from_ref(&inputs)), &mut Stats::Running).as_vec();
+            let mut whole = Planes::from_vec(3, w, h, whole).window((0, 0), (width, height));
+            whole.data.iter_mut().for_each(|v| *v *= inputs.scale);
+            network.freeze();
+            for rows in [Some(1), Some(48), Some(300), None] {
+                let image = network.infer(&passes, rows).expect("all passes are there");
+                assert!(image == whole, "bands of {rows:?} rows, {precision:?}, {config}");
+            }
         }
     }
+}
+
+#[test]
+fn a_prefilter_does_what_its_network_does_alone() {
+    let own = Config { widths: vec![9, 16, 8, 8], ..trainable("demc-s") };
+    let config = Config { widths: vec![8, 20, 8, 8], prefilter: own.widths.clone(), ..own.clone() };
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let mut alone = models::build(&own, 5);
+    weights_file::write(&path("albedo.safetensors"), &mut *alone, &facts()).unwrap();
+    assert_eq!(weights_file::prefilter_widths(&path("albedo.safetensors")).unwrap(), own.widths);
+    let mut network = models::build(&config, 6);
+    let set = |network: &mut dyn Network, file: &str| {
+        weights_file::set_prefilter(network, &std::fs::read(path(file)).unwrap(), &path(file))
+    };
+    set(&mut *network, "albedo.safetensors").unwrap();
+    assert!(network.params().iter().all(|p| p.trainable != p.name.starts_with("prefilter.")));
+
+    let passes = random_passes(50, 90, 4);
+    let lit = features::albedo_as_radiance(&passes, "the test").unwrap();
+    let clean = features::radiance_as_albedo(alone.infer(&lit, None).unwrap());
+    assert_ne!(Some(&clean), passes.get(Pass::DenoisingAlbedo));
+    assert!(clean.data.iter().all(|a| (0.0..=1.0).contains(a)));
+    let mut cleaned = passes.clone();
+    cleaned.insert(Pass::DenoisingAlbedo, clean);
+    weights_file::write(&path("whole.safetensors"), &mut *network, &facts()).unwrap();
+    let main =
+        weights_file::read_as(&path("whole.safetensors"), &Config { prefilter: vec![], ..config.clone() }, 1);
+    let [whole, parts] =
+        [network.infer(&passes, None), main.unwrap().infer(&cleaned, None)].map(Result::unwrap);
+    // The file holds halves of what the network holds.
+    for (a, b) in whole.data.iter().zip(&parts.data) {
+        assert!((a - b).abs() <= 2e-3 * a.abs() + 1e-4, "{a} became {b}");
+    }
+
+    // The prefilter of a whole network serves others; one of other widths does not.
+    let mut other = models::build(&config, 7);
+    set(&mut *other, "whole.safetensors").unwrap();
+    for (a, b) in other.params().iter().zip(network.params()).filter(|(a, _)| !a.trainable) {
+        assert!(a.values().iter().zip(b.values()).all(|(a, b)| (a - b).abs() < 1e-3), "{}", a.name);
+    }
+    let mut wider = models::build(&Config { prefilter: vec![9, 16, 8, 16], ..config }, 7);
+    let error = set(&mut *wider, "albedo.safetensors").unwrap_err().to_string();
+    assert!(error.contains("albedo.safetensors") && error.contains("of shape"), "{error}");
 }
 
 #[test]
@@ -212,7 +260,7 @@ fn trainable(name: &str) -> Config {
 
 #[test]
 fn kpcn_has_its_published_size() {
-    let config = Config { architecture: Architecture::Kpcn, widths: vec![PUBLISHED_WIDTH] };
+    let config = Config::new(Architecture::Kpcn, &[PUBLISHED_WIDTH]);
     let mut network = models::build(&config, 1);
     // By hand: nine 5x5 convolutions from 34 channels over 100 to 21 x 21 weights, twice.
     let conv = |i: usize, o: usize| 25 * i * o + o;
@@ -274,14 +322,9 @@ fn a_constant_image_stays_as_it_is() {
     assert!(image.data.iter().all(|v| (v - 0.7).abs() < 1e-4), "{:?}", &image.data[..8]);
 }
 
-#[test]
-fn a_wider_network_begins_as_the_narrower_one() {
-    let config = |widths: [usize; 4]| Config { architecture: Architecture::Pyramid, widths: widths.into() };
-    let (narrow, wide) = (config([3, 5, 4, 6]), config([4, 5, 9, 17]));
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("narrow.safetensors");
-    let mut network = models::build(&narrow, 5);
-    let facts = Facts {
+/// Something to write into a file.
+fn facts() -> Facts {
+    Facts {
         frames: 1,
         steps: 1,
         batch: 1,
@@ -295,8 +338,17 @@ fn a_wider_network_begins_as_the_narrower_one() {
         validation_frames: 0,
         validation_relmse: None,
         validation_ssim: None,
-    };
-    weights_file::write(&path, &mut *network, &facts).unwrap();
+    }
+}
+
+#[test]
+fn a_wider_network_begins_as_the_narrower_one() {
+    let config = |widths: [usize; 4]| Config::new(Architecture::Pyramid, &widths);
+    let (narrow, wide) = (config([3, 5, 4, 6]), config([4, 5, 9, 17]));
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("narrow.safetensors");
+    let mut network = models::build(&narrow, 5);
+    weights_file::write(&path, &mut *network, &facts()).unwrap();
     let mut passes = PassSet::new(std::path::Path::new("x"), "ViewLayer", 40, 24);
     let mut rng = Rng::new(3, 0);
     for pass in [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo] {

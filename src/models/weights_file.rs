@@ -136,7 +136,10 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
 pub fn prefilter_widths(path: &Path) -> Result<Vec<usize>> {
     let Config { architecture, widths, prefilter } = config(path)?;
     if architecture != Architecture::Pyramid {
-        return Err(Error::invalid(path, "cannot prefilter; take weights of demc-s or narrower, trained on albedo"));
+        return Err(Error::invalid(
+            path,
+            "cannot prefilter; take weights of demc-s or narrower, trained on albedo",
+        ));
     }
     Ok(if prefilter.is_empty() { widths } else { prefilter })
 }

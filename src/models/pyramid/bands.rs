@@ -11,9 +11,7 @@ use dfdx::tensor::NoneTape;
 use super::{ALBEDO_KERNEL, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
 use crate::{
     Result,
-    features::{
-        Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo,
-    },
+    features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo},
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -79,7 +77,8 @@ struct Feed<'a> {
 impl<'a> Feed<'a> {
     fn new(network: &'a Pyramid, passes: &PassSet, exposure: f32, band: usize) -> Self {
         let size = (passes.width, passes.height);
-        let padded = (size.0.next_multiple_of(network.multiple()), size.1.next_multiple_of(network.multiple()));
+        let padded =
+            (size.0.next_multiple_of(network.multiple()), size.1.next_multiple_of(network.multiple()));
         Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
     }
 
