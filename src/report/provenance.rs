@@ -8,7 +8,7 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use crate::kernels::simd::Tier;
+use crate::{kernels::simd::Tier, nn::Precision};
 
 /// The program, the machine, and the command.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -24,7 +24,7 @@ pub struct Provenance {
     pub cpu: String,
     /// Logical processors that the process may use.
     pub cores: usize,
-    /// Instructions that the kernels use: AVX-512, AVX2 or portable.
+    /// Instructions that the kernels use, AVX-512, AVX2 or portable, and what networks round their factors to.
     pub instructions: String,
     /// Operating system and architecture.
     pub system: String,
@@ -42,11 +42,23 @@ impl Provenance {
             commit: option_env!("DEMC_COMMIT").map(Into::into),
             cpu: cpu(),
             cores: std::thread::available_parallelism().map_or(1, usize::from),
-            instructions: format!("{:?}", Tier::detect()).to_lowercase(),
+            instructions: instructions(),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             started: utc(seconds),
         }
     }
+}
+
+/// See [`Provenance::instructions`].
+fn instructions() -> String {
+    let tier = Tier::detect();
+    match [Precision::fastest(true), Precision::fastest(false)] {
+        [built_in, others] if built_in != others => {
+            format!("{tier:?}, {built_in:?} (built-in), {others:?} (others)")
+        }
+        [all, _] => format!("{tier:?}, {all:?}"),
+    }
+    .to_lowercase()
 }
 
 /// The processor's name, where the system tells.

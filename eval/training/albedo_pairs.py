@@ -1,0 +1,61 @@
+"""Makes pairs on which `demc train` makes a prefilter: albedo in the place of radiance.
+
+    python albedo_pairs.py PAIRS... --out OUT
+
+Of each <scene>_<spp>spp.exr and <scene>_ref.exr, Combined becomes what Denoising Albedo was, within 0 to 1 and as much
+brighter as radiance is later divided by, and Denoising Albedo becomes 1. References must hold their albedo, as those of
+generate_scenes.py do; scenes whose references do not are left out. What is there already is kept.
+"""
+
+import argparse
+import glob
+import os
+
+import numpy as np
+
+from clean_references import exr, planes
+
+ALBEDO_FLOOR = 0.05  # src/features.rs
+KEPT = ("Combined", "Denoising Normal", "Denoising Albedo")
+
+
+def convert(source, target):
+    """Writes one frame or reference; returns whether it holds an albedo."""
+    channels = exr.read(source)
+    try:
+        albedo, albedo_names = planes(channels, "Denoising Albedo", "RGB")
+        _, radiance_names = planes(channels, "Combined", "RGB")
+    except ValueError:
+        return False
+    kept = {name: values for name, values in channels.items() if name.rsplit(".", 1)[0].endswith(KEPT)}
+    for c, name in enumerate(radiance_names):
+        kept[name] = np.clip(albedo[..., c], 0, 1) + ALBEDO_FLOOR
+    kept.update({name: np.ones_like(albedo[..., 0]) for name in albedo_names})
+    exr.write_half(target + ".tmp", kept)
+    os.replace(target + ".tmp", target)
+    return True
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="albedo_pairs.py", description="Puts albedo in the place of radiance.")
+    parser.add_argument("pairs", nargs="+", help="folders of <scene>_<spp>spp.exr and <scene>_ref.exr")
+    parser.add_argument("--out", required=True, help="folder for the new pairs")
+    options = parser.parse_args()
+    os.makedirs(options.out, exist_ok=True)
+    for folder in options.pairs:
+        for reference in sorted(glob.glob(os.path.join(glob.escape(folder), "*_ref.exr"))):
+            scene = os.path.basename(reference).removesuffix("_ref.exr")
+            target = os.path.join(options.out, os.path.basename(reference))
+            noisy = sorted(glob.glob(os.path.join(glob.escape(folder), glob.escape(scene) + "_[0-9]*spp*.exr")))
+            if not noisy or not (os.path.exists(target) or convert(reference, target)):
+                continue
+            for path in noisy:
+                target = os.path.join(options.out, os.path.basename(path))
+                if not os.path.exists(target):
+                    convert(path, target)
+            print(scene, flush=True)
+
+
+if __name__ == "__main__":
+    main()
