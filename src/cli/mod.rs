@@ -50,6 +50,7 @@ pub const USAGE: u8 = 2;
 
 /// Parses the process arguments and runs the subcommand.
 pub fn main() -> ExitCode {
+    crate::kernels::heap::keep_freed();
     let done = match Cli::parse().command {
         Command::Denoise(args) => denoise::run(args),
         Command::Train(args) => train::run(&args),
