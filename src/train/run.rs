@@ -271,7 +271,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
             ssims.extend(metrics::ssim::ssim(&display(image), &display(reference)));
         }
     }
-    if frames.len() > 0 {
+    if !frames.is_empty() {
         for (layer, observed) in trained.convolutions().into_iter().zip(network.convolutions()) {
             layer.range = observed.observed();
         }
