@@ -111,16 +111,12 @@ impl Engine {
         unsafe {
             match (self.0, format) {
                 #[cfg(target_arch = "x86_64")]
-                (Unit::Vnni | Unit::Avx512, Format::Int8 { .. }) => {
+                (unit, Format::Int8 { .. }) if unit != Unit::Portable => {
                     avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
                 (Unit::Avx512, Format::Bf16) => {
                     avx512::multiply_bf16((terms, groups), position, weights, (outputs, plane), sums);
-                }
-                #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-                (Unit::Amx, Format::Int8 { .. }) => {
-                    avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
                 (Unit::Amx, Format::Bf16) => {
@@ -421,21 +417,29 @@ mod avx512 {
         terms: (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
-        (outputs, plane): (usize, usize),
+        outputs: (usize, usize),
         sums: &mut Sums,
     ) {
         // SAFETY: the caller's promise.
-        unsafe {
-            if outputs == 2 {
-                tiles::<Bf16, 2>(terms, position, weights, plane, sums);
-            } else {
-                tiles::<Bf16, 1>(terms, position, weights, plane, sums);
-            }
-        }
+        unsafe { multiply::<Bf16>(terms, position, weights, outputs, sums) }
     }
 
     #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
     pub unsafe fn multiply_int8(
+        terms: (&[Term], &[u8]),
+        position: usize,
+        weights: *const Wide,
+        outputs: (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe { multiply::<Int8>(terms, position, weights, outputs, sums) }
+    }
+
+    /// # Safety
+    /// As [`Engine::multiply`], and the processor has the instructions of `P`.
+    #[inline(always)]
+    unsafe fn multiply<P: Product>(
         terms: (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
@@ -445,9 +449,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<Int8, 2>(terms, position, weights, plane, sums);
+                tiles::<P, 2>(terms, position, weights, plane, sums);
             } else {
-                tiles::<Int8, 1>(terms, position, weights, plane, sums);
+                tiles::<P, 1>(terms, position, weights, plane, sums);
             }
         }
     }
