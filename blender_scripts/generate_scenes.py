@@ -49,7 +49,8 @@ def parse(arguments):
         epilog=f"Kinds: {', '.join(KINDS)}, and with --blend the names of its scenes.")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pairs")
     parser.add_argument("--seeds", required=True, type=cl.seed_range, metavar="A:B", help="scenes A to B-1")
-    parser.add_argument("--assets", metavar="DIR", help="models, textures, HDRIs and pictures to furnish with")
+    parser.add_argument("--assets", action="append", default=[], metavar="DIR",
+                        help="models, textures, HDRIs and pictures to furnish with; may be repeated")
     parser.add_argument("--blend", metavar="DIR", help="also render random views of the .blend scenes below DIR")
     parser.add_argument("--blend-share", type=float, default=0.3, metavar="F",
                         help="share of seeds that go to --blend scenes (default 0.3)")
@@ -72,10 +73,10 @@ def parse(arguments):
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--stop-file", metavar="PATH", help="stop before the next scene once this file exists")
     options = parser.parse_args(arguments)
-    for name in ("assets", "blend"):
-        folder = getattr(options, name)
-        if folder and not os.path.isdir(folder):
-            parser.error(f"{folder}: no such folder (--{name})")
+    for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
+        for folder in folders:
+            if not os.path.isdir(folder):
+                parser.error(f"{folder}: no such folder (--{name})")
     options.blends = find_blends(options.blend) if options.blend else {}
     known = set(KINDS) | set(options.blends)
     options.kinds = options.kinds.split(",") if options.kinds else sorted(known)

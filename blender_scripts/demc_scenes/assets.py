@@ -1,6 +1,6 @@
-"""The folder given by --assets: models, texture sets, environments and pictures.
+"""The folders given by --assets: models, texture sets, environments and pictures.
 
-Layout: models/*.glb (metres, standing on z = 0), textures/NAME/{color,normal,rough,metal}.*,
+Layout of each: models/*.glb (metres, standing on z = 0), textures/NAME/{color,normal,rough,metal}.*,
 hdri/*.exr|hdr, pictures/*.jpg|png; models.tsv and images.tsv tell categories and are optional:
 without them the file name decides. Without a folder every list is empty, and callers fall back to
 procedural content.
@@ -44,15 +44,15 @@ def _role(name, category):
 
 
 class Library:
-    """What the assets folder holds; empty lists without a folder. Names are sorted, so a seed picks
+    """What the assets folders hold; empty lists without a folder. Names are sorted, so a seed picks
     the same thing on every machine."""
 
-    def __init__(self, folder=None):
+    def __init__(self, folders=()):
         self.models, self.textures, self.environments, self.pictures = [], {}, [], []
-        if folder is None:
-            return
-        if not os.path.isdir(folder):
-            raise ValueError(f"{folder}: no such folder (--assets)")
+        for folder in folders:
+            self._read(folder)
+
+    def _read(self, folder):
         rows = _table(os.path.join(folder, "models.tsv"))
         for name, path in _files(os.path.join(folder, "models"), (".glb", ".gltf")):
             row = rows.get(name, {})
@@ -61,7 +61,7 @@ class Library:
         self._read_textures(os.path.join(folder, "textures"), kinds)
         for name, path in _files(os.path.join(folder, "hdri"), (".exr", ".hdr")):
             self.environments.append((path, f"{name} {kinds.get(name, '')}".lower()))
-        self.pictures = [path for _, path in _files(os.path.join(folder, "pictures"), _IMAGES)]
+        self.pictures += [path for _, path in _files(os.path.join(folder, "pictures"), _IMAGES)]
 
     def _read_textures(self, folder, kinds):
         for name in sorted(os.listdir(folder)) if os.path.isdir(folder) else []:
