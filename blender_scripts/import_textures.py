@@ -54,6 +54,8 @@ def store(path, target):
     image = bpy.data.images.load(path)
     try:
         size = tuple(image.size)
+        if 0 in size:
+            raise ValueError("not an image")
         pixels = np.array(image.pixels[:], np.float32).reshape(-1, image.channels)
         holes = image.channels == 4 and np.mean(pixels[:, 3] < 0.9) > 0.01
         if min(size) < _SIDE[0] or max(size) > 4 * min(size) or holes:
@@ -79,7 +81,7 @@ def main():
             name = re.sub(r"\W+", "_", "_".join(place.split(os.sep)[-2:]).lower())
             try:
                 kept = store(path, os.path.join(options.out, "textures", f"{kind}_{name}", "color.jpg"))
-            except RuntimeError as error:  # one bad image must not cost the others
+            except (RuntimeError, ValueError) as error:  # one bad image must not cost the others
                 print(f"{path}: left out, {' '.join(str(error).split())}")
                 kept = False
             stored, passed = stored + kept, passed + (not kept)

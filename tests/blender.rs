@@ -266,3 +266,25 @@ fn builds_every_kind_of_scene_without_assets() {
         assert!(meshes >= 3, "{kind}");
     }
 }
+
+#[test]
+fn makes_assets_of_furniture_libraries_and_of_images() {
+    let folder = tempfile::tempdir().unwrap();
+    run(blender().arg(snippet("make_furniture.py")).arg(folder.path()));
+    let [furniture, textures] = ["furniture", "textures"].map(|name| folder.path().join(name));
+    let import = |name: &str, out: &Path, from: &str| {
+        run(blender().arg(script(name)).arg("--out").arg(out).arg(folder.path().join(from)))
+    };
+    let said = import("import_furniture.py", &furniture, "library.sh3f");
+    assert!(said.contains("test_maker_nothing: left out"), "{said}");
+    assert!(said.contains("1 models in") && said.contains("1 left out"), "{said}");
+    let said = import("import_textures.py", &textures, "images");
+    assert!(said.contains("brick_broken.jpg: left out"), "{said}");
+    assert!(said.contains("1 textures in") && said.contains("2 of fitting names left out"), "{said}");
+
+    let said = run(blender().arg(snippet("use_assets.py")).arg(script("")).arg(&furniture).arg(&textures));
+    let table = "MODEL test_maker_lowtable table 1.20 0.60 0.45 from 0.00: solid clear";
+    assert!(said.contains(table) && said.contains("TEXTURE brick 1 512"), "{said}");
+    let index = fs::read_to_string(furniture.join("models.tsv")).unwrap();
+    assert!(index.contains("test_maker_lowtable\tfurniture\t1.2\tTest library\tSomebody\tCC0"), "{index}");
+}
