@@ -1,7 +1,7 @@
 //! Removes Monte Carlo noise from Blender Cycles renders stored as multilayer EXR.
 //!
 //! Modules point downwards only:
-//! [`cli`] dispatches; [`report`] scores methods over a test set; [`train`] fits weights;
+//! [`cli`] dispatches; [`stability`] changes inputs and [`report`] scores methods over a test set; [`train`] fits weights;
 //! [`models`] holds every denoising method behind one trait; [`nn`] is differentiable image
 //! operations on dfdx's tape; [`filters`] are classical building blocks; [`features`] turns passes into network inputs; [`passes`] says what
 //! a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions;
@@ -21,6 +21,7 @@ pub mod nn;
 pub mod passes;
 pub mod planes;
 pub mod report;
+pub mod stability;
 pub mod testset;
 pub mod train;
 

@@ -1,21 +1,15 @@
 //! `demc eval`: methods against references, with times, tables, charts and comparison sheets.
 
-use std::{
-    collections::HashSet,
-    io::IsTerminal,
-    path::{Path, PathBuf},
-    process::ExitCode,
-};
+use std::{collections::HashSet, io::IsTerminal, path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{SOME_FAILED, peak_memory};
+use super::{SOME_FAILED, methods};
 use crate::{
     Error, Result,
-    models::{self, Denoiser, oidn::Oidn},
-    report::{self, Event, Method, NOISY, Options, Row},
-    testset::{self, Unmatched},
+    report::{self, Event, Method, Options, Row},
+    testset,
 };
 
 /// Arguments of `demc eval`.
@@ -59,22 +53,10 @@ pub struct Args {
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: Args) -> Result<ExitCode> {
     let set = testset::read(&args.test_set)?;
-    let threads = args
-        .threads
-        .map(usize::from)
-        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-    let methods = methods(&args, threads)?;
+    let threads = methods::count(args.threads);
+    let methods = methods::open(&args.models, args.oidn.as_deref(), args.view_layer.as_deref(), threads)?;
     let baseline = baseline(&args, &methods)?;
-    let mut failed = 0;
-    for unmatched in &set.unmatched {
-        match unmatched {
-            Unmatched::Noisy { .. } => {
-                failed += 1;
-                eprintln!("demc: {unmatched}");
-            }
-            Unmatched::Reference(_) => eprintln!("warning: {unmatched}"),
-        }
-    }
+    let mut failed = methods::tell_unmatched(&set);
     let options = Options {
         out: args.out,
         repeats: args.repeats.into(),
@@ -84,10 +66,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         overwrite: args.overwrite,
         sheets: !args.no_sheets,
     };
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build()
-        .map_err(|e| Error::Usage(format!("cannot start {threads} threads: {e}; use fewer")))?;
+    let pool = methods::threads(threads)?;
     let mut progress = Progress::new();
     let rows = pool
         .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
@@ -103,60 +82,12 @@ pub fn run(args: Args) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The methods asked for, the noisy input first, each under a name of its own.
-fn methods(args: &Args, threads: usize) -> Result<Vec<Method>> {
-    // Built-in methods change with the program.
-    let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
-    let asked = args.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
-    let mut seen = HashSet::new();
-    let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
-    let mut methods = Vec::new();
-    for name in &asked {
-        let denoiser: Box<dyn Denoiser> = match Oidn::new(name, args.oidn.clone()) {
-            Some(oidn) => Box::new(oidn),
-            None => models::open(name)?,
-        };
-        let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
-        let (spec, view_layer) = (name.to_string(), args.view_layer.clone());
-        let peak_mib =
-            move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
-        methods.push(Method {
-            name: short_name(name, &asked),
-            denoiser,
-            peak_mib: Box::new(peak_mib),
-            stamp,
-        });
-    }
-    Ok(methods)
-}
-
-fn is_file(name: &str) -> bool {
-    Path::new(name).is_file()
-}
-
-/// A weights file goes by its stem, and by its folder too where the stem alone is another's.
-fn short_name(name: &str, all: &[&str]) -> String {
-    if !is_file(name) {
-        return name.into();
-    }
-    let stem = |name: &str| Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
-    let own = stem(name).unwrap_or_else(|| name.into());
-    let is_unique = all.iter().filter(|other| stem(other).as_ref() == Some(&own)).count() == 1;
-    if is_unique && own != "best" {
-        return own;
-    }
-    match Path::new(name).parent().and_then(Path::file_name) {
-        Some(folder) => format!("{}/{own}", folder.to_string_lossy()),
-        None => own,
-    }
-}
-
 fn baseline(args: &Args, methods: &[Method]) -> Result<String> {
     let Some(wanted) = &args.baseline else {
         return Ok(methods.get(1).unwrap_or(&methods[0]).name.clone());
     };
     let names: Vec<&str> = methods.iter().map(|m| m.name.as_str()).collect();
-    let wanted = short_name(wanted, &args.models.iter().map(String::as_str).collect::<Vec<_>>());
+    let wanted = methods::short_name(wanted, &args.models.iter().map(String::as_str).collect::<Vec<_>>());
     if !names.contains(&wanted.as_str()) {
         return Err(Error::Usage(format!(
             "--baseline {wanted} is not among the methods: {}; add it to --models",

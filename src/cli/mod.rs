@@ -5,8 +5,10 @@ mod denoise;
 mod eval;
 mod inputs;
 mod inspect;
+mod methods;
 mod models;
 mod peak_memory;
+mod stability;
 mod stop;
 mod train;
 
@@ -39,6 +41,8 @@ enum Command {
     /// RelMSE, SSIM, RMSE, maximum error ... of an image against a reference
     Compare(compare::Args),
     Models(models::Args),
+    /// How much results change when inputs go wrong: fireflies, NaN, missing guides, other exposure ...
+    Stability(stability::Args),
     #[command(name = peak_memory::COMMAND, hide = true)]
     PeakMemory(peak_memory::Args),
 }
@@ -58,6 +62,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => inspect::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Models(args) => models::run(&args),
+        Command::Stability(args) => stability::run(&args),
         Command::PeakMemory(args) => peak_memory::run(&args),
     };
     done.unwrap_or_else(|error| {

@@ -91,8 +91,11 @@ impl fmt::Display for Incomparable {
 
 impl std::error::Error for Incomparable {}
 
-/// Errors unless both images have one size and only finite values.
-fn check(image: &Planes, reference: &Planes) -> Result<(), Incomparable> {
+/// Whether metrics are defined on two images.
+///
+/// # Errors
+/// The sizes differ or a value is not finite.
+pub fn check(image: &Planes, reference: &Planes) -> Result<(), Incomparable> {
     let size = |p: &Planes| (p.channels, p.width, p.height);
     if size(image) != size(reference) {
         return Err(Incomparable::Size { image: size(image), reference: size(reference) });

@@ -37,14 +37,12 @@ const KERNEL: usize = 5;
 /// Rows and columns of the albedo kernels.
 const ALBEDO_KERNEL: usize = 3;
 
-/// Channels of a radiance level's head: kernel, confidence, and the mask that blends the level below.
-const HEAD: usize = KERNEL * KERNEL + 2;
+/// Channels of a level's head for each of its pixels: kernel, confidence, the mask that blends the level below, and the
+/// corners from which that is upsampled.
+const HEAD: usize = KERNEL * KERNEL + 2 + CORNERS;
 
-/// Channels of a trunk level's head: also the corners from which the level below is upsampled.
-const LEVEL_HEAD: usize = HEAD + CORNERS;
-
-/// Channels of the full-resolution head for one pixel: also the albedo kernel.
-const FULL_HEAD: usize = LEVEL_HEAD + ALBEDO_KERNEL * ALBEDO_KERNEL;
+/// What follows for each pixel at full resolution, but in a prefilter: the albedo kernel.
+const ALBEDO_TAPS: usize = ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -71,7 +69,7 @@ pub struct Pyramid {
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
-    /// Full resolution: radiance kernels, confidence, mask and albedo kernels of four pixels.
+    /// Full resolution: radiance kernels, confidence, mask, corners and albedo kernels of four pixels.
     full: Conv,
     /// One head a trunk level, finest first.
     heads: Vec<Conv>,
@@ -107,26 +105,25 @@ struct Prediction<T> {
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     /// What a trunk level's head says.
     fn of_level(head: Activation<T>) -> Self {
-        Self::split(head, 1, 0)
+        Self::split(head, 1)
     }
 
-    /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W).
-    fn of_full(head: Activation<T>) -> (Self, Field<T>) {
-        let albedo_taps = 4 * ALBEDO_KERNEL * ALBEDO_KERNEL;
-        let albedo_kernel = Field::from_activation(head.fork(), 4 * HEAD, albedo_taps, 2);
-        (Self::split(head, 2, albedo_taps), albedo_kernel)
+    /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W), if it has them.
+    fn of_full(head: Activation<T>) -> (Self, Option<Field<T>>) {
+        let has_albedo = head.shape().c > 4 * HEAD;
+        let albedo = has_albedo.then(|| Field::from_activation(head.fork(), 4 * HEAD, 4 * ALBEDO_TAPS, 2));
+        (Self::split(head, 2), albedo)
     }
 
     /// Parts a head's channels; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
-    /// `between` are the channels before the corners that are not of this.
-    fn split(head: Activation<T>, factor: usize, between: usize) -> Self {
+    fn split(head: Activation<T>, factor: usize) -> Self {
         let area = factor * factor;
         let taps = KERNEL * KERNEL * area;
         Self {
             kernel: Field::from_activation(head.fork(), 0, taps, factor),
             confidence: Field::from_activation(head.fork(), taps, area, factor),
             mask: Field::from_activation(head.fork(), taps + area, area, factor),
-            corners: Field::from_activation(head, HEAD * area + between, CORNERS * area, factor),
+            corners: Field::from_activation(head, taps + 2 * area, CORNERS * area, factor),
         }
     }
 }
@@ -178,7 +175,8 @@ impl Pyramid {
         network
     }
 
-    /// A network without prefilter whose layers' names begin with `prefix`.
+    /// A network without prefilter whose layers' names begin with `prefix`; if that is a prefilter's, without albedo
+    /// kernels, since the albedo that a prefilter multiplies by is white.
     fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
@@ -207,8 +205,12 @@ impl Pyramid {
             Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
-            full: head("head.full".into(), decoder_width(0), 4 * FULL_HEAD),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
+            full: head(
+                "head.full".into(),
+                decoder_width(0),
+                4 * (HEAD + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
+            ),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), HEAD)).collect(),
             config,
             prefilter: None,
             encoders,
@@ -278,7 +280,10 @@ impl Pyramid {
             };
             let filtered = corrected.filter(KERNEL, kernel, Some(confidence));
             if pyramid.is_empty() {
-                let albedo = field(albedo).filter(ALBEDO_KERNEL, albedo_kernel, None);
+                let albedo = match albedo_kernel {
+                    Some(kernel) => field(albedo).filter(ALBEDO_KERNEL, kernel, None),
+                    None => field(albedo),
+                };
                 return filtered.product(albedo).into_images();
             }
             correction = Some(filtered.minus(noisy));
@@ -384,7 +389,7 @@ impl Network for Pyramid {
         // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
         let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
         let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
-        convolutions + filters + (4 * ALBEDO_KERNEL * ALBEDO_KERNEL) as f64 + prefilter
+        convolutions + filters + (4 * ALBEDO_TAPS) as f64 + prefilter
     }
 
     fn reach(&self) -> usize {

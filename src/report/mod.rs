@@ -25,7 +25,7 @@ mod summary;
 use std::path::{Path, PathBuf};
 
 pub use loss::loss_chart;
-pub use rows::{COLUMNS, Row, read_rows};
+pub use rows::{COLUMNS, Row, read_rows, to_csv, write_file};
 pub use run::{Event, evaluate};
 pub use settings::file_stamp;
 pub use summary::{Method as MethodSummary, summarise};

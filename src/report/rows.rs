@@ -177,6 +177,9 @@ pub fn to_csv<R: AsRef<[String]>>(columns: &[&str], rows: impl IntoIterator<Item
 }
 
 /// Replaces a file by `text` in one step.
+///
+/// # Errors
+/// It cannot be written.
 pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
     atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
 }

@@ -50,14 +50,21 @@ impl Augment {
     /// # Panics
     /// If the sample is not square and a quarter turn is asked for.
     pub fn apply(&self, sample: &mut Sample) {
-        let old = &sample.passes;
+        sample.passes = self.passes(&sample.passes);
+        sample.reference = self.pass(Pass::Combined, &sample.reference);
+        sample.raw_reference = sample.raw_reference.take().map(|raw| self.pass(Pass::Combined, &raw));
+    }
+
+    /// Applied to every pass.
+    ///
+    /// # Panics
+    /// As [`Augment::apply`].
+    pub fn passes(&self, old: &PassSet) -> PassSet {
         let mut new = PassSet::new(&old.path, &old.view_layer, old.width, old.height);
         for (pass, planes) in old.iter() {
             new.insert(pass, self.pass(pass, planes));
         }
-        sample.passes = new;
-        sample.reference = self.pass(Pass::Combined, &sample.reference);
-        sample.raw_reference = sample.raw_reference.take().map(|raw| self.pass(Pass::Combined, &raw));
+        new
     }
 
     fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
@@ -67,7 +74,7 @@ impl Augment {
             Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Vector => {}
             _ => planes = self.permuted(&planes),
         }
-        if carries_radiance(pass) {
+        if Self::carries_radiance(pass) {
             planes.data.iter_mut().for_each(|v| *v *= self.exposure);
         }
         planes
@@ -120,26 +127,26 @@ impl Augment {
         }
         out
     }
-}
 
-/// Whether a pass scales with the light in the scene.
-fn carries_radiance(pass: Pass) -> bool {
-    use Pass::*;
-    matches!(
-        pass,
-        Combined
-            | NoisyImage
-            | DiffuseDirect
-            | DiffuseIndirect
-            | GlossyDirect
-            | GlossyIndirect
-            | TransmissionDirect
-            | TransmissionIndirect
-            | VolumeDirect
-            | VolumeIndirect
-            | Emission
-            | Environment
-    )
+    /// Whether a pass scales with the light in the scene.
+    pub fn carries_radiance(pass: Pass) -> bool {
+        use Pass::*;
+        matches!(
+            pass,
+            Combined
+                | NoisyImage
+                | DiffuseDirect
+                | DiffuseIndirect
+                | GlossyDirect
+                | GlossyIndirect
+                | TransmissionDirect
+                | TransmissionIndirect
+                | VolumeDirect
+                | VolumeIndirect
+                | Emission
+                | Environment
+        )
+    }
 }
 
 #[cfg(test)]

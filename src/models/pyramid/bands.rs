@@ -125,8 +125,8 @@ struct Frame<'a> {
     /// Full resolution first.
     scales: Vec<Scale>,
     albedo: Line<Field>,
-    /// One for each kernel of full resolution.
-    albedo_kernels: VecDeque<Field>,
+    /// One for each kernel of full resolution, where the network has them.
+    albedo_kernels: VecDeque<Option<Field>>,
 }
 
 /// A level of an encoder.
@@ -334,8 +334,13 @@ impl<'a> Frame<'a> {
                 continue;
             }
             let kernel = self.albedo_kernels.pop_front().expect("there is one for each kernel");
-            let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
-            let albedo = self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None);
+            let albedo = match kernel {
+                Some(kernel) => {
+                    let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
+                    self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None)
+                }
+                None => self.albedo.rows(rows.clone()),
+            };
             done(rows.start, &smooth.product(albedo));
         }
     }

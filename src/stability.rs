@@ -1,0 +1,375 @@
+//! How much a method's result changes when its input is not what it should be.
+//!
+//! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene the result is
+//! scored against what the reference then is, and beside the result for the frame as it was rendered: `ratio` is its
+//! RelMSE over that one's, `deviation` the RelMSE between the two. A method that is indifferent to the change has a
+//! ratio of 1 and a deviation of 0.
+
+use std::path::Path;
+
+use crate::{
+    Result,
+    metrics::{self, error::relmse},
+    passes::{self, Pass, PassSet},
+    planes::Planes,
+    report::{Method, NOISY, number, to_csv, write_file},
+    testset::Pair,
+    train::Augment,
+};
+
+/// One way to change a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trial {
+    /// Nothing changes: what the others are measured by.
+    AsRendered,
+    /// Radiance is a 256th: physical units, moonlight.
+    Darker,
+    /// Radiance is 256 times as high.
+    Brighter,
+    /// Left and right change places.
+    Mirrored,
+    /// The frame begins 5 pixels further right and 3 further down: a network's grid falls elsewhere.
+    Cropped,
+    /// One pixel in 1024 is a firefly of 1000 times the mean radiance.
+    Fireflies,
+    /// One pixel in 1024 of every pass is NaN or infinite.
+    NonFinite,
+    /// Guides are 2 pixels further right than radiance, as those of a compositor that moved one layer.
+    ShiftedGuides,
+    /// Guides hold nothing: all zero.
+    BlankGuides,
+}
+
+/// Factor of [`Trial::Darker`] and its inverse's of [`Trial::Brighter`].
+const DARK: f32 = 1.0 / 256.0;
+
+/// First column and row of [`Trial::Cropped`]; no multiple of what networks halve by.
+const CORNER: (usize, usize) = (5, 3);
+
+/// Radiance of a firefly over the frame's mean.
+const FIREFLY: f64 = 1000.0;
+
+/// Columns by which [`Trial::ShiftedGuides`] moves guides.
+const SHIFT: usize = 2;
+
+impl Trial {
+    /// Every trial, the unchanged frame first.
+    pub const ALL: [Self; 9] = [
+        Self::AsRendered,
+        Self::Darker,
+        Self::Brighter,
+        Self::Mirrored,
+        Self::Cropped,
+        Self::Fireflies,
+        Self::NonFinite,
+        Self::ShiftedGuides,
+        Self::BlankGuides,
+    ];
+
+    /// Its name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::AsRendered => "as-rendered",
+            Self::Darker => "darker",
+            Self::Brighter => "brighter",
+            Self::Mirrored => "mirrored",
+            Self::Cropped => "cropped",
+            Self::Fireflies => "fireflies",
+            Self::NonFinite => "non-finite",
+            Self::ShiftedGuides => "shifted-guides",
+            Self::BlankGuides => "blank-guides",
+        }
+    }
+
+    /// The change as an augmentation, where it is one.
+    fn augment(self) -> Option<Augment> {
+        match self {
+            Self::Darker => Some(Augment { exposure: DARK, ..Augment::IDENTITY }),
+            Self::Brighter => Some(Augment { exposure: DARK.recip(), ..Augment::IDENTITY }),
+            Self::Mirrored => Some(Augment { flip: true, ..Augment::IDENTITY }),
+            _ => None,
+        }
+    }
+
+    /// The changed frame; values may be NaN.
+    fn change(self, passes: &PassSet) -> PassSet {
+        if let Some(augment) = self.augment() {
+            return augment.passes(passes);
+        }
+        let (width, height) = (passes.width, passes.height);
+        match self {
+            Self::Cropped => {
+                let size = (width.saturating_sub(CORNER.0), height.saturating_sub(CORNER.1));
+                each_pass(passes, size, |_, planes| self.seen(planes))
+            }
+            Self::Fireflies => each_pass(passes, (width, height), |pass, planes| {
+                let mut planes = planes.clone();
+                if pass == Pass::Combined {
+                    let sum: f64 = planes.data.iter().map(|v| f64::from(*v)).sum();
+                    let firefly = (FIREFLY * sum / planes.data.len().max(1) as f64) as f32;
+                    let pixels = planes.pixels();
+                    (0..pixels).filter(|&at| is_chosen(at)).for_each(|at| {
+                        (0..3).for_each(|c| planes.data[c * pixels + at] = firefly);
+                    });
+                }
+                planes
+            }),
+            Self::NonFinite => each_pass(passes, (width, height), |_, planes| {
+                const BAD: [f32; 3] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
+                let mut planes = planes.clone();
+                let pixels = planes.pixels();
+                for (c, plane) in planes.data.chunks_mut(pixels.max(1)).enumerate() {
+                    (0..pixels)
+                        .filter(|&at| is_chosen(at))
+                        .for_each(|at| plane[at] = BAD[(at + c) % BAD.len()]);
+                }
+                planes
+            }),
+            Self::ShiftedGuides => each_pass(passes, (width, height), |pass, planes| {
+                let mut shifted = planes.clone();
+                if !Augment::carries_radiance(pass) {
+                    for (row, from) in shifted.data.chunks_mut(width).zip(planes.data.chunks(width)) {
+                        row.iter_mut().enumerate().for_each(|(x, v)| *v = from[x.saturating_sub(SHIFT)]);
+                    }
+                }
+                shifted
+            }),
+            Self::BlankGuides => each_pass(passes, (width, height), |pass, planes| {
+                let blank = || Planes::new(planes.channels, width, height);
+                if Augment::carries_radiance(pass) { planes.clone() } else { blank() }
+            }),
+            _ => passes.clone(),
+        }
+    }
+
+    /// The result for the changed frame as one for the frame as it was rendered.
+    fn undo(self, mut image: Planes) -> Planes {
+        match self {
+            Self::Mirrored => image.data.chunks_mut(image.width).for_each(<[f32]>::reverse),
+            Self::Darker => image.data.iter_mut().for_each(|v| *v /= DARK),
+            Self::Brighter => image.data.iter_mut().for_each(|v| *v *= DARK),
+            _ => {}
+        }
+        image
+    }
+
+    /// What of an image is in the changed frame.
+    fn seen(self, image: &Planes) -> Planes {
+        match self {
+            Self::Cropped => {
+                let (x, y) = (CORNER.0.min(image.width), CORNER.1.min(image.height));
+                image.window((x, y), (image.width - x, image.height - y))
+            }
+            _ => image.clone(),
+        }
+    }
+}
+
+fn each_pass(
+    passes: &PassSet,
+    (width, height): (usize, usize),
+    change: impl Fn(Pass, &Planes) -> Planes,
+) -> PassSet {
+    let mut changed = PassSet::new(&passes.path, &passes.view_layer, width, height);
+    passes.iter().for_each(|(pass, planes)| changed.insert(pass, change(pass, planes)));
+    changed
+}
+
+/// One pixel in 1024, spread by the hash of its index (Knuth's multiplicative one).
+fn is_chosen(pixel: usize) -> bool {
+    (pixel as u32).wrapping_mul(2_654_435_761) >> 22 == 0
+}
+
+/// What one method made of one changed frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Row {
+    /// Scene, with the frame of a sequence.
+    pub scene: String,
+    /// Method.
+    pub model: String,
+    /// Samples per pixel of the noisy render.
+    pub spp: u32,
+    /// Name of the trial.
+    pub trial: &'static str,
+    /// RelMSE against what of the reference is in the frame.
+    pub relmse: Option<f64>,
+    /// The same over that of the frame as rendered.
+    pub ratio: Option<f64>,
+    /// RelMSE between this result and that for the frame as rendered.
+    pub deviation: Option<f64>,
+    /// Why numbers are missing; empty where all is well.
+    pub reason: String,
+}
+
+/// Columns of `stability.csv`.
+const COLUMNS: [&str; 8] = ["scene", "model", "spp", "trial", "relmse", "ratio", "deviation", "reason"];
+
+/// Columns of `stability_summary.csv`.
+const SUMMARY_COLUMNS: [&str; 8] =
+    ["model", "trial", "scenes", "failed", "ratio", "worst_ratio", "worst_scene", "worst_deviation"];
+
+impl Row {
+    fn cells(&self) -> [String; COLUMNS.len()] {
+        let value = |v: Option<f64>| v.map(number).unwrap_or_default();
+        [
+            self.scene.clone(),
+            self.model.clone(),
+            self.spp.to_string(),
+            self.trial.into(),
+            value(self.relmse),
+            value(self.ratio),
+            value(self.deviation),
+            self.reason.clone(),
+        ]
+    }
+}
+
+/// Runs every trial of every method on every pair, tells each row, and writes `stability.csv` and
+/// `stability_summary.csv` into `out` at the end. A pair or method that fails has rows that say why.
+///
+/// # Errors
+/// The tables cannot be written.
+pub fn run(
+    pairs: &[Pair],
+    methods: &[Method],
+    view_layer: Option<&str>,
+    out: &Path,
+    on: &mut dyn FnMut(&Row),
+) -> Result<Vec<Row>> {
+    std::fs::create_dir_all(out).map_err(crate::Error::io("create", out))?;
+    let mut rows = Vec::new();
+    for pair in pairs {
+        let loaded = load(pair, view_layer);
+        for method in methods {
+            let mut before = None;
+            for trial in Trial::ALL {
+                let row = Row {
+                    scene: pair.label(),
+                    model: method.name.clone(),
+                    spp: pair.spp,
+                    trial: trial.name(),
+                    ..Row::default()
+                };
+                let tried = match &loaded {
+                    Ok((passes, reference)) => attempt(trial, method, passes, reference, &mut before),
+                    Err(error) => Err(error.to_string()),
+                };
+                let row = match tried {
+                    Ok([relmse, ratio, deviation]) => Row { relmse, ratio, deviation, ..row },
+                    Err(reason) => Row { reason, ..row },
+                };
+                on(&row);
+                rows.push(row);
+            }
+        }
+    }
+    write_file(&out.join("stability.csv"), to_csv(&COLUMNS, rows.iter().map(Row::cells)).as_bytes())?;
+    let summary = summarise(&rows, methods);
+    write_file(&out.join("stability_summary.csv"), to_csv(&SUMMARY_COLUMNS, &summary).as_bytes())?;
+    Ok(rows)
+}
+
+/// The noisy passes as stored, and the reference.
+fn load(pair: &Pair, view_layer: Option<&str>) -> Result<(PassSet, Planes)> {
+    let mut passes = passes::load(&pair.noisy, view_layer)?;
+    passes.use_noisy_image();
+    passes.require(Pass::Combined, NOISY)?;
+    passes.sanitize();
+    let reference = passes::load(&pair.reference, view_layer)?;
+    Ok((passes, reference.require(Pass::Combined, "a reference")?.clone()))
+}
+
+/// RelMSE, ratio and deviation of one trial; `before` is the result for the frame as rendered, which the first
+/// trial leaves there.
+fn attempt(
+    trial: Trial,
+    method: &Method,
+    passes: &PassSet,
+    reference: &Planes,
+    before: &mut Option<Planes>,
+) -> std::result::Result<[Option<f64>; 3], String> {
+    let mut changed = trial.change(passes);
+    changed.sanitize();
+    let image = trial.undo(method.denoiser.denoise(&changed).map_err(|e| e.to_string())?);
+    let reference = trial.seen(reference);
+    metrics::check(&image, &reference).map_err(|why| why.to_string())?;
+    let error = relmse(&image, &reference);
+    let numbers = match before {
+        None => [Some(error), None, None],
+        Some(before) => {
+            let before = trial.seen(before);
+            [Some(error), Some(error / relmse(&before, &reference)), Some(relmse(&image, &before))]
+        }
+    };
+    if trial == Trial::AsRendered {
+        *before = Some(image);
+        return Ok([Some(error), Some(1.0), Some(0.0)]);
+    }
+    Ok(numbers)
+}
+
+/// A line for each method and trial.
+fn summarise(rows: &[Row], methods: &[Method]) -> Vec<[String; SUMMARY_COLUMNS.len()]> {
+    let lines = methods.iter().flat_map(|method| Trial::ALL.map(|trial| (method, trial)));
+    lines
+        .map(|(method, trial)| {
+            let own = || rows.iter().filter(|row| row.model == method.name && row.trial == trial.name());
+            let ratios: Vec<(f64, &str)> =
+                own().filter_map(|row| Some((row.ratio?, row.scene.as_str()))).collect();
+            let mean = ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64;
+            let worst = ratios.iter().max_by(|a, b| a.0.total_cmp(&b.0));
+            let deviation = own().filter_map(|row| row.deviation).max_by(f64::total_cmp);
+            let failed = own().filter(|row| !row.reason.is_empty()).count();
+            [
+                method.name.clone(),
+                trial.name().into(),
+                own().count().to_string(),
+                failed.to_string(),
+                worst.map(|_| number(mean.exp())).unwrap_or_default(),
+                worst.map(|(ratio, _)| number(*ratio)).unwrap_or_default(),
+                worst.map(|(_, scene)| (*scene).into()).unwrap_or_default(),
+                deviation.map(number).unwrap_or_default(),
+            ]
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame() -> PassSet {
+        let mut passes = PassSet::new("test.exr", "ViewLayer", 64, 64);
+        for (i, pass) in
+            [Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal].into_iter().enumerate()
+        {
+            let values = (0..3 * 64 * 64).map(|v| (v % 61) as f32 / 60.0 + i as f32 / 8.0).collect();
+            passes.insert(pass, Planes::from_vec(3, 64, 64, values));
+        }
+        passes
+    }
+
+    /// What a change does to radiance is undone, but for what it adds on purpose.
+    #[test]
+    fn changes_are_undone() {
+        let before = frame();
+        let radiance = before.get(Pass::Combined).unwrap();
+        for trial in Trial::ALL {
+            let after = trial.change(&before);
+            let image = trial.undo(after.get(Pass::Combined).unwrap().clone());
+            let same = image == trial.seen(radiance);
+            assert_eq!(same, !matches!(trial, Trial::Fireflies | Trial::NonFinite), "{}", trial.name());
+            let albedo = after.get(Pass::DenoisingAlbedo).unwrap();
+            let kept = *albedo == trial.seen(before.get(Pass::DenoisingAlbedo).unwrap());
+            let moved = [Trial::Mirrored, Trial::NonFinite, Trial::ShiftedGuides, Trial::BlankGuides];
+            assert_eq!(kept, !moved.contains(&trial), "{}", trial.name());
+        }
+    }
+
+    #[test]
+    fn one_pixel_in_1024_is_chosen() {
+        let chosen = (0..1 << 20).filter(|&at| is_chosen(at)).count();
+        assert!((900..1150).contains(&chosen), "{chosen}");
+        assert!((0..64 * 64).any(is_chosen), "small frames have some too");
+    }
+}

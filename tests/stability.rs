@@ -1,0 +1,100 @@
+//! `demc stability` from the command line.
+
+use std::{
+    collections::HashMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use assert_cmd::Command as Demc;
+use predicates::prelude::*;
+
+type Row = HashMap<String, String>;
+
+fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+fn demc() -> Demc {
+    Demc::cargo_bin("demc").unwrap()
+}
+
+fn table(path: &Path) -> Vec<Row> {
+    let mut reader = csv::Reader::from_path(path).unwrap();
+    reader.deserialize().map(Result::unwrap).collect()
+}
+
+fn value(row: &Row, column: &str) -> f64 {
+    row[column].parse().unwrap_or_else(|_| panic!("{column} of {row:?}"))
+}
+
+/// What is known without running anything: the noisy input is not moved by any change of the guides, of the
+/// exposure or of the frame, and by fireflies it is; a network that works on squares of pixels whose exposure it
+/// normalises first may feel where they begin and little else.
+#[test]
+fn tells_what_changes_results_and_what_does_not() {
+    let out = tempfile::tempdir().unwrap();
+    demc()
+        .args(["stability", "--models", "demc-s:f32", "--test-set"])
+        .arg(data(""))
+        .arg("--out")
+        .arg(out.path())
+        .assert()
+        .success()
+        .stdout(predicate::str::contains("stability_summary.csv"));
+    let rows = table(&out.path().join("stability.csv"));
+    assert_eq!(rows.len(), 2 * 2 * 9, "pairs, methods, trials");
+    for row in &rows {
+        let (trial, ratio, deviation) = (&row["trial"][..], value(row, "ratio"), value(row, "deviation"));
+        let is_noisy = row["model"] == "noisy";
+        match trial {
+            "as-rendered" => assert_eq!((ratio, deviation), (1.0, 0.0)),
+            "fireflies" if is_noisy => assert!(ratio > 10.0, "{row:?}"),
+            "non-finite" if is_noisy => assert!(deviation > 0.0, "{row:?}"),
+            _ if is_noisy => assert_eq!(deviation, 0.0, "{row:?}"),
+            "darker" | "brighter" => assert!(deviation < 1e-6, "{row:?}"),
+            "mirrored" | "cropped" => assert!(deviation > 0.0 && ratio < 1.3, "{row:?}"),
+            _ => assert!(deviation > 0.0, "{row:?}"),
+        }
+    }
+    let summary = table(&out.path().join("stability_summary.csv"));
+    assert_eq!(summary.len(), 2 * 9);
+    for line in &summary {
+        let own = || rows.iter().filter(|r| r["model"] == line["model"] && r["trial"] == line["trial"]);
+        let ratios: Vec<f64> = own().map(|r| value(r, "ratio")).collect();
+        let mean = (ratios.iter().map(|r| r.ln()).sum::<f64>() / 2.0).exp();
+        assert!((value(line, "ratio") / mean - 1.0).abs() < 1e-5, "{line:?}");
+        assert_eq!(value(line, "worst_ratio"), ratios[0].max(ratios[1]));
+        assert!(own().any(|r| r["scene"] == line["worst_scene"]), "{line:?}");
+        assert_eq!((&line["scenes"][..], &line["failed"][..]), ("2", "0"));
+    }
+}
+
+/// A frame that cannot be read has rows without numbers and with a reason; the others go on.
+#[test]
+fn one_bad_frame_does_not_stop_the_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    fs::create_dir(&set).unwrap();
+    for name in ["s0000_room_0004spp.exr", "s0000_room_ref.exr"] {
+        fs::copy(data(name), set.join(name)).unwrap();
+    }
+    fs::copy(data("s0000_room_ref.exr"), set.join("cut_ref.exr")).unwrap();
+    fs::write(set.join("cut_0004spp.exr"), b"no frame").unwrap();
+    let out = folder.path().join("out");
+    demc()
+        .args(["stability", "--models", "noisy", "--test-set"])
+        .arg(&set)
+        .arg("--out")
+        .arg(&out)
+        .assert()
+        .code(1)
+        .stderr(predicate::str::contains("stability.csv"));
+    let rows = table(&out.join("stability.csv"));
+    let failed: Vec<&Row> = rows.iter().filter(|row| !row["reason"].is_empty()).collect();
+    assert_eq!((rows.len(), failed.len()), (18, 9));
+    for row in failed {
+        assert!(row["scene"] == "cut" && row["relmse"].is_empty() && row["ratio"].is_empty(), "{row:?}");
+        assert!(row["reason"].contains("cut_0004spp.exr"), "{row:?}");
+    }
+}
