@@ -156,7 +156,8 @@ def reduced(image, confidence):
 
 
 def blended(fine, coarse, alpha):
-    return fine + jax.nn.sigmoid(alpha) * (jax.image.resize(coarse, fine.shape, "bilinear") - fine)
+    difference = coarse - squares(fine).mean(axis=-1)
+    return fine + jax.nn.sigmoid(alpha) * jax.image.resize(difference, fine.shape, "bilinear")
 
 
 def shuffled(x):
