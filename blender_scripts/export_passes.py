@@ -147,7 +147,7 @@ def render_frame(options, scene, layers, scene_name, frame, numbered):
             render_job(options, scene, layers, job)
             done.append(f"{job.label} {time.perf_counter() - start:.1f} s")
         except (RuntimeError, OSError) as error:
-            errors.append(f"{job.label} failed: {' '.join(str(error).split())}")
+            errors.append(f"{job.label} failed: {cl.reason(error)}")
     print(f"{scene_name} frame {frame}: {', '.join(done + errors)}")
     return not errors
 
@@ -198,7 +198,7 @@ def main():
     except (RuntimeError, ValueError, OSError) as error:
         if os.environ.get("DEMC_TRACEBACK"):
             traceback.print_exc()
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {cl.reason(error)}", file=sys.stderr)
         failed = 1
     cl.finish(failed)
 

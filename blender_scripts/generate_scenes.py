@@ -295,7 +295,7 @@ def main():
             failed += 1
             if os.environ.get("DEMC_TRACEBACK"):
                 traceback.print_exc()
-            print(f"{scene_name}: failed, {' '.join(str(error).split())}")
+            print(f"{scene_name}: failed, {cl.reason(error)}")
     cl.finish(failed)
 
 

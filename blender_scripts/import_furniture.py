@@ -23,8 +23,9 @@ from mathutils import Matrix, Vector
 sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 
 from demc_blender import command_line as cl
+from demc_scenes.assets import shrink
+from demc_scenes.materials import principled_of
 
-_TEXTURE_SIDE = 512  # pixels at most
 _MOST_TRIANGLES = 250_000
 _PROP_SIZE = 0.6  # metres; smaller furniture stands on furniture
 _CATEGORIES = {"Characters": "figure", "Vehicles": "vehicle"}
@@ -93,11 +94,9 @@ def import_model(folder, model):
 def mend_materials():
     """What OBJ files cannot say: clear parts are glass, and textures are no larger than needed."""
     for image in bpy.data.images:
-        side = max(image.size)
-        if side > _TEXTURE_SIDE:
-            image.scale(*(max(1, s * _TEXTURE_SIDE // side) for s in image.size))
+        shrink(image)
     for material in bpy.data.materials:
-        shader = next((n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
+        shader = principled_of(material)
         if shader is None:
             continue
         alpha = shader.inputs["Alpha"]
@@ -133,7 +132,7 @@ def main():
                         os.replace(f"{target}.part.glb", target)
                 except Exception as error:  # one bad model must not cost the others
                     failed += 1
-                    print(f"{name}: left out, {' '.join(str(error).split())}")
+                    print(f"{name}: left out, {cl.reason(error)}")
                     continue
                 rows.append((name, category, round(max(dimensions(model)), 3), library["name"], model.get("creator", ""), library["license"]))
     with open(os.path.join(options.out, "models.tsv"), "w", encoding="utf-8", newline="") as file:

@@ -18,8 +18,9 @@ import numpy as np
 sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 
 from demc_blender import command_line as cl
+from demc_scenes.assets import shrink
 
-_SIDE = (64, 512)  # pixels, least and most
+_LEAST_SIDE = 64  # pixels
 _KINDS = tuple((kind, re.compile(words)) for kind, words in (  # the first match wins
     ("bark", "bark|trunk"), ("brick", "brick"), ("tiles", "tile|floor|roof|mosaic"), ("marble", "marble"),
     ("wood", "wood|plank|crate|parquet|board"), ("asphalt", "asphalt|tarmac|road|track"), ("concrete", "concrete|cement"),
@@ -49,6 +50,15 @@ def candidates(folder):
                 yield path, kind
 
 
+def has_holes(image):
+    """Whether more than a hundredth of the pixels let something through."""
+    if image.channels != 4:
+        return False
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    return np.mean(pixels[3::4] < 0.9) > 0.01
+
+
 def store(path, target):
     """Writes an image as a texture set; False for one that is small, long, or has holes."""
     image = bpy.data.images.load(path)
@@ -56,12 +66,9 @@ def store(path, target):
         size = tuple(image.size)
         if 0 in size:
             raise ValueError("not an image")
-        pixels = np.array(image.pixels[:], np.float32).reshape(-1, image.channels)
-        holes = image.channels == 4 and np.mean(pixels[:, 3] < 0.9) > 0.01
-        if min(size) < _SIDE[0] or max(size) > 4 * min(size) or holes:
+        if min(size) < _LEAST_SIDE or max(size) > 4 * min(size) or has_holes(image):
             return False
-        if max(size) > _SIDE[1]:
-            image.scale(*(max(1, s * _SIDE[1] // max(size)) for s in size))
+        shrink(image)
         os.makedirs(os.path.dirname(target), exist_ok=True)
         image.file_format = "JPEG"
         image.save(filepath=target)
@@ -82,7 +89,7 @@ def main():
             try:
                 kept = store(path, os.path.join(options.out, "textures", f"{kind}_{name}", "color.jpg"))
             except (RuntimeError, ValueError) as error:  # one bad image must not cost the others
-                print(f"{path}: left out, {' '.join(str(error).split())}")
+                print(f"{path}: left out, {cl.reason(error)}")
                 kept = False
             stored, passed = stored + kept, passed + (not kept)
     print(f"{stored} textures in {options.out}, {passed} of fitting names left out")

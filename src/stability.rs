@@ -10,9 +10,9 @@ use std::path::Path;
 use crate::{
     Result,
     metrics::{self, error::relmse},
-    passes::{self, Pass, PassSet},
+    passes::{Pass, PassSet},
     planes::Planes,
-    report::{Method, NOISY, number, to_csv, write_file},
+    report::{self, Loaded, Method, cell, geometric_mean, to_csv, write_file},
     testset::Pair,
     train::Augment,
 };
@@ -100,9 +100,9 @@ impl Trial {
         match self {
             Self::Cropped => {
                 let size = (width.saturating_sub(CORNER.0), height.saturating_sub(CORNER.1));
-                each_pass(passes, size, |_, planes| self.seen(planes))
+                passes.map(size, |_, planes| self.seen(planes))
             }
-            Self::Fireflies => each_pass(passes, (width, height), |pass, planes| {
+            Self::Fireflies => passes.map((width, height), |pass, planes| {
                 let mut planes = planes.clone();
                 if pass == Pass::Combined {
                     let sum: f64 = planes.data.iter().map(|v| f64::from(*v)).sum();
@@ -114,7 +114,7 @@ impl Trial {
                 }
                 planes
             }),
-            Self::NonFinite => each_pass(passes, (width, height), |_, planes| {
+            Self::NonFinite => passes.map((width, height), |_, planes| {
                 const BAD: [f32; 3] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
                 let mut planes = planes.clone();
                 let pixels = planes.pixels();
@@ -125,18 +125,18 @@ impl Trial {
                 }
                 planes
             }),
-            Self::ShiftedGuides => each_pass(passes, (width, height), |pass, planes| {
+            Self::ShiftedGuides => passes.map((width, height), |pass, planes| {
                 let mut shifted = planes.clone();
-                if !Augment::carries_radiance(pass) {
+                if !pass.carries_radiance() {
                     for (row, from) in shifted.data.chunks_mut(width).zip(planes.data.chunks(width)) {
                         row.iter_mut().enumerate().for_each(|(x, v)| *v = from[x.saturating_sub(SHIFT)]);
                     }
                 }
                 shifted
             }),
-            Self::BlankGuides => each_pass(passes, (width, height), |pass, planes| {
+            Self::BlankGuides => passes.map((width, height), |pass, planes| {
                 let blank = || Planes::new(planes.channels, width, height);
-                if Augment::carries_radiance(pass) { planes.clone() } else { blank() }
+                if pass.carries_radiance() { planes.clone() } else { blank() }
             }),
             _ => passes.clone(),
         }
@@ -163,16 +163,6 @@ impl Trial {
             _ => image.clone(),
         }
     }
-}
-
-fn each_pass(
-    passes: &PassSet,
-    (width, height): (usize, usize),
-    change: impl Fn(Pass, &Planes) -> Planes,
-) -> PassSet {
-    let mut changed = PassSet::new(&passes.path, &passes.view_layer, width, height);
-    passes.iter().for_each(|(pass, planes)| changed.insert(pass, change(pass, planes)));
-    changed
 }
 
 /// One pixel in 1024, spread by the hash of its index (Knuth's multiplicative one).
@@ -210,15 +200,14 @@ const SUMMARY_COLUMNS: [&str; 8] =
 
 impl Row {
     fn cells(&self) -> [String; COLUMNS.len()] {
-        let value = |v: Option<f64>| v.map(number).unwrap_or_default();
         [
             self.scene.clone(),
             self.model.clone(),
             self.spp.to_string(),
             self.trial.into(),
-            value(self.relmse),
-            value(self.ratio),
-            value(self.deviation),
+            cell(self.relmse),
+            cell(self.ratio),
+            cell(self.deviation),
             self.reason.clone(),
         ]
     }
@@ -239,7 +228,7 @@ pub fn run(
     std::fs::create_dir_all(out).map_err(crate::Error::io("create", out))?;
     let mut rows = Vec::new();
     for pair in pairs {
-        let loaded = load(pair, view_layer);
+        let loaded = report::load(pair, view_layer);
         for method in methods {
             let mut before = None;
             for trial in Trial::ALL {
@@ -251,7 +240,7 @@ pub fn run(
                     ..Row::default()
                 };
                 let tried = match &loaded {
-                    Ok((passes, reference)) => attempt(trial, method, passes, reference, &mut before),
+                    Ok(loaded) => attempt(trial, method, loaded, &mut before),
                     Err(error) => Err(error.to_string()),
                 };
                 let row = match tried {
@@ -269,43 +258,32 @@ pub fn run(
     Ok(rows)
 }
 
-/// The noisy passes as stored, and the reference.
-fn load(pair: &Pair, view_layer: Option<&str>) -> Result<(PassSet, Planes)> {
-    let mut passes = passes::load(&pair.noisy, view_layer)?;
-    passes.use_noisy_image();
-    passes.require(Pass::Combined, NOISY)?;
-    passes.sanitize();
-    let reference = passes::load(&pair.reference, view_layer)?;
-    Ok((passes, reference.require(Pass::Combined, "a reference")?.clone()))
-}
-
 /// RelMSE, ratio and deviation of one trial; `before` is the result for the frame as rendered, which the first
 /// trial leaves there.
 fn attempt(
     trial: Trial,
     method: &Method,
-    passes: &PassSet,
-    reference: &Planes,
+    loaded: &Loaded,
     before: &mut Option<Planes>,
 ) -> std::result::Result<[Option<f64>; 3], String> {
-    let mut changed = trial.change(passes);
+    let mut changed = trial.change(&loaded.passes);
     changed.sanitize();
     let image = trial.undo(method.denoiser.denoise(&changed).map_err(|e| e.to_string())?);
-    let reference = trial.seen(reference);
+    let reference = trial.seen(&loaded.reference);
     metrics::check(&image, &reference).map_err(|why| why.to_string())?;
     let error = relmse(&image, &reference);
-    let numbers = match before {
-        None => [Some(error), None, None],
+    let (ratio, deviation) = match &*before {
+        _ if trial == Trial::AsRendered => (Some(1.0), Some(0.0)),
+        None => (None, None),
         Some(before) => {
             let before = trial.seen(before);
-            [Some(error), Some(error / relmse(&before, &reference)), Some(relmse(&image, &before))]
+            (Some(error / relmse(&before, &reference)), Some(relmse(&image, &before)))
         }
     };
     if trial == Trial::AsRendered {
         *before = Some(image);
-        return Ok([Some(error), Some(1.0), Some(0.0)]);
     }
-    Ok(numbers)
+    Ok([Some(error), ratio, deviation])
 }
 
 /// A line for each method and trial.
@@ -316,7 +294,7 @@ fn summarise(rows: &[Row], methods: &[Method]) -> Vec<[String; SUMMARY_COLUMNS.l
             let own = || rows.iter().filter(|row| row.model == method.name && row.trial == trial.name());
             let ratios: Vec<(f64, &str)> =
                 own().filter_map(|row| Some((row.ratio?, row.scene.as_str()))).collect();
-            let mean = ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64;
+            let mean = geometric_mean(&ratios.iter().map(|(ratio, _)| *ratio).collect::<Vec<_>>());
             let worst = ratios.iter().max_by(|a, b| a.0.total_cmp(&b.0));
             let deviation = own().filter_map(|row| row.deviation).max_by(f64::total_cmp);
             let failed = own().filter(|row| !row.reason.is_empty()).count();
@@ -325,10 +303,10 @@ fn summarise(rows: &[Row], methods: &[Method]) -> Vec<[String; SUMMARY_COLUMNS.l
                 trial.name().into(),
                 own().count().to_string(),
                 failed.to_string(),
-                worst.map(|_| number(mean.exp())).unwrap_or_default(),
-                worst.map(|(ratio, _)| number(*ratio)).unwrap_or_default(),
+                cell(mean),
+                cell(worst.map(|(ratio, _)| *ratio)),
                 worst.map(|(_, scene)| (*scene).into()).unwrap_or_default(),
-                deviation.map(number).unwrap_or_default(),
+                cell(deviation),
             ]
         })
         .collect()

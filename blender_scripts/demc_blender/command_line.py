@@ -34,6 +34,11 @@ def quiet_stdout():
     sys.stdout = os.fdopen(ours, "w", buffering=1, encoding="utf-8", errors="replace")
 
 
+def reason(error):
+    """An exception's message on one line."""
+    return " ".join(str(error).split())
+
+
 def finish(failed):
     """Ends a script with exit code 1 where something failed. An open Blender window stays open."""
     sys.stdout.flush()

@@ -9,6 +9,7 @@ procedural content.
 import csv
 import os
 
+TEXTURE_SIDE = 512  # pixels of an imported texture, at most
 _IMAGES = (".jpg", ".jpeg", ".png", ".exr", ".hdr", ".tif", ".tiff")
 # What a model is used for, by words in its name; the first match wins.
 _ROLES = (
@@ -83,6 +84,13 @@ class Library:
     def texture_sets(self, *kinds):
         """Texture sets of these kinds."""
         return [maps for kind in kinds for maps in self.textures.get(kind, [])]
+
+
+def shrink(image):
+    """Scales a Blender image down to the size of textures, where it is larger."""
+    side = max(image.size)
+    if side > TEXTURE_SIDE:
+        image.scale(*(max(1, s * TEXTURE_SIDE // side) for s in image.size))
 
 
 def _files(folder, endings):

@@ -330,6 +330,11 @@ def screen(rng, path):
     return n.principled(Base_Color=(0.01,) * 3, Roughness=0.05, Emission_Color=base.outputs[0], Emission_Strength=rng.uniform(0.5, 4))
 
 
+def principled_of(material):
+    """The material's Principled BSDF, None without one."""
+    return next((n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
+
+
 def image(n, path, vector, data=False):
     """An image texture node; images are shared by path."""
     node = n.new("ShaderNodeTexImage")

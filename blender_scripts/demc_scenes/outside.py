@@ -49,7 +49,7 @@ def facade(stage, at, turn, night):
 def wet(stage, material):
     """Puddles: patches of a surface turn smooth and dark."""
     tree = material.node_tree
-    shader = next((n for n in tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
+    shader = m.principled_of(material)
     if shader is None:
         return material
     n = m.Nodes.__new__(m.Nodes)

@@ -65,7 +65,7 @@ class Stage:
         if slots and rng.random() < 0.2:
             rng.choice(slots).material = palette.anything(rng, self.library)
         for slot in slots:
-            shader = next((n for n in slot.material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
+            shader = m.principled_of(slot.material)
             if shader is None or rng.random() < 0.5:
                 continue
             if not shader.inputs["Roughness"].is_linked:

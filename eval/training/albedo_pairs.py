@@ -8,12 +8,11 @@ generate_scenes.py do; scenes whose references do not are left out. What is ther
 """
 
 import argparse
-import glob
 import os
 
 import numpy as np
 
-from clean_references import exr, planes
+from clean_references import exr, pairs, planes
 
 ALBEDO_FLOOR = 0.05  # src/features.rs
 KEPT = ("Combined", "Denoising Normal", "Denoising Albedo")
@@ -44,10 +43,8 @@ def main():
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
     for folder in options.pairs:
-        for reference in sorted(glob.glob(os.path.join(glob.escape(folder), "*_ref.exr"))):
-            scene = os.path.basename(reference).removesuffix("_ref.exr")
+        for scene, reference, noisy in pairs(folder):
             target = os.path.join(options.out, os.path.basename(reference))
-            noisy = sorted(glob.glob(os.path.join(glob.escape(folder), glob.escape(scene) + "_[0-9]*spp*.exr")))
             if not noisy or not (os.path.exists(target) or convert(reference, target)):
                 continue
             for path in noisy:

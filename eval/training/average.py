@@ -7,35 +7,26 @@ the largest range that any of them knows for a layer. Needs numpy.
 
 import argparse
 import json
-import struct
 
 import numpy as np
 
+import weights
+
 KEY = "demc"  # src/nn/weights.rs
-
-
-def read(path):
-    """The header and the values of a weights file."""
-    data = open(path, "rb").read()
-    end = 8 + struct.unpack("<Q", data[:8])[0]
-    return json.loads(data[8:end]), np.frombuffer(data[end:], "<f2").astype(np.float32)
-
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("files", nargs="+")
 parser.add_argument("--out", required=True)
 args = parser.parse_args()
-headers, values = zip(*map(read, args.files))
-if len({len(v) for v in values}) != 1:
+metadata, tensors = zip(*map(weights.read, args.files))
+shapes = [[(name, tensor.shape) for name, tensor in held.items()] for held in tensors]
+if any(other != shapes[0] for other in shapes):
     raise SystemExit("these are not weights of one network")
 ranges = {}
-for header in headers:
-    for layer, value in json.loads(header["__metadata__"][KEY]).get("ranges", {}).items():
+for held in metadata:
+    for layer, value in json.loads(held[KEY]).get("ranges", {}).items():
         ranges[layer] = max(value, ranges.get(layer, 0.0))
-header = headers[-1]
-metadata = json.loads(header["__metadata__"][KEY]) | ({"ranges": ranges} if ranges else {})
-header["__metadata__"][KEY] = json.dumps(metadata)
-header = json.dumps(header).encode()
-header += b" " * (-len(header) % 8)
-with open(args.out, "wb") as file:
-    file.write(struct.pack("<Q", len(header)) + header + np.mean(values, axis=0).astype("<f2").tobytes())
+last = metadata[-1]
+last[KEY] = json.dumps(json.loads(last[KEY]) | ({"ranges": ranges} if ranges else {}))
+mean = {name: np.mean([held[name].astype(np.float32) for held in tensors], axis=0) for name in tensors[0]}
+weights.write(args.out, last, mean)

@@ -22,6 +22,14 @@ sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."
 from demc_blender import exr
 
 
+def pairs(folder):
+    """(scene, reference, its noisy frames) of a folder of <scene>_<spp>spp.exr and <scene>_ref.exr, sorted."""
+    folder = glob.escape(folder)
+    for reference in sorted(glob.glob(os.path.join(folder, "*_ref.exr"))):
+        scene = os.path.basename(reference).removesuffix("_ref.exr")
+        yield scene, reference, sorted(glob.glob(os.path.join(folder, glob.escape(scene) + "_[0-9]*spp*.exr")))
+
+
 def planes(channels, ending, letters):
     """The channels of the one pass whose name ends so, (height, width, 3)."""
     found = [[c for c in channels if c.endswith(f"{ending}.{letter}")] for letter in letters]
@@ -78,10 +86,8 @@ def main():
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        for source in sorted(glob.glob(os.path.join(glob.escape(options.pairs), "*_ref.exr"))):
-            scene = os.path.basename(source).removesuffix("_ref.exr")
+        for scene, source, noisy in pairs(options.pairs):
             target = os.path.join(options.out, os.path.basename(source))
-            noisy = sorted(glob.glob(os.path.join(glob.escape(options.pairs), glob.escape(scene) + "_[0-9]*spp*.exr")))
             if os.path.exists(target) or not noisy:
                 continue
             for path in noisy:

@@ -5,7 +5,7 @@ use std::{collections::HashSet, io::IsTerminal, path::PathBuf, process::ExitCode
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{SOME_FAILED, methods};
+use super::methods;
 use crate::{
     Error, Result,
     report::{self, Event, Method, Options, Row},
@@ -15,12 +15,8 @@ use crate::{
 /// Arguments of `demc eval`.
 #[derive(Debug, ClapArgs)]
 pub struct Args {
-    /// Directory of <scene>_<spp>spp.exr and <scene>_ref.exr, CSV manifest, or quoted glob
-    #[arg(long, value_name = "DIR|MANIFEST|GLOB")]
-    test_set: String,
-    /// Methods: built-in names, oidn-fast, oidn-balanced, oidn-high, oidn-high-prefilter, weights files
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
-    models: Vec<String>,
+    #[command(flatten)]
+    asked: methods::Args,
     /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -30,15 +26,6 @@ pub struct Args {
     /// Timed runs of each method and scene after one that warms up; their median counts
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..))]
     repeats: u16,
-    /// Threads for every method [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
-    /// View layer to read [default: the one with the most passes]
-    #[arg(long, value_name = "NAME")]
-    view_layer: Option<String>,
-    /// The program oidnDenoise [default: $OIDN_DENOISE, else the one on PATH]
-    #[arg(long, value_name = "PATH")]
-    oidn: Option<PathBuf>,
     /// Write no comparison sheets
     #[arg(long)]
     no_sheets: bool,
@@ -52,9 +39,9 @@ pub struct Args {
 /// # Errors
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: Args) -> Result<ExitCode> {
-    let set = testset::read(&args.test_set)?;
-    let threads = methods::count(args.threads);
-    let methods = methods::open(&args.models, args.oidn.as_deref(), args.view_layer.as_deref(), threads)?;
+    let set = testset::read(&args.asked.test_set)?;
+    let threads = args.asked.threads();
+    let methods = args.asked.methods()?;
     let baseline = baseline(&args, &methods)?;
     let mut failed = methods::tell_unmatched(&set);
     let options = Options {
@@ -62,11 +49,11 @@ pub fn run(args: Args) -> Result<ExitCode> {
         repeats: args.repeats.into(),
         threads,
         baseline,
-        view_layer: args.view_layer,
+        view_layer: args.asked.view_layer,
         overwrite: args.overwrite,
         sheets: !args.no_sheets,
     };
-    let pool = methods::threads(threads)?;
+    let pool = methods::pool(threads)?;
     let mut progress = Progress::new();
     let rows = pool
         .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
@@ -75,11 +62,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     for file in ["summary.csv", "report.html"] {
         println!("{}", options.out.join(file).display());
     }
-    if failed > 0 {
-        eprintln!("demc: {failed} failed; {} says why", options.out.join("scores.csv").display());
-        return Ok(ExitCode::from(SOME_FAILED));
-    }
-    Ok(ExitCode::SUCCESS)
+    Ok(methods::finish(failed, &options.out.join("scores.csv")))
 }
 
 fn baseline(args: &Args, methods: &[Method]) -> Result<String> {
@@ -87,7 +70,8 @@ fn baseline(args: &Args, methods: &[Method]) -> Result<String> {
         return Ok(methods.get(1).unwrap_or(&methods[0]).name.clone());
     };
     let names: Vec<&str> = methods.iter().map(|m| m.name.as_str()).collect();
-    let wanted = methods::short_name(wanted, &args.models.iter().map(String::as_str).collect::<Vec<_>>());
+    let wanted =
+        methods::short_name(wanted, &args.asked.models.iter().map(String::as_str).collect::<Vec<_>>());
     if !names.contains(&wanted.as_str()) {
         return Err(Error::Usage(format!(
             "--baseline {wanted} is not among the methods: {}; add it to --models",

@@ -3,9 +3,12 @@
 use std::{
     collections::HashSet,
     path::{Path, PathBuf},
+    process::ExitCode,
 };
 
-use super::peak_memory;
+use clap::Args as ClapArgs;
+
+use super::{SOME_FAILED, peak_memory};
 use crate::{
     Error, Result,
     models::{self, Denoiser, oidn::Oidn},
@@ -13,39 +16,64 @@ use crate::{
     testset::{TestSet, Unmatched},
 };
 
-/// The methods of these names, the noisy input first, each under a name of its own.
-///
-/// # Errors
-/// A name is no method's.
-pub fn open(
-    models: &[String],
-    oidn: Option<&Path>,
-    view_layer: Option<&str>,
-    threads: usize,
-) -> Result<Vec<Method>> {
-    // Built-in methods change with the program.
-    let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
-    let asked = models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
-    let mut seen = HashSet::new();
-    let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
-    let mut methods = Vec::new();
-    for name in &asked {
-        let denoiser: Box<dyn Denoiser> = match Oidn::new(name, oidn.map(PathBuf::from)) {
-            Some(oidn) => Box::new(oidn),
-            None => models::open(name)?,
-        };
-        let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
-        let (spec, view_layer) = (name.to_string(), view_layer.map(String::from));
-        let peak_mib =
-            move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
-        methods.push(Method {
-            name: short_name(name, &asked),
-            denoiser,
-            peak_mib: Box::new(peak_mib),
-            stamp,
-        });
+/// Arguments that both have.
+#[derive(Debug, ClapArgs)]
+pub struct Args {
+    /// Directory of <scene>_<spp>spp.exr and <scene>_ref.exr, CSV manifest, or quoted glob
+    #[arg(long, value_name = "DIR|MANIFEST|GLOB")]
+    pub test_set: String,
+    /// Methods: built-in names, oidn-fast, oidn-balanced, oidn-high, oidn-high-prefilter, weights files
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
+    pub models: Vec<String>,
+    /// Threads for every method [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    /// View layer to read [default: the one with the most passes]
+    #[arg(long, value_name = "NAME")]
+    pub view_layer: Option<String>,
+    /// The program oidnDenoise [default: $OIDN_DENOISE, else the one on PATH]
+    #[arg(long, value_name = "PATH")]
+    oidn: Option<PathBuf>,
+}
+
+impl Args {
+    /// How many threads: as asked, or one for each core.
+    pub fn threads(&self) -> usize {
+        self.threads
+            .map(usize::from)
+            .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
     }
-    Ok(methods)
+
+    /// The methods asked for, the noisy input first, each under a name of its own.
+    ///
+    /// # Errors
+    /// A name is no method's.
+    pub fn methods(&self) -> Result<Vec<Method>> {
+        let threads = self.threads();
+        // Built-in methods change with the program.
+        let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
+        let asked = self.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
+        let mut seen = HashSet::new();
+        let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
+        let mut methods = Vec::new();
+        for name in &asked {
+            let denoiser: Box<dyn Denoiser> = match Oidn::new(name, self.oidn.clone()) {
+                Some(oidn) => Box::new(oidn),
+                None => models::open(name)?,
+            };
+            let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
+            let (spec, view_layer) = (name.to_string(), self.view_layer.clone());
+            let peak_mib =
+                move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
+            methods.push(Method {
+                name: short_name(name, &asked),
+                denoiser,
+                peak_mib: Box::new(peak_mib),
+                stamp,
+            });
+        }
+        Ok(methods)
+    }
 }
 
 /// A weights file goes by its stem, and by its folder too where the stem alone is another's.
@@ -80,18 +108,22 @@ pub fn tell_unmatched(set: &TestSet) -> usize {
     set.unmatched.iter().filter(|unmatched| matches!(unmatched, Unmatched::Noisy { .. })).count()
 }
 
-/// How many threads: as asked, or one for each core.
-pub fn count(asked: Option<u16>) -> usize {
-    asked.map(usize::from).unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
-}
-
 /// That many threads.
 ///
 /// # Errors
 /// The system refuses.
-pub fn threads(count: usize) -> Result<rayon::ThreadPool> {
+pub fn pool(count: usize) -> Result<rayon::ThreadPool> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(count)
         .build()
         .map_err(|e| Error::Usage(format!("cannot start {count} threads: {e}; use fewer")))
+}
+
+/// Says how many rows or frames failed, and which table says why; the exit status that goes with it.
+pub fn finish(failed: usize, table: &Path) -> ExitCode {
+    if failed == 0 {
+        return ExitCode::SUCCESS;
+    }
+    eprintln!("demc: {failed} failed; {} says why", table.display());
+    ExitCode::from(SOME_FAILED)
 }

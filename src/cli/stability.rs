@@ -4,7 +4,7 @@ use std::{path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, methods};
+use super::methods;
 use crate::{
     Result,
     report::number,
@@ -15,24 +15,11 @@ use crate::{
 /// Arguments of `demc stability`.
 #[derive(Debug, ClapArgs)]
 pub struct Args {
-    /// Directory of <scene>_<spp>spp.exr and <scene>_ref.exr, CSV manifest, or quoted glob
-    #[arg(long, value_name = "DIR|MANIFEST|GLOB")]
-    test_set: String,
-    /// Methods, as `demc eval` takes them
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
-    models: Vec<String>,
+    #[command(flatten)]
+    asked: methods::Args,
     /// Folder for stability.csv and stability_summary.csv
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Threads for every method [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
-    /// View layer to read [default: the one with the most passes]
-    #[arg(long, value_name = "NAME")]
-    view_layer: Option<String>,
-    /// The program oidnDenoise [default: $OIDN_DENOISE, else the one on PATH]
-    #[arg(long, value_name = "PATH")]
-    oidn: Option<PathBuf>,
 }
 
 /// Runs the trials.
@@ -40,10 +27,8 @@ pub struct Args {
 /// # Errors
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let set = testset::read(&args.test_set)?;
-    let threads = methods::count(args.threads);
-    let view_layer = args.view_layer.as_deref();
-    let methods = methods::open(&args.models, args.oidn.as_deref(), view_layer, threads)?;
+    let set = testset::read(&args.asked.test_set)?;
+    let methods = args.asked.methods()?;
     let mut failed = methods::tell_unmatched(&set);
     let (mut done, all) = (0, set.pairs.len() * methods.len() * Trial::ALL.len());
     let mut tell = |row: &Row| {
@@ -58,13 +43,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         };
         eprintln!("[{done}/{all}] {} {} spp {} {}{said}", row.scene, row.spp, row.model, row.trial);
     };
-    let rows = methods::threads(threads)?
+    let view_layer = args.asked.view_layer.as_deref();
+    let rows = methods::pool(args.asked.threads())?
         .install(|| stability::run(&set.pairs, &methods, view_layer, &args.out, &mut tell))?;
     failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
     println!("{}", args.out.join("stability_summary.csv").display());
-    if failed > 0 {
-        eprintln!("demc: {failed} failed; {} says why", args.out.join("stability.csv").display());
-        return Ok(ExitCode::from(SOME_FAILED));
-    }
-    Ok(ExitCode::SUCCESS)
+    Ok(methods::finish(failed, &args.out.join("stability.csv")))
 }

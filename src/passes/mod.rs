@@ -107,6 +107,26 @@ impl Pass {
         }
     }
 
+    /// Whether the pass scales with the light in the scene.
+    pub fn carries_radiance(self) -> bool {
+        use Pass::*;
+        matches!(
+            self,
+            Combined
+                | NoisyImage
+                | DiffuseDirect
+                | DiffuseIndirect
+                | GlossyDirect
+                | GlossyIndirect
+                | TransmissionDirect
+                | TransmissionIndirect
+                | VolumeDirect
+                | VolumeIndirect
+                | Emission
+                | Environment
+        )
+    }
+
     /// Names under which Blender has written the pass, the current one first.
     pub fn blender_names(self) -> &'static [&'static str] {
         names::row(self).names
@@ -158,6 +178,16 @@ impl PassSet {
             part.insert(pass, planes.window((0, rows.start), (self.width, rows.len())));
         }
         part
+    }
+
+    /// What `change` makes of every pass, of one new size.
+    ///
+    /// # Panics
+    /// If a result has another size or channel count.
+    pub fn map(&self, (width, height): (usize, usize), change: impl Fn(Pass, &Planes) -> Planes) -> Self {
+        let mut changed = Self::new(&self.path, &self.view_layer, width, height);
+        self.iter().for_each(|(pass, planes)| changed.insert(pass, change(pass, planes)));
+        changed
     }
 
     /// Adds or replaces a pass.

@@ -26,9 +26,9 @@ use std::path::{Path, PathBuf};
 
 pub use loss::loss_chart;
 pub use rows::{COLUMNS, Row, read_rows, to_csv, write_file};
-pub use run::{Event, evaluate};
+pub use run::{Event, Loaded, evaluate, load};
 pub use settings::file_stamp;
-pub use summary::{Method as MethodSummary, summarise};
+pub use summary::{Method as MethodSummary, geometric_mean, summarise};
 
 use crate::models::Denoiser;
 
@@ -82,6 +82,11 @@ pub fn number(value: f64) -> String {
     let decimals = (6 - magnitude).max(0) as usize;
     let text = format!("{value:.decimals$}");
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
+}
+
+/// A number's cell in a table: empty where there is none.
+pub fn cell(value: Option<f64>) -> String {
+    value.map(number).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use std::{
 
 use serde::Deserialize;
 
-use super::number;
+use super::cell;
 use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
@@ -136,7 +136,6 @@ impl Row {
 
     /// Its cells in the order of [`COLUMNS`].
     fn cells(&self) -> [String; COLUMNS.len()] {
-        let value = |v: Option<f64>| v.map(number).unwrap_or_default();
         let count = |v: Option<usize>| v.map(|v| v.to_string()).unwrap_or_default();
         [
             self.scene.clone(),
@@ -144,17 +143,17 @@ impl Row {
             self.spp.to_string(),
             count(self.width),
             count(self.height),
-            value(self.relmse),
-            value(self.ssim),
-            value(self.rmse),
-            value(self.max_error),
-            value(self.seconds),
-            value(self.ms_per_mpx),
-            value(self.exposure),
-            value(self.relmse_trimmed),
-            value(self.smape),
-            value(self.flip),
-            value(self.peak_mib),
+            cell(self.relmse),
+            cell(self.ssim),
+            cell(self.rmse),
+            cell(self.max_error),
+            cell(self.seconds),
+            cell(self.ms_per_mpx),
+            cell(self.exposure),
+            cell(self.relmse_trimmed),
+            cell(self.smape),
+            cell(self.flip),
+            cell(self.peak_mib),
             self.threads.to_string(),
             self.repeats.to_string(),
             count(self.non_finite),

@@ -158,16 +158,20 @@ struct Scene {
 }
 
 /// The decoded pair.
-struct Loaded {
+pub struct Loaded {
     /// As stored: what `noisy` is judged by.
-    noisy: Planes,
+    pub noisy: Planes,
     /// Non-finite values replaced: what methods see.
-    passes: PassSet,
-    reference: Planes,
+    pub passes: PassSet,
+    /// The reference's radiance, of the same size.
+    pub reference: Planes,
 }
 
-fn load(pair: &Pair, options: &Options) -> Result<Loaded> {
-    let view_layer = options.view_layer.as_deref();
+/// Reads a pair of frames, of the view layer named or the one with the most passes.
+///
+/// # Errors
+/// A file is unusable or lacks Combined, or their sizes differ.
+pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     let mut passes = passes::load(&pair.noisy, view_layer)?;
     passes.use_noisy_image();
     let noisy = passes.require(Pass::Combined, NOISY)?.clone();
@@ -201,7 +205,7 @@ fn run_pair(
         row.threads = options.threads;
         row
     };
-    let loaded = match load(pair, options) {
+    let loaded = match load(pair, options.view_layer.as_deref()) {
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };

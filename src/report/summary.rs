@@ -10,7 +10,7 @@ use std::{
 };
 
 use super::{
-    number,
+    cell,
     rows::{Row, to_csv},
 };
 
@@ -145,8 +145,8 @@ fn median(values: &[f64]) -> Option<f64> {
     Some(f64::midpoint(sorted[last / 2], sorted[sorted.len() / 2]))
 }
 
-/// None for no values, a negative one, or a ratio to zero.
-fn geometric_mean(values: &[f64]) -> Option<f64> {
+/// The geometric mean; none for no values, a negative one, or a ratio to zero.
+pub fn geometric_mean(values: &[f64]) -> Option<f64> {
     if values.iter().any(|v| *v < 0.0 || !v.is_finite()) {
         return None;
     }
@@ -161,7 +161,6 @@ pub fn to_text(summaries: &[Method], baseline: &str) -> String {
     }
     columns.push("peak_mib_max".into());
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
-    let value = |v: Option<f64>| v.map(number).unwrap_or_default();
     let rows = summaries.iter().map(|s| {
         let mut cells = vec![
             s.model.clone(),
@@ -171,9 +170,9 @@ pub fn to_text(summaries: &[Method], baseline: &str) -> String {
             baseline.into(),
         ];
         for s in s.statistics {
-            cells.extend([s.mean, s.median, s.geomean, s.ratio].map(value));
+            cells.extend([s.mean, s.median, s.geomean, s.ratio].map(cell));
         }
-        cells.push(value(s.peak_mib));
+        cells.push(cell(s.peak_mib));
         cells
     });
     to_csv(&columns, rows)

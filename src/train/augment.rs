@@ -60,11 +60,7 @@ impl Augment {
     /// # Panics
     /// As [`Augment::apply`].
     pub fn passes(&self, old: &PassSet) -> PassSet {
-        let mut new = PassSet::new(&old.path, &old.view_layer, old.width, old.height);
-        for (pass, planes) in old.iter() {
-            new.insert(pass, self.pass(pass, planes));
-        }
-        new
+        old.map((old.width, old.height), |pass, planes| self.pass(pass, planes))
     }
 
     fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
@@ -74,7 +70,7 @@ impl Augment {
             Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Vector => {}
             _ => planes = self.permuted(&planes),
         }
-        if Self::carries_radiance(pass) {
+        if pass.carries_radiance() {
             planes.data.iter_mut().for_each(|v| *v *= self.exposure);
         }
         planes
@@ -126,26 +122,6 @@ impl Augment {
             out.channel_mut(to).copy_from_slice(planes.channel(from));
         }
         out
-    }
-
-    /// Whether a pass scales with the light in the scene.
-    pub fn carries_radiance(pass: Pass) -> bool {
-        use Pass::*;
-        matches!(
-            pass,
-            Combined
-                | NoisyImage
-                | DiffuseDirect
-                | DiffuseIndirect
-                | GlossyDirect
-                | GlossyIndirect
-                | TransmissionDirect
-                | TransmissionIndirect
-                | VolumeDirect
-                | VolumeIndirect
-                | Emission
-                | Environment
-        )
     }
 }
 

@@ -8,6 +8,7 @@ sys.path.insert(0, sys.argv[1])
 import bpy
 from demc_blender import command_line as cl
 from demc_scenes.assets import Library
+from demc_scenes.materials import principled_of
 from demc_scenes.stage import Stage
 
 cl.quiet_stdout()
@@ -18,8 +19,7 @@ for model in library.models:
     size, base = " ".join(f"{v:.2f}" for v in group.size), f"{group.low.z:.2f}"
     # From the lowest part to the highest.
     parts = sorted(group.objects, key=lambda o: sum((o.matrix_world @ v.co).z for v in o.data.vertices))
-    trees = [part.material_slots[0].material.node_tree for part in parts]
-    shaders = [next(n for n in tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled") for tree in trees]
+    shaders = [principled_of(part.material_slots[0].material) for part in parts]
     looks = ("clear" if s.inputs["Transmission Weight"].default_value > 0.9 else "solid" for s in shaders)
     print(f"MODEL {model.name} {model.role} {size} from {base}: {' '.join(looks)}")
 for kind, sets in library.textures.items():

@@ -1,0 +1,31 @@
+"""Weights files as `demc train` writes them: safetensors in half precision."""
+
+import json
+import struct
+
+import numpy as np
+
+
+def read(path):
+    """The metadata, and the tensors by name in the file's order."""
+    data = open(path, "rb").read()
+    end = 8 + struct.unpack("<Q", data[:8])[0]
+    header = json.loads(data[8:end])
+    metadata, tensors = header.pop("__metadata__"), {}
+    for name, tensor in sorted(header.items(), key=lambda item: item[1]["data_offsets"]):
+        first, last = (end + offset for offset in tensor["data_offsets"])
+        tensors[name] = np.frombuffer(data[first:last], "<f2").reshape(tensor["shape"])
+    return metadata, tensors
+
+
+def write(path, metadata, tensors):
+    """What `read` gives, its tensors in any precision."""
+    header, values = {"__metadata__": metadata}, b""
+    for name, tensor in tensors.items():
+        offsets = [len(values), len(values) + 2 * tensor.size]
+        header[name] = {"dtype": "F16", "shape": list(tensor.shape), "data_offsets": offsets}
+        values += tensor.astype("<f2").tobytes()
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    with open(path, "wb") as file:
+        file.write(struct.pack("<Q", len(text)) + text + values)
