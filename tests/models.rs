@@ -356,11 +356,25 @@ fn a_wider_network_begins_as_the_narrower_one() {
         passes.insert(pass, Planes::from_vec(3, 40, 24, data));
     }
     let held = weights_file::read_as(&path, &narrow, 1).unwrap();
-    let wider = weights_file::read_as(&path, &wide, 1).unwrap();
+    let mut wider = weights_file::read_as(&path, &wide, 1).unwrap();
     assert_eq!(wider.config(), wide);
     let (a, b) = (held.infer(&passes, None).unwrap(), wider.infer(&passes, None).unwrap());
     for (a, b) in a.data.iter().zip(&b.data) {
         assert!((a - b).abs() <= 1e-4 * a.abs(), "{a} became {b}");
+    }
+    // Further channels are read with weights as large as those of the channels that they copy, but others.
+    for (layer, [channel, copy]) in
+        [("encoder.guide.2.1", [0, 4]), ("encoder.guide.2.1", [0, 8]), ("decoder.2.refine", [1, 21])]
+    {
+        let weight =
+            wider.params().into_iter().find(|param| param.name == format!("{layer}.weight")).unwrap();
+        let (inputs, taps) = (weight.shape[1], weight.shape[2] * weight.shape[3]);
+        let values = weight.values();
+        let reading =
+            |channel: usize| values.chunks(inputs * taps).flat_map(move |row| &row[channel * taps..][..taps]);
+        let norm = |channel: usize| reading(channel).map(|v| v * v).sum::<f32>().sqrt();
+        assert!(norm(copy) > 0.3 * norm(channel), "{layer}: {} beside {}", norm(copy), norm(channel));
+        assert!(reading(copy).ne(reading(channel)), "{layer}");
     }
     let error = weights_file::read_as(&path, &config([2, 5, 9, 17]), 1).err().unwrap().to_string();
     assert!(error.contains("neither") && error.contains("--widths"), "{error}");

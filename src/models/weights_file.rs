@@ -11,7 +11,7 @@ use super::{
 use crate::{
     Error, Result,
     nn::{
-        Arithmetic,
+        Arithmetic, Rng,
         weights::{self, Precision, Tensor},
     },
 };
@@ -92,8 +92,7 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
 }
 
 /// Reads the network `config` from a weights file that holds it, or a narrower one of the same design:
-/// the wider network then begins as the same function (see `Conv::widen_from`), its further channels as
-/// `seed` draws them.
+/// the wider network then begins as the same function, with what `seed` draws (see `Conv::widen_from`).
 ///
 /// # Errors
 /// As [`read`], or the file holds another network.
@@ -108,13 +107,13 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
     // Only convolutions can be widened: a network's every parameter must belong to one.
     let all = 2 * network.convolutions().len() == network.params().len();
     let fits = held.architecture == config.architecture && all && {
-        let mut narrow = super::build(held, 0);
+        let (mut narrow, rng) = (super::build(held, 0), &mut Rng::new(seed, 1));
         let find = |name: &str| tensors.iter().find(|t| t.name == name);
         network.convolutions().into_iter().zip(narrow.convolutions()).all(|(wide, narrow)| {
             let (weight, bias) = (find(&wide.weight.name), find(&wide.bias.name));
             weight.zip(bias).is_some_and(|(weight, bias)| {
                 let held = Arithmetic { outputs: bias.values.len(), ..narrow.arithmetic().clone() };
-                wide.widen_from(&held, &weight.values, &bias.values)
+                wide.widen_from(&held, &weight.values, &bias.values, rng)
             })
         })
     };

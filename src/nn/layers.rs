@@ -99,10 +99,12 @@ impl Conv {
         self
     }
 
-    /// Takes over the weights of a narrower layer of the same kind, so that it computes the same on the
-    /// channels they share: its further inputs begin without effect on the old outputs. Further outputs
-    /// keep their fresh weights, or begin at zero in a layer without ReLU. Returns whether the layers fit.
-    pub fn widen_from(&mut self, narrow: &Arithmetic, weight: &[f32], bias: &[f32]) -> bool {
+    /// Takes over the weights of a narrower layer of the same kind so that it computes the same, and every channel
+    /// counts: further channels copy the old ones in turn, and what reads a channel and its copies divides its weight
+    /// among them, at random (after Chen et al. 2016, Net2Net, where shares are equal). Their gradients then differ from
+    /// the first step on. Channels that begin without effect hardly learn one. Further outputs of a layer without ReLU,
+    /// which are no features, begin at zero. Returns whether the layers fit.
+    pub fn widen_from(&mut self, narrow: &Arithmetic, weight: &[f32], bias: &[f32], rng: &mut Rng) -> bool {
         let wide = &self.arithmetic;
         let fits = wide.geometry == narrow.geometry
             && wide.outputs >= narrow.outputs
@@ -112,22 +114,28 @@ impl Conv {
         if !fits || (weight.len(), bias.len()) != (total[1] * narrow.outputs * taps, narrow.outputs) {
             return false;
         }
-        let (mut weights, mut biases) = (self.weight.values(), self.bias.values());
-        if !self.relu {
-            weights.fill(0.0);
-        }
+        let outputs = if self.relu { wide.outputs } else { narrow.outputs };
+        let (mut weights, mut biases) = (vec![0.0; total[0] * wide.outputs * taps], vec![0.0; wide.outputs]);
         let place = |a: &Arithmetic, total, o, i, t| weight_index(a.geometry, a.outputs, total, o, i, t);
-        let mut first = [0; 2];
-        for (w, n) in wide.inputs.iter().zip(&narrow.inputs) {
-            for (o, i, t) in
-                (0..narrow.outputs).flat_map(|o| (0..*w).flat_map(move |i| (0..taps).map(move |t| (o, i, t))))
-            {
-                let old = (i < *n).then(|| weight[place(narrow, total[1], o, first[1] + i, t)]);
-                weights[place(wide, total[0], o, first[0] + i, t)] = old.unwrap_or(0.0);
+        for o in 0..outputs {
+            let copied = o % narrow.outputs;
+            biases[o] = bias[copied];
+            let mut first = [0; 2];
+            for (&w, &n) in wide.inputs.iter().zip(&narrow.inputs) {
+                for (i, t) in (0..n).flat_map(|i| (0..taps).map(move |t| (i, t))) {
+                    let old = weight[place(narrow, total[1], copied, first[1] + i, t)];
+                    let copies = (w - i).div_ceil(n);
+                    let mut rest = 1.0;
+                    for copy in (0..copies).rev() {
+                        let drawn = 1.0 / copies as f32 + 2.0 * rng.uniform() - 1.0;
+                        let share = if copy > 0 { drawn } else { rest };
+                        rest -= share;
+                        weights[place(wide, total[0], o, first[0] + i + copy * n, t)] = share * old;
+                    }
+                }
+                first = [first[0] + w, first[1] + n];
             }
-            first = [first[0] + w, first[1] + n];
         }
-        biases[..bias.len()].copy_from_slice(bias);
         self.weight.set(&weights);
         self.bias.set(&biases);
         self.frozen = None;
