@@ -6,17 +6,20 @@
 A channel counts as much as the norm of the weights that make it times the norm of those that read it, the latter
 relative to their mean over the channels of each layer that reads. Channels that were added to a trained network and
 hardly learned go without loss (`demc train --init` then widens the network again, by channels that count). The
-prefilter stays as it is.
+prefilter stays as it is, or goes too with --drop-prefilter. Needs numpy.
 """
 
 import argparse
 import json
 
 import numpy as np
+
 import weights
 
 # A decoder level is this much wider than the encoders beside it, as in src/models/pyramid.rs.
 DECODER_EXTRA = 16
+PREFILTER = "prefilter."  # the same
+KEY = "demc"  # src/nn/weights.rs
 ENCODERS = ["encoder.radiance", "encoder.guide"]
 
 
@@ -78,17 +81,23 @@ def main():
     parser.add_argument("input")
     parser.add_argument("output")
     parser.add_argument("--widths", required=True, help="channels at each level, finest first")
+    parser.add_argument("--drop-prefilter", action="store_true")
     args = parser.parse_args()
 
     metadata, tensors = weights.read(args.input)
-    facts = json.loads(metadata["demc"])
+    facts = json.loads(metadata[KEY])
     network = Network(tensors, facts["network"]["widths"])
     widths = [int(width) for width in args.widths.split(",")]
     if len(widths) != len(network.widths) or any(w > held for w, held in zip(widths, network.widths)):
         parser.error(f"{args.input} has widths {network.widths}, and no level of it can have more")
     for level, width in enumerate(widths):
         network.narrow(level, width)
-    metadata["demc"] = json.dumps(facts, separators=(",", ":"))
+    if args.drop_prefilter:
+        facts["network"].pop("prefilter", None)
+        for part in facts.get("ranges", {}), tensors:
+            for name in [name for name in part if name.startswith(PREFILTER)]:
+                del part[name]
+    metadata[KEY] = json.dumps(facts, separators=(",", ":"))
     weights.write(args.output, metadata, tensors)
 
 

@@ -1,10 +1,10 @@
 //! Blending the levels of a filtered pyramid, planar f32, one image at a time.
 //!
-//! `fine + sigmoid(alpha) * up(correction)`: what filtering changed in the level below, the correction,
-//! replaces the low frequencies of the fine level and leaves its detail (after Vogels et al. 2018,
-//! Section 4.3, with a mask for each pixel). `up` weighs the four nearest coarse pixels: bilinearly, times the
-//! exponential of what the network predicts for each, so that light does not leak over an edge (Balint et
-//! al. 2023 predict the whole upsampling kernel).
+//! `(1 - alpha) * fine + alpha * up(coarse)` with `alpha` the logistic of what the network predicts for each pixel: where
+//! the level below, already filtered, says all there is, nothing of the fine level's noise is left to filter. (Vogels et
+//! al. 2018, Section 4.3, keep the fine level's detail, and its noise with it.) `up` weighs the four nearest coarse
+//! pixels: bilinearly, times the exponential of what the network predicts for each, so that light does not leak over an
+//! edge (Balint et al. 2023 predict the whole upsampling kernel).
 
 use rayon::prelude::*;
 
@@ -64,29 +64,23 @@ pub struct Place {
     pub first: usize,
     /// Rows of the frame.
     pub total: usize,
-    /// The coarse frame's row that the correction's first is; every coarse row next to a fine one is there.
+    /// The coarse frame's row that the coarse level's first is; every coarse row next to a fine one is there.
     pub coarse: usize,
 }
 
-/// Adds a correction (3, h, W/2) to a fine level (3, H, W), where h is H/2 if that is all of the frame.
+/// Blends a fine level (3, H, W) with a coarse one (3, h, W/2), where h is H/2 if that is all of the frame.
 ///
 /// # Panics
 /// If lengths do not fit.
-pub fn blend(
-    size: Size,
-    place: Place,
-    (fine, correction): (&[f32], &[f32]),
-    masks: Masks,
-    output: &mut [f32],
-) {
+pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: Masks, output: &mut [f32]) {
     let n = size.pixels();
-    assert_eq!((fine.len(), output.len(), correction.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
+    assert_eq!((fine.len(), output.len(), coarse.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
     assert_eq!((masks.alpha.len(), masks.corners.len()), (n, CORNERS * n));
     let (red, rest) = output.split_at_mut(n);
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
     rows.enumerate().for_each(|(y, ((red, green), blue))| {
-        Tier::detect().run(Row { size, place, y, fine, correction, masks, output: [red, green, blue] });
+        Tier::detect().run(Row { size, place, y, fine, coarse, masks, output: [red, green, blue] });
     });
 }
 
@@ -96,7 +90,7 @@ struct Row<'a> {
     place: Place,
     y: usize,
     fine: &'a [f32],
-    correction: &'a [f32],
+    coarse: &'a [f32],
     masks: Masks<'a>,
     output: [&'a mut [f32]; 3],
 }
@@ -104,9 +98,9 @@ struct Row<'a> {
 impl Kernel for Row<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { size, place, y, fine, correction, masks, output } = self;
+        let Self { size, place, y, fine, coarse, masks, output } = self;
         let (w, n) = (size.w / 2, size.pixels());
-        let h = correction.len() / (3 * w).max(1);
+        let h = coarse.len() / (3 * w).max(1);
         let (own, other) = near(place.first + y, place.total / 2);
         let row = |values: &'_ [f32], plane: usize| -> std::ops::Range<usize> {
             debug_assert!(values.len() >= (plane + 1) * n);
@@ -122,27 +116,29 @@ impl Kernel for Row<'_> {
             }
         }
         let [w0, w1, w2, w3] = weights.each_ref().map(|w| &w[..size.w]);
-        let mut share = vec![0.0; size.w];
-        for (x, share) in share[..size.w].iter_mut().enumerate() {
-            *share = sigmoid(alpha[x]) / (w0[x] + w1[x] + w2[x] + w3[x]);
+        let (mut share, mut inverse) = (vec![0.0; size.w], vec![0.0; size.w]);
+        for (x, (share, inverse)) in share.iter_mut().zip(&mut inverse).enumerate() {
+            *share = sigmoid(alpha[x]);
+            *inverse = 1.0 / (w0[x] + w1[x] + w2[x] + w3[x]);
         }
-        // Each corner's correction, drawn out to the fine row.
+        // Each corner's coarse pixels, drawn out to the fine row.
         let mut drawn: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
         for (c, output) in output.into_iter().enumerate() {
-            for (pair, coarse) in [own - place.coarse, other - place.coarse].into_iter().enumerate() {
-                let coarse = &correction[(c * h + coarse) * w..][..w];
+            for (pair, row) in [own - place.coarse, other - place.coarse].into_iter().enumerate() {
+                let row = &coarse[(c * h + row) * w..][..w];
                 for x in 0..w {
-                    let (left, right) = (coarse[x.saturating_sub(1)], coarse[(x + 1).min(w - 1)]);
-                    drawn[2 * pair][2 * x..2 * x + 2].fill(coarse[x]);
+                    let (left, right) = (row[x.saturating_sub(1)], row[(x + 1).min(w - 1)]);
+                    drawn[2 * pair][2 * x..2 * x + 2].fill(row[x]);
                     drawn[2 * pair + 1][2 * x] = left;
                     drawn[2 * pair + 1][2 * x + 1] = right;
                 }
             }
             let [d0, d1, d2, d3] = drawn.each_ref().map(|d| &d[..size.w]);
-            let (fine, share) = (&fine[row(fine, c)][..size.w], &share[..size.w]);
+            let fine = &fine[row(fine, c)][..size.w];
+            let (share, inverse) = (&share[..size.w], &inverse[..size.w]);
             for (x, out) in output[..size.w].iter_mut().enumerate() {
                 let up = w0[x] * d0[x] + w1[x] * d1[x] + w2[x] * d2[x] + w3[x] * d3[x];
-                *out = fine[x] + share[x] * up;
+                *out = fine[x] + share[x] * (up * inverse[x] - fine[x]);
             }
         }
     }
@@ -152,8 +148,8 @@ impl Kernel for Row<'_> {
 pub struct BlendGradient<'a> {
     /// To the fine level, (3, H, W).
     pub fine: &'a mut [f32],
-    /// To the correction, (3, H/2, W/2).
-    pub correction: &'a mut [f32],
+    /// To the coarse level, (3, H/2, W/2).
+    pub coarse: &'a mut [f32],
     /// To the share's logit, (1, H, W).
     pub alpha: &'a mut [f32],
     /// To the corners' logits, (4, H, W).
@@ -167,27 +163,28 @@ pub struct BlendGradient<'a> {
 pub fn blend_gradient(
     size: Size,
     masks: Masks,
-    correction: &[f32],
+    (fine, coarse): (&[f32], &[f32]),
     output_gradient: &[f32],
     into: BlendGradient,
 ) {
     let (quarter, n) = (size.pixels() / 4, size.pixels());
-    assert_eq!((masks.alpha.len(), correction.len(), output_gradient.len()), (n, 3 * quarter, 3 * n));
+    assert_eq!((masks.alpha.len(), coarse.len(), output_gradient.len()), (n, 3 * quarter, 3 * n));
     for y in 0..size.h {
         for x in 0..size.w {
             let at = y * size.w + x;
             let share = sigmoid(masks.alpha[at]);
             let (corners, weights) = (corners(size, y, x), weights(masks.corners, n, at));
-            // What a unit of each corner's weight, and the upsampled correction, would change.
+            // What a unit of each corner's weight, and of the coarse level's share, would change.
             let (mut by_weight, mut by_share) = ([0.0; CORNERS], 0.0);
             for c in 0..3 {
                 let g = output_gradient[c * n + at];
-                into.fine[c * n + at] += g;
+                into.fine[c * n + at] += g * (1.0 - share);
+                by_share -= g * fine[c * n + at];
                 for i in 0..CORNERS {
                     let from = c * quarter + corners[i];
-                    by_weight[i] += g * share * correction[from];
-                    by_share += g * weights[i] * correction[from];
-                    into.correction[from] += weights[i] * g * share;
+                    by_weight[i] += g * share * coarse[from];
+                    by_share += g * weights[i] * coarse[from];
+                    into.coarse[from] += weights[i] * g * share;
                 }
             }
             into.alpha[at] += by_share * share * (1.0 - share);

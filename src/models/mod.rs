@@ -155,8 +155,8 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     let prefiltered = |widths| Config { prefilter: PREFILTER.into(), ..pyramid(widths) };
     let kpcn = |architecture| Config::new(architecture, &[32]);
     vec![
-        ("demc-s", pyramid([32, 48, 64, 80])),
-        ("demc-m", prefiltered([96, 96, 96, 112])),
+        ("demc-s", pyramid([48, 64, 80, 80])),
+        ("demc-m", prefiltered([80, 96, 96, 112])),
         ("demc-l", prefiltered([112, 128, 128, 128])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),

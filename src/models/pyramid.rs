@@ -3,7 +3,7 @@
 //! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
 //! follows what measurement favoured: the trunk works on 2x2 squares (space to depth), and each level
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
-//! al. 2018), after it was corrected by what filtering changed in the level below: a level's own kernels
+//! al. 2018), after it was blended with what filtering made of the level below: a level's own kernels
 //! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
 //! by a filtered albedo last, so texture is never blurred with the noise, and noise in the albedo (depth
 //! of field, 4 spp edges) is removed. A confidence for every pixel and level lets a firefly take itself
@@ -31,17 +31,21 @@ use crate::{
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
 pub const LEVELS: usize = 4;
 
-/// Rows and columns of the radiance kernels.
+/// Rows and columns of the radiance kernels below full resolution, and at it.
 const KERNEL: usize = 5;
+const FULL_KERNEL: usize = 3;
 
 /// Rows and columns of the albedo kernels.
 const ALBEDO_KERNEL: usize = 3;
 
-/// Channels of a level's head for each of its pixels: kernel, confidence, the mask that blends the level below, and the
-/// corners from which that is upsampled.
-const HEAD: usize = KERNEL * KERNEL + 2 + CORNERS;
+/// Channels of a trunk level's head: kernel, confidence, the mask that blends the level below, and the corners from
+/// which that is upsampled.
+const LEVEL_HEAD: usize = KERNEL * KERNEL + 2 + CORNERS;
 
-/// What follows for each pixel at full resolution, but in a prefilter: the albedo kernel.
+/// The same of the full-resolution head for one pixel.
+const FULL_HEAD: usize = FULL_KERNEL * FULL_KERNEL + 2 + CORNERS;
+
+/// What follows for one pixel, but in a prefilter: the albedo kernel.
 const ALBEDO_TAPS: usize = ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
@@ -90,9 +94,14 @@ struct Level {
     refine: Conv,
 }
 
+/// Rows and columns of the kernels of a level of the radiance pyramid, 0 the finest.
+const fn kernel_of(level: usize) -> usize {
+    if level == 0 { FULL_KERNEL } else { KERNEL }
+}
+
 /// What a head says of one level of the radiance pyramid.
 struct Prediction<T> {
-    /// Logits of the kernels, (N, 25, H, W).
+    /// Logits of the kernels, (N, 25, H, W); (N, 9, H, W) at full resolution.
     kernel: Field<T>,
     /// How far each pixel is to be trusted, (N, 1, H, W).
     confidence: Field<T>,
@@ -105,20 +114,22 @@ struct Prediction<T> {
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     /// What a trunk level's head says.
     fn of_level(head: Activation<T>) -> Self {
-        Self::split(head, 1)
+        Self::split(head, KERNEL, 1)
     }
 
     /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W), if it has them.
     fn of_full(head: Activation<T>) -> (Self, Option<Field<T>>) {
-        let has_albedo = head.shape().c > 4 * HEAD;
-        let albedo = has_albedo.then(|| Field::from_activation(head.fork(), 4 * HEAD, 4 * ALBEDO_TAPS, 2));
-        (Self::split(head, 2), albedo)
+        let has_albedo = head.shape().c > 4 * FULL_HEAD;
+        let albedo =
+            has_albedo.then(|| Field::from_activation(head.fork(), 4 * FULL_HEAD, 4 * ALBEDO_TAPS, 2));
+        (Self::split(head, FULL_KERNEL, 2), albedo)
     }
 
-    /// Parts a head's channels; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
-    fn split(head: Activation<T>, factor: usize) -> Self {
+    /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
+    /// the trunk.
+    fn split(head: Activation<T>, k: usize, factor: usize) -> Self {
         let area = factor * factor;
-        let taps = KERNEL * KERNEL * area;
+        let taps = k * k * area;
         Self {
             kernel: Field::from_activation(head.fork(), 0, taps, factor),
             confidence: Field::from_activation(head.fork(), taps, area, factor),
@@ -208,9 +219,9 @@ impl Pyramid {
             full: head(
                 "head.full".into(),
                 decoder_width(0),
-                4 * (HEAD + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
+                4 * (FULL_HEAD + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
             ),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), HEAD)).collect(),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
             config,
             prefilter: None,
             encoders,
@@ -256,8 +267,8 @@ impl Pyramid {
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(Prediction::of_level));
 
-        // The radiance pyramid, finest level first; then, from the coarsest up, each level is corrected by
-        // what filtering changed in the one below, and filtered.
+        // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
+        // filtering made of the one below, and filtered.
         let mut image = field(irradiance);
         let mut pyramid = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
@@ -269,16 +280,16 @@ impl Pyramid {
                 None => break,
             }
         }
-        let mut correction: Option<Field<T>> = None;
+        let mut below: Option<Field<T>> = None;
         loop {
             let (noisy, predicted) = pyramid.pop().expect("there are levels");
             let Prediction { kernel, confidence, mask, corners } = predicted;
-            let corrected = match correction.take() {
-                None => noisy.fork(),
+            let blended = match below.take() {
+                None => noisy,
                 // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
-                Some(correction) => noisy.fork().blend(correction, mask, corners),
+                Some(below) => noisy.blend(below, mask, corners),
             };
-            let filtered = corrected.filter(KERNEL, kernel, Some(confidence));
+            let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
             if pyramid.is_empty() {
                 let albedo = match albedo_kernel {
                     Some(kernel) => field(albedo).filter(ALBEDO_KERNEL, kernel, None),
@@ -286,7 +297,7 @@ impl Pyramid {
                 };
                 return filtered.product(albedo).into_images();
             }
-            correction = Some(filtered.minus(noisy));
+            below = Some(filtered);
         }
     }
 
@@ -387,7 +398,8 @@ impl Network for Pyramid {
             .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
             .sum();
         // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
-        let filters: f64 = (0..=LEVELS).map(|l| (4 * KERNEL * KERNEL) as f64 / 4f64.powi(l as i32)).sum();
+        let taps = |level: usize| (4 * kernel_of(level).pow(2)) as f64 / 4f64.powi(level as i32);
+        let filters: f64 = (0..=LEVELS).map(taps).sum();
         let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
         convolutions + filters + (4 * ALBEDO_TAPS) as f64 + prefilter
     }
@@ -396,7 +408,7 @@ impl Network for Pyramid {
         // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
         let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
         let prefilter = self.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
-        trunk + (0..=LEVELS).map(|level| (KERNEL / 2 + 1) << level).sum::<usize>() + prefilter
+        trunk + (0..=LEVELS).map(|level| (kernel_of(level) / 2 + 1) << level).sum::<usize>() + prefilter
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {

@@ -269,42 +269,16 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// The difference to a field of the same extent, `self - other`.
-    ///
-    /// # Panics
-    /// If extents differ.
-    pub fn minus(self, other: Self) -> Self {
-        assert_eq!(self.extent(), other.extent());
-        let (a, b) = (self.saved, other.saved);
-        let mut output = plane_buffer(a.values.data.len());
-        combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a - b);
-        let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
-        if T::OWNS_TAPE {
-            field.tape.add_backward_op(move |_| {
-                let Some(gradient) = out.take() else { return Ok(()) };
-                for (into, sign) in [(&a, 1.0), (&b, -1.0)] {
-                    into.accumulate(|into| {
-                        if let Some(into) = into {
-                            into.iter_mut().zip(&*gradient).for_each(|(sum, g)| *sum += sign * g);
-                        }
-                    });
-                }
-                Ok(())
-            });
-        }
-        field
-    }
-
-    /// Adds a `correction` of the level below, (N, 3, H/2, W/2), to this one, (N, 3, H, W): its share
-    /// before the logistic is `alpha`, (N, 1, H, W), the logits of its upsampling `corners`, (N, 4, H, W).
+    /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic is
+    /// `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W).
     /// See [`crate::kernels::blend`].
-    pub fn blend(self, correction: Self, alpha: Self, corners: Self) -> Self {
+    pub fn blend(self, coarse: Self, alpha: Self, corners: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
         let size = Size { h, w };
         let mut output = plane_buffer(images * 3 * pixels);
-        let tape = self.tape.merge(correction.tape).merge(alpha.tape).merge(corners.tape);
-        let (fine, below, mask, corners) = (self.saved, correction.saved, alpha.saved, corners.saved);
+        let tape = self.tape.merge(coarse.tape).merge(alpha.tape).merge(corners.tape);
+        let (fine, below, mask, corners) = (self.saved, coarse.saved, alpha.saved, corners.saved);
         let predicted = (mask.values.clone(), corners.values.clone());
         let place = Place { first: 0, total: h, coarse: 0 };
         for (n, output) in output.chunks_mut(3 * pixels).enumerate() {
@@ -315,7 +289,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         if T::OWNS_TAPE {
             field.tape.add_backward_op(move |_| {
                 let Some(gradient) = out.take() else { return Ok(()) };
-                let correction = &below.values;
+                let levels = (&fine.values, &below.values);
                 // A fine level that is the network's input gets no gradient; the kernel's goes nowhere.
                 let mut nowhere = plane_buffer(0);
                 let run = |fine: &mut [f32], coarse: &mut [f32], alpha: &mut [f32], corners: &mut [f32]| {
@@ -326,9 +300,15 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                         .enumerate()
                         .for_each(|(n, (((fine, coarse), alpha), corners))| {
                             let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
-                            let into = BlendGradient { fine, correction: coarse, alpha, corners };
+                            let into = BlendGradient { fine, coarse, alpha, corners };
                             let masks = masks_of(&predicted, n);
-                            blend_gradient(size, masks, correction.image(n), gradient, into);
+                            blend_gradient(
+                                size,
+                                masks,
+                                (levels.0.image(n), levels.1.image(n)),
+                                gradient,
+                                into,
+                            );
                         });
                 };
                 const LEARNED: &str = "what is blended was filtered or predicted";
@@ -396,11 +376,11 @@ impl Field<NoneTape> {
     }
 
     /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)
-    pub fn blend_rows(&self, place: Place, correction: &Self, alpha: &Self, corners: &Self) -> Self {
+    pub fn blend_rows(&self, place: Place, coarse: &Self, alpha: &Self, corners: &Self) -> Self {
         let (_, _, h, w) = self.extent();
         let mut output = plane_buffer(3 * h * w);
         let masks = Masks { alpha: alpha.values(), corners: corners.values() };
-        blend(Size { h, w }, place, (self.values(), correction.values()), masks, &mut output);
+        blend(Size { h, w }, place, (self.values(), coarse.values()), masks, &mut output);
         Self::from_buffer((1, 3, h, w), output)
     }
 }

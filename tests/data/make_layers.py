@@ -156,8 +156,7 @@ def reduced(image, confidence):
 
 
 def blended(fine, coarse, alpha):
-    difference = coarse - squares(fine).mean(axis=-1)
-    return fine + jax.nn.sigmoid(alpha) * jax.image.resize(difference, fine.shape, "bilinear")
+    return fine + jax.nn.sigmoid(alpha) * (jax.image.resize(coarse, fine.shape, "bilinear") - fine)
 
 
 def shuffled(x):

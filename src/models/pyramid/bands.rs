@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{ALBEDO_KERNEL, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
+use super::{ALBEDO_KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo},
@@ -147,13 +147,13 @@ struct Decoded {
 struct Scale {
     image: Line<Field>,
     confidence: Line<Field>,
-    /// What the head predicted for bands not yet corrected, and for those not yet filtered.
+    /// What the head predicted for bands not yet blended, and for those not yet filtered.
     masks: VecDeque<(Range<usize>, Field, Field)>,
     kernels: VecDeque<(Range<usize>, Field)>,
-    /// The image, corrected by the level below.
-    corrected: Line<Field>,
-    /// What filtering changed: the correction of the level above.
-    correction: Line<Field>,
+    /// The image, blended with the level below.
+    blended: Line<Field>,
+    /// What the level above takes in.
+    smooth: Line<Field>,
     /// Rows filtered.
     filtered: usize,
 }
@@ -176,8 +176,8 @@ impl<'a> Frame<'a> {
             confidence: Line::new(height >> s),
             masks: VecDeque::new(),
             kernels: VecDeque::new(),
-            corrected: Line::new(height >> s),
-            correction: Line::new(height >> s),
+            blended: Line::new(height >> s),
+            smooth: Line::new(height >> s),
             filtered: 0,
         };
         Self {
@@ -222,7 +222,7 @@ impl<'a> Frame<'a> {
         self.decode();
         self.reduce();
         for scale in (0..=LEVELS).rev() {
-            self.correct(scale);
+            self.blend(scale);
             self.filter(scale, done);
         }
         self.forget();
@@ -298,11 +298,11 @@ impl<'a> Frame<'a> {
         }
     }
 
-    /// Adds the correction of the scale below to the image.
-    fn correct(&mut self, scale: usize) {
+    /// Blends the image with what the scale below became.
+    fn blend(&mut self, scale: usize) {
         let (finer, coarser) = self.scales.split_at_mut(scale + 1);
-        let Scale { image, masks, corrected, .. } = &mut finer[scale];
-        let Some(below) = coarser.first().map(|c| &c.correction) else { return };
+        let Scale { image, masks, blended, .. } = &mut finer[scale];
+        let Some(below) = coarser.first().map(|c| &c.smooth) else { return };
         while let Some((rows, _, _)) = masks.front() {
             if image.end() < rows.end || 2 * below.settled(1) < rows.end {
                 break;
@@ -310,27 +310,26 @@ impl<'a> Frame<'a> {
             let (rows, mask, corners) = masks.pop_front().expect("there is one");
             let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
             let place = Place { first: rows.start, total: image.total(), coarse: near.start };
-            corrected.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
+            blended.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
         }
     }
 
     /// Filters the image; at full resolution, hands out what becomes of it.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field)) {
-        const REACH: usize = KERNEL / 2;
-        let Scale { image, confidence, kernels, corrected, correction, filtered, .. } =
-            &mut self.scales[scale];
-        let source = if scale == LEVELS { &*image } else { &*corrected };
+        let (k, reach) = (kernel_of(scale), kernel_of(scale) / 2);
+        let Scale { image, confidence, kernels, blended, smooth, filtered, .. } = &mut self.scales[scale];
+        let source = if scale == LEVELS { &*image } else { &*blended };
         while let Some((rows, _)) = kernels.front() {
-            if source.settled(REACH).min(confidence.settled(REACH)) < rows.end {
+            if source.settled(reach).min(confidence.settled(reach)) < rows.end {
                 break;
             }
             let (rows, kernel) = kernels.pop_front().expect("there is one");
-            let (near, inside) = around(&rows, REACH, source.total());
+            let (near, inside) = around(&rows, reach, source.total());
             let (source, trust) = (source.rows(near.clone()), confidence.rows(near));
-            let smooth = source.filter_rows(inside, KERNEL, &kernel, Some(&trust));
+            let output = source.filter_rows(inside, k, &kernel, Some(&trust));
             *filtered = rows.end;
             if scale > 0 {
-                correction.push(smooth.minus(image.rows(rows)));
+                smooth.push(output);
                 continue;
             }
             let kernel = self.albedo_kernels.pop_front().expect("there is one for each kernel");
@@ -341,7 +340,7 @@ impl<'a> Frame<'a> {
                 }
                 None => self.albedo.rows(rows.clone()),
             };
-            done(rows.start, &smooth.product(albedo));
+            done(rows.start, &output.product(albedo));
         }
     }
 
@@ -364,13 +363,13 @@ impl<'a> Frame<'a> {
         }
         for scale in 0..=LEVELS {
             let reduced = self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.image.end());
-            let above = scale.checked_sub(1).map_or(0, |above| self.scales[above].corrected.end() / 2);
-            let Scale { image, confidence, corrected, correction, filtered, .. } = &mut self.scales[scale];
-            let reach = filtered.saturating_sub(KERNEL / 2);
+            let above = scale.checked_sub(1).map_or(0, |above| self.scales[above].blended.end() / 2);
+            let Scale { image, confidence, blended, smooth, filtered, .. } = &mut self.scales[scale];
+            let reach = filtered.saturating_sub(kernel_of(scale) / 2);
             image.forget(reach.min(reduced));
             confidence.forget(reach.min(reduced));
-            corrected.forget(reach);
-            correction.forget(above.saturating_sub(1));
+            blended.forget(reach);
+            smooth.forget(above.saturating_sub(1));
         }
         self.albedo.forget(self.scales[0].filtered.saturating_sub(ALBEDO_KERNEL / 2));
     }

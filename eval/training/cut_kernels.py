@@ -1,0 +1,23 @@
+#!/usr/bin/env python3
+"""Cuts the 5x5 kernels of full resolution down to their centres, 3x3: cut_kernels.py IN OUT
+
+The weights then fit the network whose levels blend, and are a beginning for its training, no more: its masks say something
+else. Needs numpy.
+"""
+
+import sys
+
+import numpy as np
+
+import weights
+
+PIXELS, TAPS = 4, 5  # of one pixel of the trunk, and along an edge of a kernel
+centre = np.arange(TAPS * TAPS).reshape(TAPS, TAPS)[1:-1, 1:-1].ravel()
+kept = (PIXELS * centre[:, None] + np.arange(PIXELS)).ravel()
+
+source, target = sys.argv[1:]
+metadata, tensors = weights.read(source)
+for name, tensor in tensors.items():
+    if name.rsplit(".", 1)[0].endswith("head.full"):
+        tensors[name] = np.concatenate([tensor[kept], tensor[PIXELS * TAPS * TAPS :]])
+weights.write(target, metadata, tensors)
