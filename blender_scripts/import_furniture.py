@@ -31,6 +31,7 @@ _PROP_SIZE = 0.6  # metres; smaller furniture stands on furniture
 _CATEGORIES = {"Characters": "figure", "Vehicles": "vehicle"}
 _PLANTS = re.compile(r"plant|tree|palm|flower|bush|hedge|ficus|cactus|bamboo|pine|maple|cypress|fern|lily|acacia|beech|poplar|bonsai")
 _Y_UP = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # the libraries' axes to Blender's
+_NEEDED = ("id", "name", "width", "depth", "height")  # of a model's entry in a catalogue
 _HEADER = ("name", "category", "size_m", "source", "author", "licence")
 
 
@@ -122,9 +123,13 @@ def main():
             archive.extractall(folder)
             library, entries = catalogue(archive)
             for model in entries:
-                name, category = name_and_category(model)
-                target = os.path.join(models, f"{name}.glb")
+                name = model["model"]
                 try:
+                    missing = [key for key in _NEEDED if key not in model]
+                    if missing:
+                        raise ValueError(f"its entry in the catalogue of {path} has no {', '.join(missing)}")
+                    name, category = name_and_category(model)
+                    target = os.path.join(models, f"{name}.glb")
                     if not os.path.exists(target):
                         import_model(folder, model)
                         mend_materials()

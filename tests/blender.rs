@@ -277,7 +277,11 @@ fn makes_assets_of_furniture_libraries_and_of_images() {
     };
     let said = import("import_furniture.py", &furniture, "library.sh3f");
     assert!(said.contains("test_maker_nothing: left out"), "{said}");
-    assert!(said.contains("1 models in") && said.contains("1 left out"), "{said}");
+    assert!(
+        said.contains("/test/flat.obj: left out") && said.contains("library.sh3f has no depth"),
+        "{said}"
+    );
+    assert!(said.contains("1 models in") && said.contains("2 left out"), "{said}");
     let said = import("import_textures.py", &textures, "images");
     assert!(said.contains("brick_broken.jpg: left out"), "{said}");
     assert!(said.contains("1 textures in") && said.contains("2 of fitting names left out"), "{said}");

@@ -1,6 +1,6 @@
 """Writes a furniture library of Sweet Home 3D and a folder of images: make_furniture.py FOLDER.
 
-The library holds a table, drawn upside down, with a glass top, and a model whose file is empty.
+The library holds a table, drawn upside down, with a glass top, a model whose file is empty, and one of unknown depth.
 """
 
 import sys
@@ -28,6 +28,11 @@ model#2=/test/nothing.obj
 width#2=10
 depth#2=10
 height#2=10
+id#3=Test maker#flat
+name#3=Flat
+model#3=/test/flat.obj
+width#3=10
+height#3=10
 """
 
 
