@@ -232,8 +232,8 @@ def render_compact(scene, path, partial):
     """Renders, drops what no network reads, and stores the rest as half in one part."""
     rendering.render_to(scene, partial)
     channels = {name: plane for name, plane in exr.read(partial).items() if not name.endswith(_DROPPED)}
-    exr.write_half(partial, channels)
-    os.replace(partial, path)
+    exr.write_half(path, channels)
+    os.remove(partial)
 
 
 def render_scene(options, library, records, seed, kind, scene_name):

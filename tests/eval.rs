@@ -2,37 +2,23 @@
 
 mod common;
 
-use std::{
-    collections::HashMap,
-    fs,
-    path::{Path, PathBuf},
-};
+use std::{fs, path::Path};
 
-use assert_cmd::{Command as Demc, assert::Assert};
-use common::python;
+use assert_cmd::assert::Assert;
+use common::{
+    demc,
+    files::data,
+    python,
+    tables::{Row, table},
+};
 use predicates::prelude::*;
 
 const CONTRACT: &str = "scene,model,spp,width,height,relmse,ssim,rmse,max_error,seconds,ms_per_mpx,exposure";
-
-fn data(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
-}
-
-fn demc() -> Demc {
-    Demc::cargo_bin("demc").unwrap()
-}
 
 /// Runs `demc eval` with one timed run unless told otherwise, plus `more` arguments.
 fn eval(set: &Path, out: &Path, more: &[&str]) -> Assert {
     let once = if more.contains(&"--repeats") { &[][..] } else { &["--repeats", "1"] };
     demc().arg("eval").args(once).arg("--test-set").arg(set).arg("--out").arg(out).args(more).assert()
-}
-
-type Row = HashMap<String, String>;
-
-fn table(path: &Path) -> Vec<Row> {
-    let mut reader = csv::Reader::from_path(path).unwrap();
-    reader.deserialize().map(Result::unwrap).collect()
 }
 
 fn row<'a>(rows: &'a [Row], scene: &str, model: &str) -> &'a Row {

@@ -9,22 +9,13 @@ use std::{
     process::Command,
 };
 
-use assert_cmd::Command as Demc;
-use common::python;
+use common::{demc, files::data, python};
 use predicates::prelude::*;
 
 const SCENES: [&str; 2] = ["s0000_room", "s0010_outdoor"];
 
-fn data(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
-}
-
 fn pair(scene: &str) -> (PathBuf, PathBuf) {
     (data(&format!("{scene}_0004spp.exr")), data(&format!("{scene}_ref.exr")))
-}
-
-fn demc() -> Demc {
-    Demc::cargo_bin("demc").unwrap()
 }
 
 /// What `demc compare` prints.

@@ -1,28 +1,15 @@
 //! `demc stability` from the command line.
 
-use std::{
-    collections::HashMap,
-    fs,
-    path::{Path, PathBuf},
+mod common;
+
+use std::fs;
+
+use common::{
+    demc,
+    files::data,
+    tables::{Row, table},
 };
-
-use assert_cmd::Command as Demc;
 use predicates::prelude::*;
-
-type Row = HashMap<String, String>;
-
-fn data(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
-}
-
-fn demc() -> Demc {
-    Demc::cargo_bin("demc").unwrap()
-}
-
-fn table(path: &Path) -> Vec<Row> {
-    let mut reader = csv::Reader::from_path(path).unwrap();
-    reader.deserialize().map(Result::unwrap).collect()
-}
 
 fn value(row: &Row, column: &str) -> f64 {
     row[column].parse().unwrap_or_else(|_| panic!("{column} of {row:?}"))

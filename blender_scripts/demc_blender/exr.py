@@ -5,6 +5,7 @@ the passes of a render. Training crops are read back here, judged, and stored as
 Scan lines with no, ZIPS or ZIP compression are understood: what these scripts make Blender write.
 """
 
+import os
 import struct
 import zlib
 
@@ -38,7 +39,7 @@ def read(path):
 
 
 def write_half(path, channels):
-    """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines."""
+    """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all."""
     names = sorted(channels)
     height, width = channels[names[0]].shape
     limit = float(np.finfo(np.float16).max)
@@ -66,8 +67,10 @@ def write_half(path, channels):
     for chunk in chunks:
         table += struct.pack("<Q", offset)
         offset += len(chunk)
-    with open(path, "wb") as file:
+    partial = f"{path}.tmp"
+    with open(partial, "wb") as file:
         file.write(header + table + b"".join(chunks))
+    os.replace(partial, path)
 
 
 def _text(data, at):

@@ -13,10 +13,10 @@ import weights
 FRONT, ALBEDO = 27 * 4, 9 * 4  # taps, confidence and mask of four pixels; their albedo's taps
 
 source, target = sys.argv[1:]
-metadata, tensors = weights.read(source)
+facts, tensors = weights.read(source)
 for name, tensor in tensors.items():
     layer = name.rsplit(".", 1)[0]
     if layer.endswith("head.full"):
         front, albedo, corners = np.split(tensor, [FRONT, FRONT + ALBEDO])
         tensors[name] = np.concatenate([front, corners] + ([] if layer.startswith("prefilter.") else [albedo]))
-weights.write(target, metadata, tensors)
+weights.write(target, facts, tensors)

@@ -30,8 +30,7 @@ def convert(source, target):
     for c, name in enumerate(radiance_names):
         kept[name] = np.clip(albedo[..., c], 0, 1) + ALBEDO_FLOOR
     kept.update({name: np.ones_like(albedo[..., 0]) for name in albedo_names})
-    exr.write_half(target + ".tmp", kept)
-    os.replace(target + ".tmp", target)
+    exr.write_half(target, kept)
     return True
 
 

@@ -6,27 +6,23 @@ the largest range that any of them knows for a layer. Needs numpy.
 """
 
 import argparse
-import json
 
 import numpy as np
 
 import weights
 
-KEY = "demc"  # src/nn/weights.rs
-
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("files", nargs="+")
 parser.add_argument("--out", required=True)
 args = parser.parse_args()
-metadata, tensors = zip(*map(weights.read, args.files))
+facts, tensors = zip(*map(weights.read, args.files))
 shapes = [[(name, tensor.shape) for name, tensor in held.items()] for held in tensors]
 if any(other != shapes[0] for other in shapes):
     raise SystemExit("these are not weights of one network")
 ranges = {}
-for held in metadata:
-    for layer, value in json.loads(held[KEY]).get("ranges", {}).items():
+for held in facts:
+    for layer, value in held.get("ranges", {}).items():
         ranges[layer] = max(value, ranges.get(layer, 0.0))
-last = metadata[-1]
-last[KEY] = json.dumps(json.loads(last[KEY]) | ({"ranges": ranges} if ranges else {}))
+last = facts[-1] | ({"ranges": ranges} if ranges else {})
 mean = {name: np.mean([held[name].astype(np.float32) for held in tensors], axis=0) for name in tensors[0]}
 weights.write(args.out, last, mean)

@@ -46,9 +46,7 @@ def main():
                     radiance, names = planes(channels, "Combined", "RGB")
                     radiance = radiance * floored(clean) / floored(noisy)
                     channels.update({name: radiance[..., c] for c, name in enumerate(names)})
-            target = os.path.join(options.out, os.path.basename(source))
-            exr.write_half(target + ".tmp", channels)
-            os.replace(target + ".tmp", target)
+            exr.write_half(os.path.join(options.out, os.path.basename(source)), channels)
             shutil.copy(reference, options.out)
             print(scene, flush=True)
 

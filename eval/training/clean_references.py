@@ -69,12 +69,14 @@ def denoise(oidn, folder, output, *flags, **images):
     return read_pfm(path(output))
 
 
-def clean(oidn, folder, reference, albedo, normal):
-    """The reference without its noise."""
+def clean(oidn, folder, radiance, frame):
+    """Radiance without its noise; `frame` are the channels of the frame whose guides help."""
+    albedo, _ = planes(frame, "Denoising Albedo", "RGB")
+    normal, _ = planes(frame, "Denoising Normal", "XYZ")
     denoise(oidn, folder, "albedo", **{"--alb": albedo})
     denoise(oidn, folder, "normal", **{"--nrm": normal})
     guides = {"--alb": "albedo", "--nrm": "normal"}
-    return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": reference}, **guides)
+    return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": radiance}, **guides)
 
 
 def main():
@@ -92,15 +94,12 @@ def main():
                 continue
             for path in noisy:
                 shutil.copy(path, options.out)
-            channels, guides = exr.read(source), exr.read(noisy[0])
+            channels = exr.read(source)
             reference, names = planes(channels, "Combined", "RGB")
-            albedo, _ = planes(guides, "Denoising Albedo", "RGB")
-            normal, _ = planes(guides, "Denoising Normal", "XYZ")
-            cleaned = clean(options.oidn, folder, reference, albedo, normal)
+            cleaned = clean(options.oidn, folder, reference, exr.read(noisy[0]))
             for c, name in enumerate(names):
                 channels.update({name: cleaned[..., c], name.replace("Combined", "Noisy Image"): reference[..., c]})
-            exr.write_half(target + ".tmp", channels)
-            os.replace(target + ".tmp", target)
+            exr.write_half(target, channels)
             print(scene, flush=True)
 
 

@@ -12,9 +12,9 @@ CHANNELS = {"head.full": 160}  # 40 for each of four pixels
 TRUNK_HEAD_CHANNELS = 31
 
 source, target = sys.argv[1:]
-metadata, tensors = weights.read(source)
+facts, tensors = weights.read(source)
 for name, tensor in tensors.items():
     layer = name.rsplit(".", 1)[0]
     if layer.startswith("head."):
         tensors[name] = tensor[: CHANNELS.get(layer, TRUNK_HEAD_CHANNELS)]
-weights.write(target, metadata, tensors)
+weights.write(target, facts, tensors)

@@ -16,8 +16,8 @@ centre = np.arange(TAPS * TAPS).reshape(TAPS, TAPS)[1:-1, 1:-1].ravel()
 kept = (PIXELS * centre[:, None] + np.arange(PIXELS)).ravel()
 
 source, target = sys.argv[1:]
-metadata, tensors = weights.read(source)
+facts, tensors = weights.read(source)
 for name, tensor in tensors.items():
     if name.rsplit(".", 1)[0].endswith("head.full"):
         tensors[name] = np.concatenate([tensor[kept], tensor[PIXELS * TAPS * TAPS :]])
-weights.write(target, metadata, tensors)
+weights.write(target, facts, tensors)

@@ -9,13 +9,12 @@ pairs teach is to leave alone what needs no filter. What is there already is kep
 """
 
 import argparse
-import glob
 import os
 import sys
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "blender_scripts"))
+from clean_references import exr, pairs
 
-from demc_blender import exr, names
+from demc_blender import names  # found through the import above
 
 
 def main():
@@ -26,8 +25,7 @@ def main():
     parser.add_argument("--spp", type=int, required=True, help="samples of the references")
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
-    for source in sorted(glob.glob(os.path.join(glob.escape(options.pairs), "*_ref.exr"))):
-        scene = os.path.basename(source).removesuffix("_ref.exr")
+    for scene, source, _ in pairs(options.pairs):
         channels = exr.read(source)
         noisy = {name.replace("Noisy Image", "Combined"): v for name, v in channels.items() if "Noisy Image" in name}
         if not noisy:
@@ -39,8 +37,7 @@ def main():
                              (names.reference_name(scene), clean)):
             target = os.path.join(options.out, name)
             if not os.path.exists(target):
-                exr.write_half(target + ".tmp", planes)
-                os.replace(target + ".tmp", target)
+                exr.write_half(target, planes)
 
 
 if __name__ == "__main__":

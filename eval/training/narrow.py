@@ -10,7 +10,6 @@ prefilter stays as it is, or goes too with --drop-prefilter. Needs numpy.
 """
 
 import argparse
-import json
 
 import numpy as np
 
@@ -19,7 +18,6 @@ import weights
 # A decoder level is this much wider than the encoders beside it, as in src/models/pyramid.rs.
 DECODER_EXTRA = 16
 PREFILTER = "prefilter."  # the same
-KEY = "demc"  # src/nn/weights.rs
 ENCODERS = ["encoder.radiance", "encoder.guide"]
 
 
@@ -84,8 +82,7 @@ def main():
     parser.add_argument("--drop-prefilter", action="store_true")
     args = parser.parse_args()
 
-    metadata, tensors = weights.read(args.input)
-    facts = json.loads(metadata[KEY])
+    facts, tensors = weights.read(args.input)
     network = Network(tensors, facts["network"]["widths"])
     widths = [int(width) for width in args.widths.split(",")]
     if len(widths) != len(network.widths) or any(w > held for w, held in zip(widths, network.widths)):
@@ -97,8 +94,7 @@ def main():
         for part in facts.get("ranges", {}), tensors:
             for name in [name for name in part if name.startswith(PREFILTER)]:
                 del part[name]
-    metadata[KEY] = json.dumps(facts, separators=(",", ":"))
-    weights.write(args.output, metadata, tensors)
+    weights.write(args.output, facts, tensors)
 
 
 if __name__ == "__main__":

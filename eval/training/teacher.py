@@ -34,11 +34,8 @@ def main():
             if not os.path.exists(target):
                 channels = exr.read(row["noisy"])
                 radiance, names = planes(channels, "Combined", "RGB")
-                albedo, _ = planes(channels, "Denoising Albedo", "RGB")
-                normal, _ = planes(channels, "Denoising Normal", "XYZ")
-                taught = clean(options.oidn, folder, radiance, albedo, normal)
-                exr.write_half(target + ".tmp", {name: taught[..., c] for c, name in enumerate(names)})
-                os.replace(target + ".tmp", target)
+                taught = clean(options.oidn, folder, radiance, channels)
+                exr.write_half(target, {name: taught[..., c] for c, name in enumerate(names)})
             pairs.append([f"{scene}_taught", row["noisy"], target, row["spp"]])
     with open(os.path.join(options.out, "manifest.csv"), "w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([["scene", "noisy", "reference", "spp"], *pairs])

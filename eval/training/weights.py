@@ -5,22 +5,24 @@ import struct
 
 import numpy as np
 
+_KEY = "demc"  # src/nn/weights.rs
+
 
 def read(path):
-    """The metadata, and the tensors by name in the file's order."""
+    """The facts (network, training, ranges), and the tensors by name in the file's order."""
     data = open(path, "rb").read()
     end = 8 + struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8:end])
-    metadata, tensors = header.pop("__metadata__"), {}
+    facts, tensors = json.loads(header.pop("__metadata__")[_KEY]), {}
     for name, tensor in sorted(header.items(), key=lambda item: item[1]["data_offsets"]):
         first, last = (end + offset for offset in tensor["data_offsets"])
         tensors[name] = np.frombuffer(data[first:last], "<f2").reshape(tensor["shape"])
-    return metadata, tensors
+    return facts, tensors
 
 
-def write(path, metadata, tensors):
+def write(path, facts, tensors):
     """What `read` gives, its tensors in any precision."""
-    header, values = {"__metadata__": metadata}, b""
+    header, values = {"__metadata__": {_KEY: json.dumps(facts, separators=(",", ":"))}}, b""
     for name, tensor in tensors.items():
         offsets = [len(values), len(values) + 2 * tensor.size]
         header[name] = {"dtype": "F16", "shape": list(tensor.shape), "data_offsets": offsets}

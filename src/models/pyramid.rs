@@ -38,14 +38,7 @@ const FULL_KERNEL: usize = 3;
 /// Rows and columns of the albedo kernels.
 const ALBEDO_KERNEL: usize = 3;
 
-/// Channels of a trunk level's head: kernel, confidence, the mask that blends the level below, and the corners from
-/// which that is upsampled.
-const LEVEL_HEAD: usize = KERNEL * KERNEL + 2 + CORNERS;
-
-/// The same of the full-resolution head for one pixel.
-const FULL_HEAD: usize = FULL_KERNEL * FULL_KERNEL + 2 + CORNERS;
-
-/// What follows for one pixel, but in a prefilter: the albedo kernel.
+/// Channels that the head of full resolution has besides for one pixel, but in a prefilter: the albedo kernel.
 const ALBEDO_TAPS: usize = ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
@@ -99,6 +92,12 @@ const fn kernel_of(level: usize) -> usize {
     if level == 0 { FULL_KERNEL } else { KERNEL }
 }
 
+/// Channels of that level's head for one pixel: kernel, confidence, the mask that blends the level below, and the
+/// corners from which that is upsampled.
+const fn head_of(level: usize) -> usize {
+    kernel_of(level).pow(2) + 2 + CORNERS
+}
+
 /// What a head says of one level of the radiance pyramid.
 struct Prediction<T> {
     /// Logits of the kernels, (N, 25, H, W); (N, 9, H, W) at full resolution.
@@ -119,9 +118,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
 
     /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W), if it has them.
     fn of_full(head: Activation<T>) -> (Self, Option<Field<T>>) {
-        let has_albedo = head.shape().c > 4 * FULL_HEAD;
+        let has_albedo = head.shape().c > 4 * head_of(0);
         let albedo =
-            has_albedo.then(|| Field::from_activation(head.fork(), 4 * FULL_HEAD, 4 * ALBEDO_TAPS, 2));
+            has_albedo.then(|| Field::from_activation(head.fork(), 4 * head_of(0), 4 * ALBEDO_TAPS, 2));
         (Self::split(head, FULL_KERNEL, 2), albedo)
     }
 
@@ -219,9 +218,9 @@ impl Pyramid {
             full: head(
                 "head.full".into(),
                 decoder_width(0),
-                4 * (FULL_HEAD + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
+                4 * (head_of(0) + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
             ),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), LEVEL_HEAD)).collect(),
+            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), head_of(l + 1))).collect(),
             config,
             prefilter: None,
             encoders,

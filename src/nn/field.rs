@@ -302,13 +302,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                             let gradient = &gradient[n * 3 * pixels..][..3 * pixels];
                             let into = BlendGradient { fine, coarse, alpha, corners };
                             let masks = masks_of(&predicted, n);
-                            blend_gradient(
-                                size,
-                                masks,
-                                (levels.0.image(n), levels.1.image(n)),
-                                gradient,
-                                into,
-                            );
+                            let levels = (levels.0.image(n), levels.1.image(n));
+                            blend_gradient(size, masks, levels, gradient, into);
                         });
                 };
                 const LEARNED: &str = "what is blended was filtered or predicted";

@@ -4,3 +4,9 @@
 pub mod browser;
 pub mod files;
 pub mod python;
+pub mod tables;
+
+/// The program under test.
+pub fn demc() -> assert_cmd::Command {
+    assert_cmd::Command::cargo_bin("demc").unwrap()
+}
