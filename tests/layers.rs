@@ -271,6 +271,16 @@ fn blending_a_coarse_level_into_a_fine_one() {
     }
 }
 
+#[test]
+fn amplifying_by_predicted_gains() {
+    let case = Case::new("amplify");
+    let [image, logits] = ["image", "logits"].map(|key| case.images(key));
+    let [image_field, logits_field] = [&image, &logits].map(traced_field);
+    let gradients = case.project(image_field.amplify(logits_field).into_images());
+    case.compare_image("d_image", &gradients, &image);
+    case.compare_image("d_logits", &gradients, &logits);
+}
+
 /// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.
 #[test]
 fn channels_to_pixels_and_back() {

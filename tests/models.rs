@@ -306,20 +306,36 @@ fn light_that_kpcn_does_not_filter_is_optional() {
 }
 
 #[test]
-fn a_constant_image_stays_as_it_is() {
+fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     // Kernels are convex combinations: whatever the weights, constant radiance over constant albedo
-    // comes out unchanged.
+    // comes out of them unchanged.
     let mut passes = PassSet::new("flat.exr", "ViewLayer", 32, 32);
     let flat = |v: f32| Planes::from_vec(3, 32, 32, vec![v; 3 * 32 * 32]);
     passes.insert(Pass::Combined, flat(0.7));
     passes.insert(Pass::DenoisingAlbedo, flat(0.4));
     passes.insert(Pass::DenoisingNormal, flat(0.5));
     let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-m").expect("it is trainable").1;
-    let network = models::build(&config, 7);
+    let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 4);
-    let image = network.infer(&passes, None).expect("all passes are there");
-    assert!(image.data.iter().all(|v| (v - 0.7).abs() < 1e-4), "{:?}", &image.data[..8]);
+    // The gains of four pixels follow their kernels, confidences, masks and corners.
+    const GAINS: std::ops::Range<usize> = 60..72;
+    for (logit, gain) in [(0.0, 1.0), (-50.0, (-2.0f32).exp()), (50.0, 2.0f32.exp())] {
+        for param in network.params() {
+            let each = param.shape.iter().skip(1).product::<usize>();
+            let value = match param.name.as_str() {
+                "head.full.weight" | "prefilter.head.full.weight" | "prefilter.head.full.bias" => 0.0,
+                "head.full.bias" => logit,
+                _ => continue,
+            };
+            let mut values = param.values();
+            values[GAINS.start * each..GAINS.end * each].fill(value);
+            param.set(&values);
+        }
+        let image = network.infer(&passes, None).expect("all passes are there");
+        let want = 0.7 * gain;
+        assert!(image.data.iter().all(|v| (v - want).abs() < 2e-4 * want), "{want}: {:?}", &image.data[..8]);
+    }
 }
 
 /// Something to write into a file.

@@ -52,7 +52,8 @@ pub struct Args {
     /// Learning rate of the first and last step
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
-    /// What is minimised: relmse, smape, both summed, or edges, which adds the error of differences
+    /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, or geomean, the
+    /// logarithm of each crop's relmse
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
     /// Take squared errors, not their denominators, against what references were before Blender denoised them,

@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{Size, exp},
+    filter::{Size, exp, logistic},
     simd::{Kernel, Simd, Tier},
 };
 
@@ -18,12 +18,6 @@ pub const CORNERS: usize = 4;
 
 /// Their bilinear weights: nearest, beside it in the row, beside it in the column, across.
 const BILINEAR: [f32; CORNERS] = [0.5625, 0.1875, 0.1875, 0.0625];
-
-/// The logistic function, which keeps a blend between its two images.
-#[inline(always)]
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp(-x))
-}
 
 /// The coarse row (or column) of `n` that fine one `i` lies in, and the next nearest, the edge repeated.
 #[inline(always)]
@@ -118,7 +112,7 @@ impl Kernel for Row<'_> {
         let [w0, w1, w2, w3] = weights.each_ref().map(|w| &w[..size.w]);
         let (mut share, mut inverse) = (vec![0.0; size.w], vec![0.0; size.w]);
         for (x, (share, inverse)) in share.iter_mut().zip(&mut inverse).enumerate() {
-            *share = sigmoid(alpha[x]);
+            *share = logistic(alpha[x]);
             *inverse = 1.0 / (w0[x] + w1[x] + w2[x] + w3[x]);
         }
         // Each corner's coarse pixels, drawn out to the fine row.
@@ -172,7 +166,7 @@ pub fn blend_gradient(
     for y in 0..size.h {
         for x in 0..size.w {
             let at = y * size.w + x;
-            let share = sigmoid(masks.alpha[at]);
+            let share = logistic(masks.alpha[at]);
             let (corners, weights) = (corners(size, y, x), weights(masks.corners, n, at));
             // What a unit of each corner's weight, and of the coarse level's share, would change.
             let (mut by_weight, mut by_share) = ([0.0; CORNERS], 0.0);

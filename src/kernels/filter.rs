@@ -81,6 +81,12 @@ pub(super) fn exp(x: f32) -> f32 {
     e * f32::from_bits(bits)
 }
 
+/// The logistic function.
+#[inline(always)]
+pub(super) fn logistic(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
 /// The columns of a row whose neighbour `dx` away lies inside the row; `|dx| < w`.
 #[inline(always)]
 fn columns(w: usize, dx: isize) -> (usize, usize) {

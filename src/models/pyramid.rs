@@ -9,7 +9,8 @@
 //! of field, 4 spp edges) is removed. A confidence for every pixel and level lets a firefly take itself
 //! out of all kernels at once.
 //!
-//! A network that outputs kernels cannot invent a colour, and scales with its input exactly.
+//! Kernels cannot invent a colour, and scale with their input exactly; nor can they draw an edge finer than the noise
+//! that they average. So each colour of each pixel gets a bounded gain last, which scales with the input as well.
 //!
 //! Wider networks read an albedo that a prefilter denoised: a small network of the same kind, which was trained
 //! to denoise albedo in the place of radiance and is not trained any further.
@@ -38,7 +39,9 @@ const FULL_KERNEL: usize = 3;
 /// Rows and columns of the albedo kernels.
 const ALBEDO_KERNEL: usize = 3;
 
-/// Channels that the head of full resolution has besides for one pixel, but in a prefilter: the albedo kernel.
+/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, but in a prefilter,
+/// the albedo kernel.
+const GAINS: usize = 3;
 const ALBEDO_TAPS: usize = ALBEDO_KERNEL * ALBEDO_KERNEL;
 
 /// A decoder level is this much wider than the encoders beside it.
@@ -66,7 +69,7 @@ pub struct Pyramid {
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
-    /// Full resolution: radiance kernels, confidence, mask, corners and albedo kernels of four pixels.
+    /// Full resolution: radiance kernels, confidence, mask, corners, gains and albedo kernels of four pixels.
     full: Conv,
     /// One head a trunk level, finest first.
     heads: Vec<Conv>,
@@ -110,18 +113,27 @@ struct Prediction<T> {
     corners: Field<T>,
 }
 
+/// What the head of full resolution says of the rest of a frame, once its light is filtered.
+struct Finish<T> {
+    /// Logits of the gains, (N, 3, H, W).
+    gain: Field<T>,
+    /// Logits of the albedo kernels, (N, 9, H, W), if it has them.
+    albedo: Option<Field<T>>,
+}
+
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     /// What a trunk level's head says.
     fn of_level(head: Activation<T>) -> Self {
         Self::split(head, KERNEL, 1)
     }
 
-    /// What the head of full resolution says, and the logits of its albedo kernels, (N, 9, 2H, 2W), if it has them.
-    fn of_full(head: Activation<T>) -> (Self, Option<Field<T>>) {
-        let has_albedo = head.shape().c > 4 * head_of(0);
-        let albedo =
-            has_albedo.then(|| Field::from_activation(head.fork(), 4 * head_of(0), 4 * ALBEDO_TAPS, 2));
-        (Self::split(head, FULL_KERNEL, 2), albedo)
+    /// What the head of full resolution says.
+    fn of_full(head: Activation<T>) -> (Self, Finish<T>) {
+        const FIRST: [usize; 2] = [4 * head_of(0), 4 * (head_of(0) + GAINS)];
+        let has_albedo = head.shape().c > FIRST[1];
+        let albedo = has_albedo.then(|| Field::from_activation(head.fork(), FIRST[1], 4 * ALBEDO_TAPS, 2));
+        let gain = Field::from_activation(head.fork(), FIRST[0], 4 * GAINS, 2);
+        (Self::split(head, FULL_KERNEL, 2), Finish { gain, albedo })
     }
 
     /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
@@ -218,7 +230,7 @@ impl Pyramid {
             full: head(
                 "head.full".into(),
                 decoder_width(0),
-                4 * (head_of(0) + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
+                4 * (head_of(0) + GAINS + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
             ),
             heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), head_of(l + 1))).collect(),
             config,
@@ -262,7 +274,7 @@ impl Pyramid {
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, albedo_kernel) = Prediction::of_full(full);
+        let (finest, finish) = Prediction::of_full(full);
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(Prediction::of_level));
 
@@ -290,11 +302,11 @@ impl Pyramid {
             };
             let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
             if pyramid.is_empty() {
-                let albedo = match albedo_kernel {
+                let albedo = match finish.albedo {
                     Some(kernel) => field(albedo).filter(ALBEDO_KERNEL, kernel, None),
                     None => field(albedo),
                 };
-                return filtered.product(albedo).into_images();
+                return filtered.product(albedo).amplify(finish.gain).into_images();
             }
             below = Some(filtered);
         }

@@ -12,6 +12,7 @@ use super::{
 use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
+    gain::{amplify, amplify_gradient},
     layout::{from_blocked_shuffled, to_blocked_shuffled},
     simd::Tier,
 };
@@ -263,6 +264,33 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                         }
                     });
                 }
+                Ok(())
+            });
+        }
+        field
+    }
+
+    /// Every value times the gain of a logit in a field of the same extent. See [`crate::kernels::gain`].
+    ///
+    /// # Panics
+    /// If extents differ.
+    pub fn amplify(self, logits: Self) -> Self {
+        assert_eq!(self.extent(), logits.extent());
+        let tape = self.tape.merge(logits.tape);
+        let (image, logits) = (self.saved, logits.saved);
+        let mut output = plane_buffer(image.values.data.len());
+        amplify(&image.values.data, &logits.values.data, &mut output);
+        let (mut field, out) = Self::output(image.values.extent, output, tape);
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                image.accumulate(|into_image| {
+                    logits.accumulate(|into_logits| {
+                        const LEARNED: &str = "what is amplified was filtered, its gain predicted";
+                        let into = (into_image.expect(LEARNED), into_logits.expect(LEARNED));
+                        amplify_gradient((&image.values.data, &logits.values.data), &gradient, into);
+                    });
+                });
                 Ok(())
             });
         }

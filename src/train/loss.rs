@@ -29,6 +29,9 @@ pub enum Loss {
     /// brightness: steps in a smooth gradient and soft edges weigh little as errors of pixels, but are what
     /// people see first (and what SSIM measures).
     Edges,
+    /// Mean over images of `ln(1 + RelMSE / 0.001)`, for the geometric mean over scenes by which methods are compared. A
+    /// plain mean is all but made of the noisiest images; what is left to gain on even walls counts for nothing in it.
+    Geomean,
 }
 
 impl std::fmt::Display for Loss {
@@ -38,13 +41,14 @@ impl std::fmt::Display for Loss {
             Loss::Smape => "smape",
             Loss::Both => "both",
             Loss::Edges => "edges",
+            Loss::Geomean => "geomean",
         })
     }
 }
 
 impl Loss {
     /// Every loss, for the command line.
-    pub const ALL: [Loss; 4] = [Loss::Relmse, Loss::Smape, Loss::Both, Loss::Edges];
+    pub const ALL: [Loss; 5] = [Loss::Relmse, Loss::Smape, Loss::Both, Loss::Edges, Loss::Geomean];
 
     /// The loss of `image` against `reference`, same shape and scale.
     ///
@@ -71,6 +75,7 @@ impl Loss {
                 let differences = edges(image.with_empty_tape(), &reference);
                 Loss::Both.of(image, reference, raw, scale) + differences
             }
+            Loss::Geomean => geomean(image, &reference, raw, scale),
         }
     }
 }
@@ -79,19 +84,60 @@ impl Loss {
 /// radiance, where that is dark).
 const RAW_LIMIT: f32 = 8.0;
 
+/// A RelMSE below which there is little left to gain.
+const SMALL_ERROR: f32 = 1e-3;
+
 fn relmse(
     image: Images<Taped>,
     reference: &[f32],
     raw: Option<Vec<f32>>,
     scale: &[f32],
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
+    let weight = denominators(reference, scale).map(f32::recip).collect();
+    squares(image, reference, raw, weight)
+}
+
+/// The logarithm's gradient by way of weights: those of each image divided by its error. That is against the clean
+/// reference: the noise of a raw one would make every image look as bad.
+fn geomean(
+    image: Images<Taped>,
+    reference: &[f32],
+    raw: Option<Vec<f32>>,
+    scale: &[f32],
+) -> Tensor<Rank0, f32, Cpu, Taped> {
+    let (images, values) = (scale.len(), reference.len() / scale.len());
+    let mut weight: Vec<f32> = denominators(reference, scale).map(f32::recip).collect();
+    let image_values = image.as_vec();
+    let logarithms = weight.par_chunks_mut(values).enumerate().map(|(n, weight)| {
+        let of_image = n * values..(n + 1) * values;
+        let squares = image_values[of_image.clone()].iter().zip(&reference[of_image]).zip(&*weight);
+        let sum: f64 = squares.map(|((x, r), w)| f64::from((x - r) * (x - r) * w)).sum();
+        let error = (sum / values as f64) as f32;
+        weight.iter_mut().for_each(|w| *w /= error + SMALL_ERROR);
+        (error / SMALL_ERROR).ln_1p()
+    });
+    let logarithms: Vec<f32> = logarithms.collect(); // in the order of images, whatever the threads do
+    let loss = squares(image, reference, raw, weight);
+    // Same gradient, but the value of the logarithm.
+    let value = logarithms.iter().sum::<f32>() / images as f32;
+    let shift = value - loss.as_vec()[0];
+    loss + shift
+}
+
+/// What squared errors are divided by, `r^2 + 0.001` in scene radiance.
+fn denominators(reference: &[f32], scale: &[f32]) -> impl Iterator<Item = f32> {
+    let values = reference.len() / scale.len();
+    reference.iter().enumerate().map(move |(i, r)| r * r + RELMSE_EPSILON as f32 / scale[i / values].powi(2))
+}
+
+/// The mean of weighted squared errors against the raw reference, if there is one.
+fn squares(
+    image: Images<Taped>,
+    reference: &[f32],
+    raw: Option<Vec<f32>>,
+    weight: Vec<f32>,
+) -> Tensor<Rank0, f32, Cpu, Taped> {
     let (device, shape) = (Cpu::default(), *image.shape());
-    let values = shape.1 * shape.2 * shape.3;
-    let weight: Vec<f32> = reference
-        .iter()
-        .enumerate()
-        .map(|(i, r)| (r * r + RELMSE_EPSILON as f32 / scale[i / values].powi(2)).recip())
-        .collect();
     let weight: Images = device.tensor_from_vec(weight, shape);
     let target = match raw {
         Some(raw) => raw.iter().zip(reference).map(|(raw, r)| raw.min(RAW_LIMIT * r + 1.0)).collect(),
@@ -189,6 +235,33 @@ mod tests {
         assert!((clean - noisy).abs() < 1e-3 * clean.abs(), "{clean} and {noisy}");
         assert!(noisy_loss > 2.0 * clean_loss, "noise adds to the loss itself");
         assert!(((0.2f32.powi(2) / (0.25 + RELMSE_EPSILON as f32)) - clean_loss).abs() < 1e-5);
+    }
+
+    #[test]
+    fn the_geometric_mean_weighs_every_image_by_its_own_error() {
+        const SHAPE: (usize, usize, usize, usize) = (2, 3, 8, 8);
+        let count = 3 * 8 * 8;
+        // Off by 0.2 and by 0.02, of 0.5.
+        let values = [vec![0.7; count], vec![0.52; count]].concat();
+        let image: Images = Cpu::default().tensor_from_vec(values, SHAPE);
+        let loss = |raw| Loss::Geomean.of(image.leaky_trace(), vec![0.5; 2 * count], raw, &[1.0, 1.0]);
+        let errors = [0.2f64, 0.02].map(|e| e * e / (0.25 + RELMSE_EPSILON) + f64::from(SMALL_ERROR));
+        let want = errors.map(|e| (e / f64::from(SMALL_ERROR)).ln()).iter().sum::<f64>() / 2.0;
+        let value = f64::from(loss(None).array());
+        assert!((value - want).abs() < 1e-4, "{value}, not {want}");
+        let gradients = loss(None).backward().get(&image).as_vec();
+        let sums = [&gradients[..count], &gradients[count..]].map(|g| f64::from(g.iter().sum::<f32>()));
+        for ((sum, error), off) in sums.into_iter().zip(errors).zip([0.2, 0.02]) {
+            let want = 2.0 * off / (0.25 + RELMSE_EPSILON) / error / 2.0;
+            assert!((sum - want).abs() < 1e-3 * want, "{sum}, not {want}");
+        }
+        // A raw reference that errs by chance on either side changes the value's gradient in neither image.
+        let raw = (0..2 * count).map(|i| if i % 2 == 0 { 0.9 } else { 0.1 }).collect();
+        let noisy = loss(Some(raw)).backward().get(&image).as_vec();
+        for (clean, noisy) in gradients.chunks(count).zip(noisy.chunks(count)) {
+            let [clean, noisy] = [clean, noisy].map(|g| g.iter().sum::<f32>());
+            assert!((clean - noisy).abs() < 1e-3 * clean, "{clean} and {noisy}");
+        }
     }
 
     #[test]

@@ -159,6 +159,10 @@ def blended(fine, coarse, alpha):
     return fine + jax.nn.sigmoid(alpha) * (jax.image.resize(coarse, fine.shape, "bilinear") - fine)
 
 
+def amplified(image, logits):
+    return image * jnp.exp(2 * jnp.tanh(logits / 2))
+
+
 def shuffled(x):
     """Channels 3..15 of 17: each four in a row are the pixels of a 2x2 square."""
     n, _, h, w = x.shape
@@ -177,6 +181,7 @@ def fields():
         coarse = normal(2, 3, h // 2, w // 2)
         case(name, blended, fine=normal(2, 3, h, w), coarse=coarse, alpha=normal(2, 1, h, w))
     case("shuffle", shuffled, x=normal(2, 17, 2, 3))
+    case("amplify", amplified, image=normal(2, 3, 5, 7), logits=2 * normal(2, 3, 5, 7))
 
 
 if __name__ == "__main__":

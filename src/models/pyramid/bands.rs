@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{ALBEDO_KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{ALBEDO_KERNEL, Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo},
@@ -125,8 +125,8 @@ struct Frame<'a> {
     /// Full resolution first.
     scales: Vec<Scale>,
     albedo: Line<Field>,
-    /// One for each kernel of full resolution, where the network has them.
-    albedo_kernels: VecDeque<Option<Field>>,
+    /// One for each kernel of full resolution.
+    finishes: VecDeque<Finish<NoneTape>>,
 }
 
 /// A level of an encoder.
@@ -187,7 +187,7 @@ impl<'a> Frame<'a> {
             decoder: (0..LEVELS).map(decoded).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
             albedo: Line::new(height),
-            albedo_kernels: VecDeque::new(),
+            finishes: VecDeque::new(),
         }
     }
 
@@ -279,8 +279,8 @@ impl<'a> Frame<'a> {
             self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (prediction, albedo_kernel) = Prediction::of_full(head);
-                self.albedo_kernels.push_back(albedo_kernel);
+                let (prediction, finish) = Prediction::of_full(head);
+                self.finishes.push_back(finish);
                 self.scales[0].predicted(2 * rows.start..2 * rows.end, prediction);
             }
         }
@@ -332,15 +332,15 @@ impl<'a> Frame<'a> {
                 smooth.push(output);
                 continue;
             }
-            let kernel = self.albedo_kernels.pop_front().expect("there is one for each kernel");
-            let albedo = match kernel {
+            let finish = self.finishes.pop_front().expect("there is one for each kernel");
+            let albedo = match finish.albedo {
                 Some(kernel) => {
                     let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
                     self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None)
                 }
                 None => self.albedo.rows(rows.clone()),
             };
-            done(rows.start, &output.product(albedo));
+            done(rows.start, &output.product(albedo).amplify(finish.gain));
         }
     }
 
