@@ -1,9 +1,11 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 
+mod fireflies;
 mod kpcn;
 mod lbf;
 
+pub use fireflies::{FIREFLY, tame_fireflies};
 pub use kpcn::{
     DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
     kpcn_streams,
@@ -105,22 +107,33 @@ const MIDDLE_GREY: f64 = 0.18;
 /// the noise of single pixels does not bias the exposure.
 const EXPOSURE_SQUARE: usize = 16;
 
+/// Rows of a frame, its fireflies [tamed](tame_fireflies) at the `exposure` of the whole: nothing darker than middle grey
+/// is one.
+///
+/// # Errors
+/// The Combined pass is missing.
+pub fn guide_rows(
+    passes: &PassSet,
+    rows: std::ops::Range<usize>,
+    exposure: f32,
+    needed_by: &str,
+) -> Result<PassSet> {
+    let radiance = passes.require(Pass::Combined, needed_by)?;
+    let tamed = tame_fireflies(radiance, rows.clone(), MIDDLE_GREY as f32 / exposure);
+    let mut part = passes.rows(&[Pass::DenoisingNormal, Pass::DenoisingAlbedo], rows);
+    part.insert(Pass::Combined, tamed);
+    Ok(part)
+}
+
 /// The built-in models' inputs, in this order:
 /// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
 /// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
-/// camera-space normal (6, H, W). The scale is the inverse of the exposure.
+/// camera-space normal (6, H, W). The scale is the inverse of the exposure, that of the whole frame, of which `passes` may
+/// be some rows.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guides(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
-    guides_exposed(passes, exposure(passes.require(Pass::Combined, needed_by)?), needed_by)
-}
-
-/// [`guides`] with an exposure that was found before: for some rows of a frame.
-///
-/// # Errors
-/// As [`guides`].
-pub fn guides_exposed(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
+pub fn guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();

@@ -17,12 +17,14 @@
 
 mod bands;
 
+use std::ops::Range;
+
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
-    features::{GUIDE_PASSES, Inputs, albedo_as_radiance, guides, radiance_as_albedo},
+    features::{GUIDE_PASSES, Inputs, albedo_as_radiance, exposure, guide_rows, guides, radiance_as_albedo},
     kernels::blend::CORNERS,
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
@@ -249,6 +251,15 @@ impl Pyramid {
         Ok(Some(passes))
     }
 
+    /// Rows of a frame as the network reads them. There are no fireflies in an albedo.
+    fn rows(&self, passes: &PassSet, rows: Range<usize>, exposure: f32) -> Result<PassSet> {
+        let is_prefilter = self.full.arithmetic().outputs == 4 * (head_of(0) + GAINS);
+        if is_prefilter {
+            return Ok(passes.rows(self.passes(), rows));
+        }
+        guide_rows(passes, rows, exposure, NEEDED_BY)
+    }
+
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
         let [irradiance, albedo, radiance_input, guide_input] = &batch[..] else {
             unreachable!("`inputs` makes four planes")
@@ -342,7 +353,10 @@ impl Network for Pyramid {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
-        guides(self.prefiltered(passes)?.as_ref().unwrap_or(passes), NEEDED_BY)
+        let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
+        let prefiltered = self.prefiltered(passes)?;
+        let passes = prefiltered.as_ref().unwrap_or(passes);
+        guides(&self.rows(passes, 0..passes.height, exposure)?, exposure, NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {

@@ -11,7 +11,7 @@ use dfdx::tensor::NoneTape;
 use super::{ALBEDO_KERNEL, Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
-    features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides_exposed, radiance_as_albedo},
+    features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides, radiance_as_albedo},
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -50,14 +50,14 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
             let band = albedo_as_radiance(&passes.rows(network.passes(), band), NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
             albedo.push(&band, &mut |first, clean| {
-                let mut band = passes.rows(network.passes(), first..first + clean.height);
+                let mut band = network.rows(passes, first..first + clean.height, exposure)?;
                 band.insert(Pass::DenoisingAlbedo, radiance_as_albedo(clean));
                 radiance.push(&band, &mut write)
             })?;
         }
     } else {
         for band in bands {
-            radiance.push(&passes.rows(network.passes(), band), &mut write)?;
+            radiance.push(&network.rows(passes, band, exposure)?, &mut write)?;
         }
     }
     Ok(image)
@@ -88,7 +88,7 @@ impl<'a> Feed<'a> {
         let before = self.rows;
         self.rows += band.height;
         let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
-        let inputs = guides_exposed(band, self.exposure, NEEDED_BY)?.padded_to(self.padded.0, end - before);
+        let inputs = guides(band, self.exposure, NEEDED_BY)?.padded_to(self.padded.0, end - before);
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {

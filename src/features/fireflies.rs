@@ -1,0 +1,120 @@
+//! Single pixels far brighter than all around them, as unlikely paths to a lamp leave them.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::planes::Planes;
+
+/// A pixel may be this many times as bright as the brightest other one of the 5x5 around it.
+pub const FIREFLY: f32 = 32.0;
+
+/// Rows and columns on either side that are compared.
+const REACH: usize = 2;
+
+/// Rows `rows` of radiance, (3, H, W) -> (3, R, W), in which a pixel's brightest channel is at most [`FIREFLY`] times that
+/// of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is more; what is brighter is
+/// scaled down to that and keeps its hue.
+///
+/// Of 1000 times the mean, what a network lets through of a pixel that it hardly trusts still shows.
+pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, floor: f32) -> Planes {
+    let w = radiance.width;
+    if radiance.pixels() == 1 {
+        return radiance.clone(); // nothing to compare with
+    }
+    let near = rows.start.saturating_sub(REACH)..(rows.end + REACH).min(radiance.height);
+    // The brightest channel, and the brightest of the row's pixels up to two columns away.
+    let brightest: Vec<f32> = (near.start * w..near.end * w)
+        .into_par_iter()
+        .with_min_len(w)
+        .map(|at| (0..3).map(|c| radiance.channel(c)[at]).fold(0.0, f32::max))
+        .collect();
+    let of_row = |row: &[f32], x: usize, itself: bool| {
+        let columns = x.saturating_sub(REACH)..(x + REACH + 1).min(w);
+        columns.filter(|&at| itself || at != x).map(|at| row[at]).fold(0.0, f32::max)
+    };
+    let mut widened = vec![0.0; brightest.len()];
+    widened.par_chunks_mut(w).zip(brightest.par_chunks(w)).for_each(|(widened, row)| {
+        widened.iter_mut().enumerate().for_each(|(x, to)| *to = of_row(row, x, true));
+    });
+    let mut tamed = radiance.window((0, rows.start), (w, rows.len()));
+    let n = tamed.pixels();
+    let (red, rest) = tamed.data.split_at_mut(n);
+    let (green, blue) = rest.split_at_mut(n);
+    let channels = red.par_chunks_mut(w).zip(green.par_chunks_mut(w)).zip(blue.par_chunks_mut(w));
+    channels.enumerate().for_each(|(y, ((red, green), blue))| {
+        let own = rows.start + y - near.start;
+        let row = &brightest[own * w..][..w];
+        let others = own.saturating_sub(REACH)..(own + REACH + 1).min(near.len());
+        let others: Vec<&[f32]> = others.filter(|&o| o != own).map(|o| &widened[o * w..][..w]).collect();
+        for x in 0..w {
+            let limit = |around: f32| (FIREFLY * around).max(floor);
+            let around = others.iter().map(|row| row[x]).fold(0.0, f32::max);
+            if row[x] <= limit(around) {
+                continue;
+            }
+            let limit = limit(around.max(of_row(row, x, false)));
+            if row[x] > limit {
+                [&mut *red, &mut *green, &mut *blue].into_iter().for_each(|c| c[x] *= limit / row[x]);
+            }
+        }
+    });
+    tamed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Grey noise between 0.5 and 1.5 with some pixels brighter.
+    fn frame(bright: &[(usize, usize, f32)]) -> Planes {
+        let (w, h) = (23, 17);
+        let mut rng = crate::nn::Rng::new(5, 0);
+        let mut planes = Planes::new(3, w, h);
+        for at in 0..w * h {
+            let v = 0.5 + rng.uniform();
+            (0..3).for_each(|c| planes.channel_mut(c)[at] = v);
+        }
+        for &(x, y, v) in bright {
+            planes.channel_mut(0)[y * w + x] = v;
+        }
+        planes
+    }
+
+    #[test]
+    fn a_lone_bright_pixel_is_taken_down_and_keeps_its_hue() {
+        let bright = frame(&[(7, 9, 1000.0), (0, 0, 900.0)]);
+        let tamed = tame_fireflies(&bright, 0..17, 0.0);
+        for (x, y) in [(7usize, 9usize), (0, 0)] {
+            let at = y * 23 + x;
+            let around = (0..17 * 23)
+                .filter(|i: &usize| (i % 23).abs_diff(x) <= 2 && (i / 23).abs_diff(y) <= 2 && *i != at)
+                .map(|i| bright.channel(0)[i])
+                .fold(0.0, f32::max);
+            let red = tamed.channel(0)[at];
+            assert!((red - FIREFLY * around).abs() < 1e-3 * red, "{red}, around it {around}");
+            let hue = |p: &Planes| p.channel(1)[at] / p.channel(0)[at];
+            assert!((hue(&tamed) / hue(&bright) - 1.0).abs() < 1e-5);
+        }
+        let changed = tamed.data.iter().zip(&bright.data).filter(|(a, b)| a != b).count();
+        assert_eq!(changed, 6, "and nothing else is");
+    }
+
+    #[test]
+    fn what_has_bright_company_or_is_below_the_floor_stays() {
+        let company = frame(&[(7, 9, 1000.0), (8, 11, 400.0), (18, 4, 700.0), (20, 4, 600.0)]);
+        assert_eq!(tame_fireflies(&company, 0..17, 0.0).data, company.data);
+        let lone = frame(&[(7, 9, 1000.0)]);
+        assert_eq!(tame_fireflies(&lone, 0..17, 1000.0).data, lone.data);
+    }
+
+    #[test]
+    fn rows_are_those_of_the_whole_frame() {
+        let bright = frame(&[(7, 9, 1000.0), (3, 10, 500.0), (20, 16, 800.0)]);
+        let whole = tame_fireflies(&bright, 0..17, 0.1);
+        for (from, to) in [(0, 9), (9, 10), (10, 17), (1, 17)] {
+            let rows = tame_fireflies(&bright, from..to, 0.1);
+            assert_eq!(rows.data, whole.window((0, from), (23, to - from)).data);
+        }
+    }
+}
