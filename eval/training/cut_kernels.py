@@ -5,8 +5,6 @@ The weights then fit the network whose levels blend, and are a beginning for its
 else. Needs numpy.
 """
 
-import sys
-
 import numpy as np
 
 import weights
@@ -15,9 +13,9 @@ PIXELS, TAPS = 4, 5  # of one pixel of the trunk, and along an edge of a kernel
 centre = np.arange(TAPS * TAPS).reshape(TAPS, TAPS)[1:-1, 1:-1].ravel()
 kept = (PIXELS * centre[:, None] + np.arange(PIXELS)).ravel()
 
-source, target = sys.argv[1:]
-facts, tensors = weights.read(source)
-for name, tensor in tensors.items():
-    if name.rsplit(".", 1)[0].endswith("head.full"):
-        tensors[name] = np.concatenate([tensor[kept], tensor[PIXELS * TAPS * TAPS :]])
-weights.write(target, facts, tensors)
+
+def cut(layer, tensor):
+    return np.concatenate([tensor[kept], tensor[PIXELS * TAPS * TAPS :]]) if layer.endswith("head.full") else tensor
+
+
+weights.edit(cut)

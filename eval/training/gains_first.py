@@ -5,8 +5,6 @@ In the head of full resolution the gains stand before the albedo's kernels; wher
 Needs numpy.
 """
 
-import sys
-
 import numpy as np
 
 import weights
@@ -14,14 +12,15 @@ import weights
 # Channels for four pixels: kernels, confidence, mask and corners; the albedo's kernels; gains.
 FRONT, ALBEDO, GAINS = 15 * 4, 9 * 4, 3 * 4
 
-source, target = sys.argv[1:]
-facts, tensors = weights.read(source)
-for name, tensor in tensors.items():
-    layer = name.rsplit(".", 1)[0]
-    if layer.endswith("head.full"):
-        albedo = 0 if layer.startswith("prefilter.") else ALBEDO
-        front, albedo, gains = np.split(tensor, [FRONT, FRONT + albedo])
-        if not len(gains):
-            gains = np.zeros((GAINS, *tensor.shape[1:]), tensor.dtype)
-        tensors[name] = np.concatenate([front, gains, albedo])
-weights.write(target, facts, tensors)
+
+def reorder(layer, tensor):
+    if not layer.endswith("head.full"):
+        return tensor
+    albedo = 0 if layer.startswith("prefilter.") else ALBEDO
+    front, albedo, gains = np.split(tensor, [FRONT, FRONT + albedo])
+    if not len(gains):
+        gains = np.zeros((GAINS, *tensor.shape[1:]), tensor.dtype)
+    return np.concatenate([front, gains, albedo])
+
+
+weights.edit(reorder)

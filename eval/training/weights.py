@@ -2,6 +2,7 @@
 
 import json
 import struct
+import sys
 
 import numpy as np
 
@@ -31,3 +32,10 @@ def write(path, facts, tensors):
     text += b" " * (-len(text) % 8)
     with open(path, "wb") as file:
         file.write(struct.pack("<Q", len(text)) + text + values)
+
+
+def edit(change):
+    """Copies the file that the command line names first to the second, each tensor as `change(layer, tensor)` makes it."""
+    source, target = sys.argv[1:]
+    facts, tensors = read(source)
+    write(target, facts, {name: change(name.rsplit(".", 1)[0], tensor) for name, tensor in tensors.items()})

@@ -22,41 +22,26 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, floor: f32) -> Plan
     if radiance.pixels() == 1 {
         return radiance.clone(); // nothing to compare with
     }
-    let near = rows.start.saturating_sub(REACH)..(rows.end + REACH).min(radiance.height);
-    // The brightest channel, and the brightest of the row's pixels up to two columns away.
-    let brightest: Vec<f32> = (near.start * w..near.end * w)
-        .into_par_iter()
-        .with_min_len(w)
-        .map(|at| (0..3).map(|c| radiance.channel(c)[at]).fold(0.0, f32::max))
-        .collect();
-    let of_row = |row: &[f32], x: usize, itself: bool| {
-        let columns = x.saturating_sub(REACH)..(x + REACH + 1).min(w);
-        columns.filter(|&at| itself || at != x).map(|at| row[at]).fold(0.0, f32::max)
-    };
-    let mut widened = vec![0.0; brightest.len()];
-    widened.par_chunks_mut(w).zip(brightest.par_chunks(w)).for_each(|(widened, row)| {
-        widened.iter_mut().enumerate().for_each(|(x, to)| *to = of_row(row, x, true));
-    });
+    let brightest = |x: usize, y: usize| (0..3).map(|c| radiance.channel(c)[y * w + x]).fold(0.0, f32::max);
+    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     let mut tamed = radiance.window((0, rows.start), (w, rows.len()));
     let n = tamed.pixels();
     let (red, rest) = tamed.data.split_at_mut(n);
     let (green, blue) = rest.split_at_mut(n);
     let channels = red.par_chunks_mut(w).zip(green.par_chunks_mut(w)).zip(blue.par_chunks_mut(w));
-    channels.enumerate().for_each(|(y, ((red, green), blue))| {
-        let own = rows.start + y - near.start;
-        let row = &brightest[own * w..][..w];
-        let others = own.saturating_sub(REACH)..(own + REACH + 1).min(near.len());
-        let others: Vec<&[f32]> = others.filter(|&o| o != own).map(|o| &widened[o * w..][..w]).collect();
+    rows.into_par_iter().zip(channels).for_each(|(y, ((red, green), blue))| {
         for x in 0..w {
-            let limit = |around: f32| (FIREFLY * around).max(floor);
-            let around = others.iter().map(|row| row[x]).fold(0.0, f32::max);
-            if row[x] <= limit(around) {
+            let own = brightest(x, y);
+            let others = || {
+                let square = around(y, radiance.height).flat_map(|y| around(x, w).map(move |x| (x, y)));
+                square.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
+            };
+            // Nearly every pixel has company among the first that are looked at.
+            if own <= floor || others().any(|other| own <= FIREFLY * other) {
                 continue;
             }
-            let limit = limit(around.max(of_row(row, x, false)));
-            if row[x] > limit {
-                [&mut *red, &mut *green, &mut *blue].into_iter().for_each(|c| c[x] *= limit / row[x]);
-            }
+            let limit = (FIREFLY * others().fold(0.0, f32::max)).max(floor);
+            [&mut *red, &mut *green, &mut *blue].into_iter().for_each(|c| c[x] *= limit / own);
         }
     });
     tamed

@@ -93,7 +93,7 @@ fn relmse(
     raw: Option<Vec<f32>>,
     scale: &[f32],
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
-    let weight = denominators(reference, scale).map(f32::recip).collect();
+    let weight = weights(reference, scale);
     squares(image, reference, raw, weight)
 }
 
@@ -106,12 +106,12 @@ fn geomean(
     scale: &[f32],
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
     let (images, values) = (scale.len(), reference.len() / scale.len());
-    let mut weight: Vec<f32> = denominators(reference, scale).map(f32::recip).collect();
+    let mut weight = weights(reference, scale);
     let image_values = image.as_vec();
     let logarithms = weight.par_chunks_mut(values).enumerate().map(|(n, weight)| {
         let of_image = n * values..(n + 1) * values;
-        let squares = image_values[of_image.clone()].iter().zip(&reference[of_image]).zip(&*weight);
-        let sum: f64 = squares.map(|((x, r), w)| f64::from((x - r) * (x - r) * w)).sum();
+        let pixels = image_values[of_image.clone()].iter().zip(&reference[of_image]).zip(&*weight);
+        let sum: f64 = pixels.map(|((x, r), w)| f64::from((x - r) * (x - r) * w)).sum();
         let error = (sum / values as f64) as f32;
         weight.iter_mut().for_each(|w| *w /= error + SMALL_ERROR);
         (error / SMALL_ERROR).ln_1p()
@@ -124,10 +124,15 @@ fn geomean(
     loss + shift
 }
 
-/// What squared errors are divided by, `r^2 + 0.001` in scene radiance.
-fn denominators(reference: &[f32], scale: &[f32]) -> impl Iterator<Item = f32> {
-    let values = reference.len() / scale.len();
-    reference.iter().enumerate().map(move |(i, r)| r * r + RELMSE_EPSILON as f32 / scale[i / values].powi(2))
+/// What squared errors count: the inverse of `r^2 + 0.001` in scene radiance.
+fn weights(reference: &[f32], scale: &[f32]) -> Vec<f32> {
+    let of_image = reference.chunks(reference.len() / scale.len()).zip(scale);
+    of_image
+        .flat_map(|(reference, scale)| {
+            let epsilon = RELMSE_EPSILON as f32 / scale.powi(2);
+            reference.iter().map(move |r| (r * r + epsilon).recip())
+        })
+        .collect()
 }
 
 /// The mean of weighted squared errors against the raw reference, if there is one.
