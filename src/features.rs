@@ -1,10 +1,12 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 
+mod black;
 mod fireflies;
 mod kpcn;
 mod lbf;
 
+pub use black::keep_black;
 pub use fireflies::{FIREFLY, tame_fireflies};
 pub use kpcn::{
     DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
@@ -16,6 +18,7 @@ use rayon::prelude::*;
 
 use crate::{
     Result,
+    kernels::logarithm::log_transfer,
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -100,6 +103,10 @@ pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
 const ALBEDO_FLOOR: f32 = 0.05;
 
+/// The built-in models' [`log_transfer`]: exposed radiance below the inverse is nearly linear, white is 1. Nothing is ever
+/// transferred back, because kernels act on radiance itself.
+const STEEPNESS: f32 = 16.0;
+
 /// The log-average luminance that exposure-normalised radiance has: photography's middle grey.
 const MIDDLE_GREY: f64 = 0.18;
 
@@ -136,20 +143,23 @@ pub fn guide_rows(
 pub fn guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
-    let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
-    albedo.data.iter_mut().for_each(|a| *a = texture(*a));
-    let guide = Planes::from_vec(
-        6,
-        passes.width,
-        passes.height,
-        albedo.data.iter().chain(&normal.data).map(|v| v.clamp(-1.0, 1.0)).collect(),
-    );
-    albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
+    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let mut guide = Planes::new(6, passes.width, passes.height);
+    let (colours, directions) = guide.data.split_at_mut(albedo.data.len());
+    map(&albedo.data, colours, texture);
+    map(&normal.data, directions, |v| v.clamp(-1.0, 1.0));
+    let mut albedo = albedo.clone();
+    map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
     let mut irradiance = radiance.clone();
     irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
     let mut encoded = irradiance.clone();
-    encoded.data.par_iter_mut().for_each(|v| *v = log_transfer(*v));
+    log_transfer(&irradiance.data, STEEPNESS, &mut encoded.data);
     Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
+}
+
+/// Writes `of` each value.
+fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
+    output.par_iter_mut().zip(values).for_each(|(output, value)| *output = of(*value));
 }
 
 /// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says
@@ -168,7 +178,7 @@ pub fn albedo_as_radiance(passes: &PassSet, needed_by: &str) -> Result<PassSet> 
     let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
     let mut white = Planes::new(3, passes.width, passes.height);
     white.data.fill(1.0);
-    albedo.data.iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
+    albedo.data.par_iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
     frame.insert(Pass::Combined, albedo);
     frame.insert(Pass::DenoisingAlbedo, white);
     Ok(frame)
@@ -176,16 +186,8 @@ pub fn albedo_as_radiance(passes: &PassSet, needed_by: &str) -> Result<PassSet> 
 
 /// The albedo again from what was made of [`albedo_as_radiance`].
 pub fn radiance_as_albedo(mut radiance: Planes) -> Planes {
-    radiance.data.iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
+    radiance.data.par_iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
     radiance
-}
-
-/// Logarithm of exposed radiance for a network to read: 0 for black, about 1 for white. Nothing is
-/// ever transferred back, because kernels act on radiance itself.
-fn log_transfer(exposed: f32) -> f32 {
-    /// Radiance below `1 / STEEPNESS` is nearly linear.
-    const STEEPNESS: f32 = 16.0;
-    (1.0 + STEEPNESS * exposed).ln() / (1.0 + STEEPNESS).ln()
 }
 
 /// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
@@ -206,18 +208,16 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
     let row = |y0: usize| {
         let (mut sum, mut count) = (0.0, 0usize);
         for x0 in (0..w).step_by(EXPOSURE_SQUARE) {
-            let (mut luminance, mut pixels) = (0.0f64, 0usize);
-            for y in y0..h.min(y0 + EXPOSURE_SQUARE) {
-                for x in x0..w.min(x0 + EXPOSURE_SQUARE) {
-                    for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
-                        luminance += weight * f64::from(of(planes.channel(c)[y * w + x]));
-                    }
-                    pixels += 1;
+            let (height, width) = (EXPOSURE_SQUARE.min(h - y0), EXPOSURE_SQUARE.min(w - x0));
+            let mut luminance = 0.0f64;
+            for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
+                for row in planes.channel(c).chunks(w).skip(y0).take(height) {
+                    luminance += weight * row[x0..][..width].iter().map(|v| f64::from(of(*v))).sum::<f64>();
                 }
             }
             // A black square has no logarithm and says nothing about exposure.
             if luminance > 0.0 {
-                sum += (luminance / pixels as f64).ln();
+                sum += (luminance / (height * width) as f64).ln();
                 count += 1;
             }
         }

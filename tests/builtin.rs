@@ -235,6 +235,24 @@ fn radiance_256_times_darker_or_brighter_is_denoised_alike() {
 }
 
 #[test]
+fn a_black_background_stays_black_to_the_bit() {
+    const WIDTH: usize = 96;
+    let mut frame = window(WIDTH, 64);
+    for pass in [Pass::Combined, Pass::DenoisingAlbedo] {
+        edit(&mut frame, pass, |v| v.chunks_mut(WIDTH).for_each(|row| row[WIDTH / 2..].fill(0.0)));
+    }
+    for name in ["demc-s", "demc-m", "demc-l"] {
+        let image = models::open(name).unwrap().denoise(&frame).unwrap();
+        for row in image.data.chunks(WIDTH) {
+            // Two columns see the light beside them.
+            let (lit, black) = row.split_at(WIDTH / 2 + 2);
+            assert!(lit[..WIDTH / 2].iter().all(|v| *v > 0.0), "{name}");
+            assert!(black.iter().all(|v| *v == 0.0), "{name}: {black:?}");
+        }
+    }
+}
+
+#[test]
 fn frames_of_a_few_pixels() {
     for (width, height) in [(1, 1), (2, 3), (17, 5)] {
         let small = window(width, height);

@@ -233,7 +233,7 @@ fn trainable(name: &str) -> models::network::Config {
 #[test]
 fn the_kernel_predicting_network() {
     let mut config = trainable("demc-s");
-    config.widths = vec![4, 6, 8, 8];
+    (config.widths, config.prefilter) = (vec![4, 6, 8, 8], vec![]);
     let mut network = models::build(&config, 3);
     let mut rng = Rng::new(17, 0);
     let batch: Batch = [3, 3, 3, 6]

@@ -18,6 +18,7 @@ pub mod filter;
 pub mod gain;
 pub mod heap;
 pub mod layout;
+pub mod logarithm;
 pub mod memory;
 pub mod narrow;
 pub mod peak;

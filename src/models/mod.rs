@@ -145,19 +145,21 @@ pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
     }
 }
 
-/// Widths of the prefilter of `demc-m` and `demc-l`.
+/// Widths of the built-in models' prefilter.
 const PREFILTER: [usize; pyramid::LEVELS] = [16, 24, 32, 40];
 
 /// Names of the networks that can be trained, and the configuration each begins with.
 pub fn trainable() -> Vec<(&'static str, Config)> {
     let paper = |architecture| Config::new(architecture, &widths(architecture, &PAPER_NARROW));
-    let pyramid = |widths: [usize; pyramid::LEVELS]| Config::new(Architecture::Pyramid, &widths);
-    let prefiltered = |widths| Config { prefilter: PREFILTER.into(), ..pyramid(widths) };
+    let pyramid = |widths: [usize; pyramid::LEVELS]| Config {
+        prefilter: PREFILTER.into(),
+        ..Config::new(Architecture::Pyramid, &widths)
+    };
     let kpcn = |architecture| Config::new(architecture, &[32]);
     vec![
-        ("demc-s", pyramid([48, 64, 80, 80])),
-        ("demc-m", prefiltered([80, 96, 96, 112])),
-        ("demc-l", prefiltered([112, 128, 128, 128])),
+        ("demc-s", pyramid([24, 48, 64, 64])),
+        ("demc-m", pyramid([80, 96, 96, 112])),
+        ("demc-l", pyramid([112, 128, 128, 128])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),

@@ -11,7 +11,9 @@ use dfdx::tensor::NoneTape;
 use super::{ALBEDO_KERNEL, Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
-    features::{Inputs, albedo_as_radiance, albedo_exposure, exposure, guides, radiance_as_albedo},
+    features::{
+        Inputs, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black, radiance_as_albedo,
+    },
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -30,7 +32,9 @@ const BAND_PIXELS: usize = 1 << 17;
 /// # Errors
 /// A pass is missing.
 pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<Planes> {
-    let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
+    let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
+    let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+    let exposure = exposure(radiance);
     let multiple = network.multiple();
     let width = passes.width.next_multiple_of(multiple);
     let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
@@ -42,24 +46,24 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         }
         Ok(())
     };
-    let mut radiance = Feed::new(network, passes, exposure, rows);
+    let mut beauty = Feed::new(network, passes, exposure, rows);
     if let Some(prefilter) = &network.prefilter {
-        let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
-        let mut albedo = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
+        let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         for band in bands {
             let band = albedo_as_radiance(&passes.rows(network.passes(), band), NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
-            albedo.push(&band, &mut |first, clean| {
+            prefiltered.push(&band, &mut |first, clean| {
                 let mut band = network.rows(passes, first..first + clean.height, exposure)?;
                 band.insert(Pass::DenoisingAlbedo, radiance_as_albedo(clean));
-                radiance.push(&band, &mut write)
+                beauty.push(&band, &mut write)
             })?;
         }
     } else {
         for band in bands {
-            radiance.push(&network.rows(passes, band, exposure)?, &mut write)?;
+            beauty.push(&network.rows(passes, band, exposure)?, &mut write)?;
         }
     }
+    keep_black(&mut image, radiance, albedo);
     Ok(image)
 }
 

@@ -1,0 +1,76 @@
+//! Black that stays black: backgrounds, and surfaces that reflect nothing of a colour.
+
+use rayon::prelude::*;
+
+use crate::planes::Planes;
+
+/// Rows and columns on either side that must be black too.
+const REACH: usize = 2;
+
+/// Sets to zero each channel of a pixel where neither `radiance` nor `albedo` has anything of that channel in the 5x5
+/// around it; all are (3, H, W).
+///
+/// Softmax kernels trust no pixel by nothing at all, and those of coarse levels carry a hundred-thousandth of the light
+/// far into such a place, which a display's gamma shows. Black radiance alone may be a dim wall that no path lit.
+pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
+    let (w, h, n) = (image.width, image.height, image.pixels());
+    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
+    image.data.par_chunks_mut(n).enumerate().for_each(|(c, plane)| {
+        let (radiance_of, albedo_of) = (radiance.channel(c), albedo.channel(c));
+        let is_black = |x: usize, y: usize| radiance_of[y * w + x] <= 0.0 && albedo_of[y * w + x] <= 0.0;
+        plane.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
+            for (x, value) in row.iter_mut().enumerate() {
+                let mut square = around(y, h).flat_map(|y| around(x, w).map(move |x| (x, y)));
+                if is_black(x, y) && square.all(|(x, y)| is_black(x, y)) {
+                    *value = 0.0;
+                }
+            }
+        });
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Everywhere `value`, but for a hole of 7x7 in the middle of its green.
+    fn holed(value: f32) -> Planes {
+        let (w, h) = (15, 13);
+        let mut planes = Planes::from_vec(3, w, h, vec![value; 3 * w * h]);
+        for y in 3..10 {
+            planes.channel_mut(1)[y * w + 4..][..7].fill(0.0);
+        }
+        planes
+    }
+
+    fn black(image: &Planes) -> Vec<(usize, usize, usize)> {
+        let zeros = (0..image.data.len()).filter(|&i| image.data[i] == 0.0);
+        zeros.map(|i| (i / image.pixels(), i % image.width, i % image.pixels() / image.width)).collect()
+    }
+
+    #[test]
+    fn what_is_black_all_around_stays_so_channel_by_channel() {
+        let mut image = Planes::from_vec(3, 15, 13, vec![1e-4; 3 * 15 * 13]);
+        keep_black(&mut image, &holed(0.5), &holed(0.8));
+        let middle: Vec<_> = (5..8).flat_map(|y| (6..9).map(move |x| (1, x, y))).collect();
+        assert_eq!(black(&image), middle, "3x3 have the hole all around");
+    }
+
+    #[test]
+    fn radiance_or_albedo_alone_may_be_black() {
+        let lit = Planes::from_vec(3, 15, 13, vec![0.5; 3 * 15 * 13]);
+        for (radiance, albedo) in [(holed(0.5), lit.clone()), (lit, holed(0.8))] {
+            let mut image = Planes::from_vec(3, 15, 13, vec![1e-4; 3 * 15 * 13]);
+            keep_black(&mut image, &radiance, &albedo);
+            assert_eq!(black(&image), []);
+        }
+    }
+
+    #[test]
+    fn a_border_brings_no_light() {
+        let dark = Planes::new(3, 15, 13);
+        let mut image = Planes::from_vec(3, 15, 13, vec![1e-4; 3 * 15 * 13]);
+        keep_black(&mut image, &dark, &dark);
+        assert_eq!(image.data, dark.data);
+    }
+}
