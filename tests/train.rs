@@ -91,7 +91,7 @@ fn weights_know_the_ranges_that_eight_bits_need() {
     run(&mut train(&out, 4)).success();
     let weights = out.join("best.safetensors");
     let ranges = weights_file::read(&weights).expect("weights").1.ranges;
-    assert_eq!(ranges.len(), 27, "every layer that ends in a ReLU: {ranges:?}");
+    assert_eq!(ranges.len(), 2 * 27, "every layer that ends in a ReLU, the prefilter's too: {ranges:?}");
     assert!(ranges.values().all(|range| *range > 0.0 && range.is_finite()), "{ranges:?}");
     let frame = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
     let passes = passes::load(Path::new(&frame), None).expect("a frame");
