@@ -162,6 +162,15 @@ fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
     output.par_iter_mut().zip(values).for_each(|(output, value)| *output = of(*value));
 }
 
+/// Pixels (x, y) of the 5x5 around one, as far as they lie in a frame of `w` columns and `h` rows.
+#[inline]
+fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
+    const REACH: usize = 2;
+    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
+    let columns = around(x, w);
+    around(y, h).flat_map(move |y| columns.clone().map(move |x| (x, y)))
+}
+
 /// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says
 /// nothing.
 fn texture(albedo: f32) -> f32 {

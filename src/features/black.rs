@@ -2,10 +2,8 @@
 
 use rayon::prelude::*;
 
+use super::square;
 use crate::planes::Planes;
-
-/// Rows and columns on either side that must be black too.
-const REACH: usize = 2;
 
 /// Sets to zero each channel of a pixel where neither `radiance` nor `albedo` has anything of that channel in the 5x5
 /// around it; all are (3, H, W).
@@ -14,14 +12,12 @@ const REACH: usize = 2;
 /// far into such a place, which a display's gamma shows. Black radiance alone may be a dim wall that no path lit.
 pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
     let (w, h, n) = (image.width, image.height, image.pixels());
-    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     image.data.par_chunks_mut(n).enumerate().for_each(|(c, plane)| {
         let (radiance_of, albedo_of) = (radiance.channel(c), albedo.channel(c));
         let is_black = |x: usize, y: usize| radiance_of[y * w + x] <= 0.0 && albedo_of[y * w + x] <= 0.0;
         plane.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
             for (x, value) in row.iter_mut().enumerate() {
-                let mut square = around(y, h).flat_map(|y| around(x, w).map(move |x| (x, y)));
-                if is_black(x, y) && square.all(|(x, y)| is_black(x, y)) {
+                if is_black(x, y) && square((x, y), (w, h)).all(|(x, y)| is_black(x, y)) {
                     *value = 0.0;
                 }
             }

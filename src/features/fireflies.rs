@@ -4,13 +4,11 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::square;
 use crate::planes::Planes;
 
 /// A pixel may be this many times as bright as the brightest other one of the 5x5 around it.
 pub const FIREFLY: f32 = 32.0;
-
-/// Rows and columns on either side that are compared.
-const REACH: usize = 2;
 
 /// Rows `rows` of radiance, (3, H, W) -> (3, R, W), in which a pixel's brightest channel is at most [`FIREFLY`] times that
 /// of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is more; what is brighter is
@@ -23,7 +21,6 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, floor: f32) -> Plan
         return radiance.clone(); // nothing to compare with
     }
     let brightest = |x: usize, y: usize| (0..3).map(|c| radiance.channel(c)[y * w + x]).fold(0.0, f32::max);
-    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     let mut tamed = radiance.window((0, rows.start), (w, rows.len()));
     let n = tamed.pixels();
     let (red, rest) = tamed.data.split_at_mut(n);
@@ -33,7 +30,7 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, floor: f32) -> Plan
         for x in 0..w {
             let own = brightest(x, y);
             let others = || {
-                let square = around(y, radiance.height).flat_map(|y| around(x, w).map(move |x| (x, y)));
+                let square = square((x, y), (w, radiance.height));
                 square.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
             };
             // Nearly every pixel has company among the first that are looked at.
