@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 use crate::{
     Result,
-    kernels::logarithm::log_transfer,
+    kernels::logarithm::{log_ratio, log_transfer},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -135,26 +135,38 @@ pub fn guide_rows(
 /// The built-in models' inputs, in this order:
 /// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
 /// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
-/// camera-space normal (6, H, W). The scale is the inverse of the exposure, that of the whole frame, of which `passes` may
-/// be some rows.
+/// camera-space normal (6, H, W). With a `clean` albedo, (3, H, W), that is the one meant; the logarithm of what radiance
+/// is divided by over what the noisy albedo would make of that is then the last of the inputs (3, H, W), and its mean
+/// over the colours another channel of the guide encoder's. The scale is the inverse of the exposure, that of the whole frame,
+/// of which `passes` may be some rows.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
+pub fn guides(passes: &PassSet, clean: Option<Planes>, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
-    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let mut guide = Planes::new(6, passes.width, passes.height);
-    let (colours, directions) = guide.data.split_at_mut(albedo.data.len());
-    map(&albedo.data, colours, texture);
+    let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let mut guide = Planes::new(if clean.is_some() { 7 } else { 6 }, passes.width, passes.height);
+    let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
+    let (directions, mean) = rest.split_at_mut(noisy.data.len());
+    map(&clean.as_ref().unwrap_or(noisy).data, colours, texture);
     map(&normal.data, directions, |v| v.clamp(-1.0, 1.0));
-    let mut albedo = albedo.clone();
+    let mut albedo = Planes::new(3, passes.width, passes.height);
     map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
+    let ratio = clean.map(|mut other| {
+        map(&noisy.data, &mut other.data, |a| texture(a) + ALBEDO_FLOOR);
+        let mut ratio = Planes::new(3, passes.width, passes.height);
+        log_ratio(&albedo.data, &other.data, &mut ratio.data);
+        let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
+        mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
+        ratio
+    });
     let mut irradiance = radiance.clone();
     irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
-    let mut encoded = irradiance.clone();
+    let mut encoded = Planes::new(3, passes.width, passes.height);
     log_transfer(&irradiance.data, STEEPNESS, &mut encoded.data);
-    Ok(Inputs { planes: vec![irradiance, albedo, encoded, guide], scale: exposure.recip() })
+    let planes = [irradiance, albedo, encoded, guide].into_iter().chain(ratio).collect();
+    Ok(Inputs { planes, scale: exposure.recip() })
 }
 
 /// Writes `of` each value.
@@ -177,18 +189,22 @@ fn texture(albedo: f32) -> f32 {
     albedo.clamp(0.0, 1.0)
 }
 
-/// A frame whose albedo stands in the place of radiance, as bright as radiance is later divided by, lit evenly
+/// Rows of a frame whose albedo stands in the place of radiance, as bright as radiance is later divided by, lit evenly
 /// (its own albedo is 1): what a prefilter denoises.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn albedo_as_radiance(passes: &PassSet, needed_by: &str) -> Result<PassSet> {
-    let mut frame = passes.rows(&[Pass::DenoisingNormal], 0..passes.height);
-    let mut albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?.clone();
-    let mut white = Planes::new(3, passes.width, passes.height);
-    white.data.fill(1.0);
-    albedo.data.par_iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
-    frame.insert(Pass::Combined, albedo);
+pub fn albedo_as_radiance(
+    passes: &PassSet,
+    rows: std::ops::Range<usize>,
+    needed_by: &str,
+) -> Result<PassSet> {
+    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let mut lit = albedo.window((0, rows.start), (passes.width, rows.len()));
+    lit.data.par_iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
+    let white = Planes { data: vec![1.0; lit.data.len()], ..lit };
+    let mut frame = passes.rows(&[Pass::DenoisingNormal], rows);
+    frame.insert(Pass::Combined, lit);
     frame.insert(Pass::DenoisingAlbedo, white);
     Ok(frame)
 }
@@ -264,33 +280,14 @@ pub struct Inputs {
 impl Inputs {
     /// Grows every input to a multiple of `multiple` in both directions by repeating the last row and column:
     /// what a network that halves its input `log2(multiple)` times needs.
-    pub fn padded(self, multiple: usize) -> Self {
-        let [width, height] = self.planes.first().map_or([0; 2], |p| [p.width, p.height]);
-        self.padded_to(width.next_multiple_of(multiple), height.next_multiple_of(multiple))
-    }
-
-    /// Grows every input to a size by repeating the last row and column.
-    pub fn padded_to(mut self, width: usize, height: usize) -> Self {
-        self.planes = self.planes.into_iter().map(|planes| pad(planes, (width, height))).collect();
+    pub fn padded(mut self, multiple: usize) -> Self {
+        let grow = |planes: Planes| {
+            let size = [planes.width, planes.height].map(|size| size.next_multiple_of(multiple));
+            planes.padded_to(size.into())
+        };
+        self.planes = self.planes.into_iter().map(grow).collect();
         self
     }
-}
-
-/// What [`Inputs::padded_to`] does to one input.
-fn pad(planes: Planes, (width, height): (usize, usize)) -> Planes {
-    if (width, height) == (planes.width, planes.height) {
-        return planes;
-    }
-    let mut out = Planes::new(planes.channels, width, height);
-    for c in 0..planes.channels {
-        let from = planes.channel(c);
-        for (y, row) in out.channel_mut(c).chunks_mut(width).enumerate() {
-            let source = &from[y.min(planes.height - 1) * planes.width..][..planes.width];
-            row[..planes.width].copy_from_slice(source);
-            row[planes.width..].fill(source[planes.width - 1]);
-        }
-    }
-    out
 }
 
 #[cfg(test)]
@@ -321,14 +318,5 @@ mod tests {
     fn depth_ends_at_one_and_misses_are_zero() {
         let out = relative_depth(&Planes::from_vec(1, 5, 1, vec![0.0, 1.0, 2.0, 8.0, 1e10]));
         assert_eq!(out.data, [0.0, 1.0 / 3.0, 0.5, 0.8, 0.0]);
-    }
-
-    #[test]
-    fn padding_repeats_the_edge_and_a_window_undoes_it() {
-        let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        let padded = pad(planes.clone(), (4, 4));
-        assert_eq!((padded.width, padded.height), (4, 4));
-        assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
-        assert_eq!(padded.window((0, 0), (3, 1)), planes);
     }
 }

@@ -1,5 +1,7 @@
 //! Planar f32 images: what passes, features, models and metrics hand to one another.
 
+use rayon::prelude::*;
+
 /// `channels` planes of `height` x `width` f32, channel after channel, rows top to bottom.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planes {
@@ -51,17 +53,67 @@ impl Planes {
     pub fn window(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Self {
         assert!(x + width <= self.width && y + height <= self.height, "the rectangle lies inside");
         let mut out = Self::new(self.channels, width, height);
-        for c in 0..self.channels {
-            let from = self.channel(c);
-            for (row, out) in out.channel_mut(c).chunks_mut(width.max(1)).enumerate() {
-                out.copy_from_slice(&from[(y + row) * self.width + x..][..width]);
-            }
+        out.data.par_chunks_mut(width.max(1)).enumerate().for_each(|(i, row)| {
+            let from = self.channel(i / height);
+            row.copy_from_slice(&from[(y + i % height) * self.width + x..][..width]);
+        });
+        out
+    }
+
+    /// The planes after half a turn: the last pixel becomes the first.
+    pub fn turned(&self) -> Self {
+        let (w, h) = (self.width, self.height);
+        let mut out = Self::new(self.channels, w, h);
+        out.data.par_chunks_mut(w.max(1)).enumerate().for_each(|(i, row)| {
+            let from = &self.channel(i / h)[(h - 1 - i % h) * w..][..w];
+            row.iter_mut().zip(from.iter().rev()).for_each(|(to, from)| *to = *from);
+        });
+        out
+    }
+
+    /// Grows the planes, to the right and below, by repeating the last column and row.
+    ///
+    /// # Panics
+    /// If they are empty, or larger.
+    pub fn padded_to(self, (width, height): (usize, usize)) -> Self {
+        if (width, height) == (self.width, self.height) {
+            return self;
         }
+        assert!(self.width <= width && self.height <= height, "padding only adds");
+        let mut out = Self::new(self.channels, width, height);
+        out.data.par_chunks_mut(width).enumerate().for_each(|(i, row)| {
+            let y = (i % height).min(self.height - 1);
+            let source = &self.channel(i / height)[y * self.width..][..self.width];
+            row[..self.width].copy_from_slice(source);
+            row[self.width..].fill(source[self.width - 1]);
+        });
         out
     }
 
     /// How many values are NaN or infinite.
     pub fn non_finite(&self) -> usize {
         self.data.iter().filter(|v| !v.is_finite()).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn padding_repeats_the_edge_and_a_window_undoes_it() {
+        let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        let padded = planes.clone().padded_to((4, 4));
+        assert_eq!((padded.width, padded.height), (4, 4));
+        assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
+        assert_eq!(padded.window((0, 0), (3, 1)), planes);
+    }
+
+    #[test]
+    fn half_a_turn_reverses_every_channel_and_two_change_nothing() {
+        let planes = Planes::from_vec(2, 3, 2, (0..12).map(|v| v as f32).collect());
+        let turned = planes.turned();
+        assert_eq!(turned.channel(1), [11.0, 10.0, 9.0, 8.0, 7.0, 6.0]);
+        assert_eq!(turned.turned(), planes);
     }
 }

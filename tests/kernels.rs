@@ -27,7 +27,7 @@ fn noise(seed: u64, len: usize) -> Vec<f32> {
 
 fn blocked(shape: Shape, values: &[f32]) -> Vec<Block> {
     let mut data = vec![Block::default(); shape.blocks()];
-    to_blocked(values, ViewMut::new(shape, &mut data));
+    to_blocked(values, 1, ViewMut::new(shape, &mut data));
     data
 }
 

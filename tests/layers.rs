@@ -281,6 +281,16 @@ fn amplifying_by_predicted_gains() {
     case.compare_image("d_logits", &gradients, &logits);
 }
 
+#[test]
+fn dividing_by_another_albedo() {
+    let case = Case::new("redivide");
+    let logits = case.images("logits");
+    let &(n, _, h, w) = logits.shape();
+    let [image, ratio] = ["image", "ratio"].map(|key| Field::input((n, 3, h, w), &case.images(key).as_vec()));
+    let gradients = case.project(image.redivide(ratio, traced_field(&logits)).into_images());
+    case.compare_image("d_logits", &gradients, &logits);
+}
+
 /// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.
 #[test]
 fn channels_to_pixels_and_back() {

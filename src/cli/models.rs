@@ -4,7 +4,11 @@ use std::process::ExitCode;
 
 use crate::{
     Result,
-    models::{self, Denoiser, learned::Learned, network::Network},
+    models::{
+        self,
+        learned::{BUILT_IN, Learned},
+        network::Network,
+    },
 };
 
 /// List the built-in models and the networks that can be trained
@@ -28,12 +32,12 @@ struct Row {
     trained: Option<String>,
 }
 
-fn row(model: &str, network: &mut dyn Network, trained: Option<String>) -> Row {
+fn row(model: &str, network: &mut dyn Network, macs: f64, trained: Option<String>) -> Row {
     Row {
         model: model.into(),
         weights: if trained.is_some() { "built in" } else { "untrained" },
         parameters: network.params().iter().filter(|p| p.trainable).map(|p| p.values().len()).sum(),
-        kmac_per_pixel: (network.macs_per_pixel() / 100.0).round() / 10.0,
+        kmac_per_pixel: (macs / 100.0).round() / 10.0,
         // Rows and columns of the square that an output pixel can see.
         receptive_field: 2 * network.reach() + 1,
         passes: network.passes().iter().map(ToString::to_string).collect(),
@@ -41,31 +45,26 @@ fn row(model: &str, network: &mut dyn Network, trained: Option<String>) -> Row {
     }
 }
 
+fn built_in(name: &str) -> Option<Row> {
+    let mut model = Learned::built_in(name)?;
+    let t = &model.metadata.training;
+    let last = if t.init.is_some() { ", the last of several runs (eval/training/README.md)" } else { "" };
+    let hours = t.seconds / 3600.0;
+    let trained =
+        format!("{} steps of {} crops from {} frames in {hours:.1} h{last}", t.steps, t.batch, t.frames);
+    let macs = model.macs_per_pixel();
+    Some(row(name, model.network(), macs, Some(trained)))
+}
+
 /// Runs the subcommand.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let rows: Vec<Row> = models::trainable()
-        .into_iter()
-        .map(|(name, config)| match Learned::built_in(name) {
-            Some(mut model) => {
-                let t = &model.metadata.training;
-                let trained = format!(
-                    "{} steps of {} crops from {} frames in {:.1} h{}",
-                    t.steps,
-                    t.batch,
-                    t.frames,
-                    t.seconds / 3600.0,
-                    if t.init.is_some() {
-                        ", the last of several runs (eval/training/README.md)"
-                    } else {
-                        ""
-                    }
-                );
-                debug_assert_eq!(model.name(), name);
-                row(name, model.network(), Some(trained))
-            }
-            None => row(name, &mut *models::build(&config, 0), None),
-        })
-        .collect();
+    let untrained = models::untrained().map(|(name, config)| {
+        let mut network = models::build(&config, 0);
+        let macs = network.macs_per_pixel();
+        row(name, &mut *network, macs, None)
+    });
+    let rows: Vec<Row> =
+        BUILT_IN.into_iter().filter_map(|(name, _)| built_in(name)).chain(untrained).collect();
     if args.json {
         super::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
         return Ok(ExitCode::SUCCESS);

@@ -16,7 +16,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::{
     Error, Result,
     frame::Frame,
-    models::{self, network::Architecture, weights_file},
+    models::{self, learned::TURNED, network::Architecture, weights_file},
     nn::Precision,
     passes::{self, Pass},
     report,
@@ -169,7 +169,11 @@ impl Args {
         let mut network =
             known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(|| {
                 let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
-                usage(format!("cannot train '{}'; trainable: {}", self.model, names.join(", ")))
+                usage(format!(
+                    "cannot train '{}'; trainable: {}; {TURNED} has the weights of demc-m",
+                    self.model,
+                    names.join(", ")
+                ))
             })?;
         if let Some(widths) = &self.widths {
             network.widths = models::widths(network.architecture, widths);

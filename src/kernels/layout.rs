@@ -59,20 +59,17 @@ impl Map {
     }
 }
 
-/// From `(N, C, H, W)` to blocks. The lanes beyond `C` become zero.
+/// From planes of `factor` times its size to all channels of an activation. The lanes beyond them become zero.
 ///
 /// # Panics
 /// If `input` does not hold the output's shape.
-pub fn to_blocked(input: &[f32], output: ViewMut) {
-    let o = output.shape;
-    assert_eq!(input.len(), o.n * o.c * o.h * o.w);
-    if !o.c.is_multiple_of(LANES) {
-        let ViewMut { shape, data } = output;
+pub fn to_blocked(input: &[f32], factor: usize, output: ViewMut) {
+    let ViewMut { shape, data } = output;
+    assert_eq!(input.len(), shape.n * shape.c * shape.h * shape.w);
+    if !shape.c.is_multiple_of(LANES) {
         data.par_chunks_mut(4096).for_each(|blocks| blocks.fill(Block::default()));
-        to_blocked_shuffled(input, 0, 1, ViewMut { shape, data });
-    } else {
-        to_blocked_shuffled(input, 0, 1, output);
     }
+    to_blocked_shuffled(input, 0, factor, ViewMut { shape, data });
 }
 
 /// From blocks to `(N, C, H, W)`.

@@ -1,4 +1,4 @@
-//! The logarithm in which networks read radiance, planar f32.
+//! The logarithms in which networks read radiance and the ratio of albedos, planar f32.
 
 use rayon::prelude::*;
 
@@ -18,6 +18,34 @@ pub fn log_transfer(values: &[f32], steepness: f32, output: &mut [f32]) {
     output.par_chunks_mut(CHUNK).zip(values.par_chunks(CHUNK)).for_each(|(output, values)| {
         vectorised::run(LogTransfer { values, steepness, scale, output });
     });
+}
+
+/// Writes the logarithm of each value of `above` over that of `below`, all of them normal and positive.
+///
+/// # Panics
+/// If lengths differ.
+pub fn log_ratio(above: &[f32], below: &[f32], output: &mut [f32]) {
+    assert_eq!((above.len(), below.len()), (output.len(), output.len()));
+    let read = above.par_chunks(CHUNK).zip(below.par_chunks(CHUNK));
+    output.par_chunks_mut(CHUNK).zip(read).for_each(|(output, (above, below))| {
+        vectorised::run(LogRatio { above, below, output });
+    });
+}
+
+struct LogRatio<'a> {
+    above: &'a [f32],
+    below: &'a [f32],
+    output: &'a mut [f32],
+}
+
+impl Vectorised for LogRatio<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { above, below, output } = self;
+        for (out, (above, below)) in output.iter_mut().zip(above.iter().zip(below)) {
+            *out = ln(above / below);
+        }
+    }
 }
 
 struct LogTransfer<'a> {
@@ -64,6 +92,12 @@ mod tests {
             let want = (16.0 * f64::from(*v)).ln_1p() / 17f64.ln();
             // Near 1, the sum under the logarithm is rounded.
             assert!((f64::from(*found) - want).abs() < 2e-7 * want.max(0.5), "{v}: {found} for {want}");
+        }
+        let mut ratio = vec![0.0; values.len()];
+        log_ratio(&values, &vec![0.7; values.len()], &mut ratio);
+        for (v, found) in values.iter().zip(&ratio) {
+            let want = (f64::from(*v) / f64::from(0.7f32)).ln();
+            assert!((f64::from(*found) - want).abs() < 3e-7 * want.abs().max(1.0), "{v}: {found} for {want}");
         }
         let mut ends = [2.0; 2];
         log_transfer(&[0.0, 1.0], 16.0, &mut ends);

@@ -24,6 +24,7 @@ pub mod narrow;
 pub mod peak;
 pub mod plane;
 pub mod pool;
+pub mod redivide;
 pub mod simd;
 pub mod vectorised;
 pub mod weight_grad;

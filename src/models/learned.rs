@@ -14,11 +14,18 @@ use crate::{
     planes::Planes,
 };
 
-/// The built-in weights, name and file: ours, smallest first, then the paper's networks and its rivals.
+const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
+
+/// The built-in model that looks at a frame twice, the second time upside down, and answers with the mean: what a
+/// network gets wrong depends on how its squares and levels happen to lie on the picture, and half of that averages out
+/// (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
+pub const TURNED: &str = "demc-l";
+
+/// The built-in weights, name and file: ours, fastest first, then the paper's networks and its rivals.
 pub const BUILT_IN: [(&str, &[u8]); 8] = [
     ("demc-s", include_bytes!("weights/demc-s.safetensors")),
-    ("demc-m", include_bytes!("weights/demc-m.safetensors")),
-    ("demc-l", include_bytes!("weights/demc-l.safetensors")),
+    ("demc-m", DEMC_M),
+    (TURNED, DEMC_M),
     ("demc", include_bytes!("weights/demc.safetensors")),
     ("demc-nofusion", include_bytes!("weights/demc-nofusion.safetensors")),
     ("semc", include_bytes!("weights/semc.safetensors")),
@@ -30,6 +37,8 @@ pub const BUILT_IN: [(&str, &[u8]); 8] = [
 pub struct Learned {
     name: String,
     network: Box<dyn Network>,
+    /// Whether it looks twice, see [`TURNED`].
+    turned: bool,
     /// The network's configuration and how it was trained.
     pub metadata: Metadata,
 }
@@ -40,7 +49,7 @@ impl Learned {
         let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
         let (network, metadata) = weights_file::parse(bytes, Path::new(name))
             .expect("built-in weights are sound; a test reads them");
-        Some(Self { name: name.to_string(), network, metadata })
+        Some(Self { name: name.to_string(), network, turned: *name == TURNED, metadata })
     }
 
     /// The model in a weights file, named like the file.
@@ -49,7 +58,7 @@ impl Learned {
     /// See [`weights_file::read`].
     pub fn from_file(path: &Path) -> Result<Self> {
         let (network, metadata) = weights_file::read(path)?;
-        Ok(Self { name: path.display().to_string(), network, metadata })
+        Ok(Self { name: path.display().to_string(), network, turned: false, metadata })
     }
 
     /// The model under another name, with its weights packed for an arithmetic: that asked for, or the fastest.
@@ -77,6 +86,24 @@ impl Learned {
     pub fn network(&mut self) -> &mut dyn Network {
         &mut *self.network
     }
+
+    /// Multiply-accumulates for one pixel of the frame.
+    pub fn macs_per_pixel(&self) -> f64 {
+        self.network.macs_per_pixel() * if self.turned { 2.0 } else { 1.0 }
+    }
+}
+
+/// The passes of a network after half a turn of the picture, and of camera-space vectors with it.
+fn turned(network: &dyn Network, passes: &PassSet) -> PassSet {
+    let passes = passes.rows(network.passes(), 0..passes.height);
+    passes.map((passes.width, passes.height), |pass, planes| {
+        let mut planes = planes.turned();
+        if pass == Pass::DenoisingNormal {
+            let n = planes.pixels();
+            planes.data[..2 * n].iter_mut().for_each(|v| *v = -*v);
+        }
+        planes
+    })
 }
 
 impl Denoiser for Learned {
@@ -97,10 +124,19 @@ impl Denoiser for Learned {
     }
 
     fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        self.network.infer(passes, None)
+        self.denoise_tiled(passes, None)
     }
 
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        self.network.infer(passes, tile)
+        let mut image = self.network.infer(passes, tile)?;
+        if self.turned {
+            let second = self.network.infer(&turned(&*self.network, passes), tile)?.turned();
+            image
+                .data
+                .iter_mut()
+                .zip(&second.data)
+                .for_each(|(first, second)| *first = 0.5 * (*first + second));
+        }
+        Ok(image)
     }
 }

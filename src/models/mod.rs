@@ -122,7 +122,7 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
         }
         other => match learned::Learned::built_in(other) {
             Some(model) => learned(model),
-            None if trainable().iter().any(|(name, _)| *name == other) => Err(Error::Usage(format!(
+            None if untrained().any(|(name, _)| name == other) => Err(Error::Usage(format!(
                 "{other} comes without weights: `demc train --model {other} --data DIR --out RUN` makes them, \
                  and RUN/best.safetensors then names the method"
             ))),
@@ -159,7 +159,6 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     vec![
         ("demc-s", pyramid([24, 48, 64, 64])),
         ("demc-m", pyramid([80, 96, 96, 112])),
-        ("demc-l", pyramid([112, 128, 128, 128])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),
@@ -167,6 +166,12 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
         ("kpcn-combined", kpcn(Architecture::KpcnCombined)),
         ("lbf", Config::new(Architecture::Lbf, &[lbf::PUBLISHED_WIDTH])),
     ]
+}
+
+/// Those that come without weights.
+pub fn untrained() -> impl Iterator<Item = (&'static str, Config)> {
+    let is_built_in = |name| learned::BUILT_IN.iter().any(|(built_in, _)| *built_in == name);
+    trainable().into_iter().filter(move |(name, _)| !is_built_in(*name))
 }
 
 /// Whether a configuration describes a network that [`build`] can make.

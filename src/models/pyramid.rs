@@ -5,15 +5,16 @@
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
 //! al. 2018), after it was blended with what filtering made of the level below: a level's own kernels
 //! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
-//! by a filtered albedo last, so texture is never blurred with the noise, and noise in the albedo (depth
-//! of field, 4 spp edges) is removed. A confidence for every pixel and level lets a firefly take itself
-//! out of all kernels at once.
+//! by it last, so texture is never blurred with the noise. A confidence for every pixel and level lets a firefly
+//! take itself out of all kernels at once.
 //!
 //! Kernels cannot invent a colour, and scale with their input exactly; nor can they draw an edge finer than the noise
 //! that they average. So each colour of each pixel gets a bounded gain last, which scales with the input as well.
 //!
-//! Wider networks read an albedo that a prefilter denoised: a small network of the same kind, which was trained
-//! to denoise albedo in the place of radiance and is not trained any further.
+//! Noise in the albedo (depth of field, 4 spp edges) is removed before: the built-in networks read it from a
+//! prefilter, a small network of the same kind, which was trained to denoise albedo in the place of radiance and is not
+//! trained any further. The samples that made an albedo noisy made the radiance noisy alike, though, and their quotient
+//! is free of that noise: so each pixel says how far it is to be divided by the noisy albedo, not by the clean one.
 
 mod bands;
 
@@ -38,13 +39,10 @@ pub const LEVELS: usize = 4;
 const KERNEL: usize = 5;
 const FULL_KERNEL: usize = 3;
 
-/// Rows and columns of the albedo kernels.
-const ALBEDO_KERNEL: usize = 3;
-
-/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, but in a prefilter,
-/// the albedo kernel.
+/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where there is a
+/// prefilter, which albedo to divide by.
 const GAINS: usize = 3;
-const ALBEDO_TAPS: usize = ALBEDO_KERNEL * ALBEDO_KERNEL;
+const DIVISOR: usize = 1;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -58,9 +56,11 @@ pub const PREFILTER: &str = "prefilter.";
 /// Who asks for passes, in messages.
 const NEEDED_BY: &str = "this model";
 
-/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth.
+/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth; and what the latter has
+/// besides where there is a prefilter.
 const RADIANCE_CHANNELS: usize = 3;
 const GUIDE_CHANNELS: usize = 6;
+const RATIO_CHANNELS: usize = 1;
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]
@@ -71,7 +71,7 @@ pub struct Pyramid {
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
-    /// Full resolution: radiance kernels, confidence, mask, corners, gains and albedo kernels of four pixels.
+    /// Full resolution: radiance kernels, confidence, mask, corners, gains and divisors of four pixels.
     full: Conv,
     /// One head a trunk level, finest first.
     heads: Vec<Conv>,
@@ -119,8 +119,8 @@ struct Prediction<T> {
 struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     gain: Field<T>,
-    /// Logits of the albedo kernels, (N, 9, H, W), if it has them.
-    albedo: Option<Field<T>>,
+    /// How far to divide by the noisy albedo, before its logistic, (N, 1, H, W), if it says.
+    divisor: Option<Field<T>>,
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
@@ -131,11 +131,16 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
 
     /// What the head of full resolution says.
     fn of_full(head: Activation<T>) -> (Self, Finish<T>) {
-        const FIRST: [usize; 2] = [4 * head_of(0), 4 * (head_of(0) + GAINS)];
-        let has_albedo = head.shape().c > FIRST[1];
-        let albedo = has_albedo.then(|| Field::from_activation(head.fork(), FIRST[1], 4 * ALBEDO_TAPS, 2));
-        let gain = Field::from_activation(head.fork(), FIRST[0], 4 * GAINS, 2);
-        (Self::split(head, FULL_KERNEL, 2), Finish { gain, albedo })
+        let mut end = 4 * head_of(0);
+        // The planes that the next channels make, if there are any.
+        let mut planes = |planes: usize| {
+            let first = end;
+            end += 4 * planes;
+            (end <= head.shape().c).then(|| Field::from_activation(head.fork(), first, 4 * planes, 2))
+        };
+        let gain = planes(GAINS).expect("every head of full resolution has gains");
+        let divisor = planes(DIVISOR);
+        (Self::split(head, FULL_KERNEL, 2), Finish { gain, divisor })
     }
 
     /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
@@ -188,25 +193,24 @@ impl Pyramid {
     /// If `widths` does not hold one width a level.
     pub fn new(config: &Config, seed: u64) -> Self {
         let rng = &mut Rng::new(seed, 0);
-        let mut network = Self::named("", Config::new(config.architecture, &config.widths), rng);
+        let mut network = Self::named("", config.clone(), rng);
         if !config.prefilter.is_empty() {
             let own = Config::new(config.architecture, &config.prefilter);
             let mut prefilter = Self::named(PREFILTER, own, rng);
             prefilter.params().into_iter().for_each(|param| param.trainable = false);
             network.prefilter = Some(Box::new(prefilter));
-            network.config = config.clone();
         }
         network
     }
 
-    /// A network without prefilter whose layers' names begin with `prefix`; if that is a prefilter's, without albedo
-    /// kernels, since the albedo that a prefilter multiplies by is white.
+    /// A network, but for its prefilter, whose layers' names begin with `prefix`.
     fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
+        let (ratios, divisor) = if config.prefilter.is_empty() { (0, 0) } else { (RATIO_CHANNELS, DIVISOR) };
         let encoders = [
             Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + ratios, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
         let decoder = (0..LEVELS).rev().map(|level| {
@@ -229,11 +233,7 @@ impl Pyramid {
             Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
-            full: head(
-                "head.full".into(),
-                decoder_width(0),
-                4 * (head_of(0) + GAINS + if prefix.is_empty() { ALBEDO_TAPS } else { 0 }),
-            ),
+            full: head("head.full".into(), decoder_width(0), 4 * (head_of(0) + GAINS + divisor)),
             heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), head_of(l + 1))).collect(),
             config,
             prefilter: None,
@@ -242,27 +242,25 @@ impl Pyramid {
         }
     }
 
-    /// A frame with its albedo denoised, where there is a prefilter.
-    fn prefiltered(&self, passes: &PassSet) -> Result<Option<PassSet>> {
+    /// The denoised albedo of a frame, (3, H, W), where there is a prefilter.
+    fn prefiltered(&self, passes: &PassSet) -> Result<Option<Planes>> {
         let Some(prefilter) = &self.prefilter else { return Ok(None) };
-        let albedo = bands::infer(prefilter, &albedo_as_radiance(passes, NEEDED_BY)?, None)?;
-        let mut passes = passes.rows(self.passes(), 0..passes.height);
-        passes.insert(Pass::DenoisingAlbedo, radiance_as_albedo(albedo));
-        Ok(Some(passes))
+        let albedo =
+            bands::infer(prefilter, &albedo_as_radiance(passes, 0..passes.height, NEEDED_BY)?, None)?;
+        Ok(Some(radiance_as_albedo(albedo)))
     }
 
     /// Rows of a frame as the network reads them. There are no fireflies in an albedo.
     fn rows(&self, passes: &PassSet, rows: Range<usize>, exposure: f32) -> Result<PassSet> {
-        let is_prefilter = self.full.arithmetic().outputs == 4 * (head_of(0) + GAINS);
-        if is_prefilter {
+        if self.full.name().starts_with(PREFILTER) {
             return Ok(passes.rows(self.passes(), rows));
         }
         guide_rows(passes, rows, exposure, NEEDED_BY)
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
-        let [irradiance, albedo, radiance_input, guide_input] = &batch[..] else {
-            unreachable!("`inputs` makes four planes")
+        let [irradiance, albedo, radiance_input, guide_input, ratio @ ..] = &batch[..] else {
+            unreachable!("`inputs` makes four planes and, with a prefilter, one more")
         };
         let field = |(shape, values): &(crate::kernels::Shape, Vec<f32>)| {
             Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values)
@@ -292,6 +290,9 @@ impl Pyramid {
         // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
         // filtering made of the one below, and filtered.
         let mut image = field(irradiance);
+        if let Some((ratio, divisor)) = ratio.first().zip(finish.divisor) {
+            image = image.redivide(field(ratio), divisor);
+        }
         let mut pyramid = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
         for (level, predicted) in levels.into_iter().enumerate() {
@@ -313,11 +314,7 @@ impl Pyramid {
             };
             let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
             if pyramid.is_empty() {
-                let albedo = match finish.albedo {
-                    Some(kernel) => field(albedo).filter(ALBEDO_KERNEL, kernel, None),
-                    None => field(albedo),
-                };
-                return filtered.product(albedo).amplify(finish.gain).into_images();
+                return filtered.product(field(albedo)).amplify(finish.gain).into_images();
             }
             below = Some(filtered);
         }
@@ -354,9 +351,8 @@ impl Network for Pyramid {
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
-        let prefiltered = self.prefiltered(passes)?;
-        let passes = prefiltered.as_ref().unwrap_or(passes);
-        guides(&self.rows(passes, 0..passes.height, exposure)?, exposure, NEEDED_BY)
+        let clean = self.prefiltered(passes)?;
+        guides(&self.rows(passes, 0..passes.height, exposure)?, clean, exposure, NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {
@@ -422,11 +418,11 @@ impl Network for Pyramid {
             .convolution_levels()
             .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
             .sum();
-        // Three channels and the sum of weights, at every pyramid level; the albedo at full resolution.
+        // Three channels and the sum of weights, at every pyramid level.
         let taps = |level: usize| (4 * kernel_of(level).pow(2)) as f64 / 4f64.powi(level as i32);
         let filters: f64 = (0..=LEVELS).map(taps).sum();
         let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
-        convolutions + filters + (4 * ALBEDO_TAPS) as f64 + prefilter
+        convolutions + filters + prefilter
     }
 
     fn reach(&self) -> usize {

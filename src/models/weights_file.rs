@@ -154,12 +154,8 @@ pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Re
     for param in network.params() {
         let Some(name) = param.name.strip_prefix(PREFILTER) else { continue };
         let name = if within { &param.name } else { name };
-        // Of what it has for itself alone, the albedo kernels that its last outputs are, a prefilter needs nothing.
-        let fits = |t: &&Tensor| {
-            t.name == *name && t.shape[1..] == param.shape[1..] && t.shape.first() >= param.shape.first()
-        };
-        match tensors.iter().find(fits) {
-            Some(tensor) => param.set(&tensor.values[..param.values().len()]),
+        match tensors.iter().find(|t| t.name == *name && t.shape == param.shape) {
+            Some(tensor) => param.set(&tensor.values),
             None => return Err(Error::invalid(path, format!("holds no {name} of shape {:?}", param.shape))),
         }
     }

@@ -6,8 +6,8 @@ use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 
 use super::{Images, pool::Buffer};
 use crate::kernels::{
-    Block, Shape, View,
-    layout::{from_blocked, to_blocked, to_blocked_shuffled},
+    Shape, View,
+    layout::{from_blocked, to_blocked},
     narrow::Operand,
 };
 
@@ -68,7 +68,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     /// If the length of `values` is not what `shape` demands.
     pub fn input(shape: Shape, values: &[f32]) -> Self {
         let mut data = Buffer::new(shape);
-        to_blocked(values, data.view_mut());
+        to_blocked(values, 1, data.view_mut());
         Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
     }
 
@@ -80,8 +80,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
         assert!(shape.h.is_multiple_of(2) && shape.w.is_multiple_of(2), "only even sizes halve");
         let mut data = Buffer::new(shape.with_channels(4 * shape.c).with_size(shape.h / 2, shape.w / 2));
-        data.fill(Block::default());
-        to_blocked_shuffled(values, 0, 2, data.view_mut());
+        to_blocked(values, 2, data.view_mut());
         Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
     }
 
@@ -91,7 +90,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         let &(n, c, h, w) = dfdx::shapes::HasShape::shape(&images);
         let shape = Shape::new(n, c, h, w);
         let mut data = Buffer::new(shape);
-        to_blocked(&images.as_vec(), data.view_mut());
+        to_blocked(&images.as_vec(), 1, data.view_mut());
         let gradient = Gradient::default();
         if T::OWNS_TAPE {
             let gradient = gradient.clone();
@@ -132,10 +131,10 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
                 let values = std::mem::take(&mut **gradients.get_or_alloc_mut(&of_tensor)?);
                 saved.accumulate(|gradient, fresh| {
                     if fresh {
-                        to_blocked(&values, gradient.view_mut());
+                        to_blocked(&values, 1, gradient.view_mut());
                     } else {
                         let mut addend = Buffer::new(gradient.shape());
-                        to_blocked(&values, addend.view_mut());
+                        to_blocked(&values, 1, addend.view_mut());
                         crate::kernels::pool::add(gradient.view_mut(), addend.view());
                     }
                 });

@@ -14,8 +14,12 @@ use crate::kernels::{
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     gain::{amplify, amplify_gradient},
     layout::{from_blocked_shuffled, to_blocked_shuffled},
+    redivide::{redivide, redivide_gradient},
     simd::Tier,
 };
+
+/// Values that one thread takes at a time.
+const CHUNK: usize = 1 << 14;
 
 /// Images, channels, rows, columns.
 pub type Extent = (usize, usize, usize, usize);
@@ -88,7 +92,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn input(extent: Extent, values: &[f32]) -> Self {
         assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
         let mut data = plane_buffer(values.len());
-        data.copy_from_slice(values);
+        data.par_chunks_mut(CHUNK)
+            .zip(values.par_chunks(CHUNK))
+            .for_each(|(to, from)| to.copy_from_slice(from));
         Self::from_buffer(extent, data)
     }
 
@@ -297,6 +303,38 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
+    /// Radiance over one albedo, an input (N, 3, H, W), divided by another as far as `logits`, (N, 1, H, W), say;
+    /// `ratio` is the logarithm of the first albedo over the second. See [`crate::kernels::redivide`].
+    ///
+    /// # Panics
+    /// If extents differ.
+    pub fn redivide(self, ratio: Self, logits: Self) -> Self {
+        let (images, _, h, w) = self.extent();
+        let tape = self.tape.merge(ratio.tape).merge(logits.tape);
+        let (values, ratio, logits) = (self.saved.values, ratio.saved.values, logits.saved);
+        let mut output = plane_buffer(images * 3 * h * w);
+        for (n, output) in output.chunks_mut(3 * h * w).enumerate() {
+            redivide(Size { h, w }, values.image(n), ratio.image(n), logits.values.image(n), output);
+        }
+        let (mut field, out) = Self::output((images, 3, h, w), output, tape);
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                logits.accumulate(|into| {
+                    let into = into.expect("logits come from a layer");
+                    into.par_chunks_mut(h * w).zip(gradient.par_chunks(3 * h * w)).enumerate().for_each(
+                        |(n, (into, gradient))| {
+                            let forward = (out.values.image(n), ratio.image(n), logits.values.image(n));
+                            redivide_gradient(forward, gradient, into);
+                        },
+                    );
+                });
+                Ok(())
+            });
+        }
+        field
+    }
+
     /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic is
     /// `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W).
     /// See [`crate::kernels::blend`].
@@ -382,17 +420,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 impl Field<NoneTape> {
     /// [`Field::filter`] of some rows of the one image that the field holds more rows of: `logits` are of
     /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
-    pub fn filter_rows(
-        &self,
-        rows: (usize, usize),
-        k: usize,
-        logits: &Self,
-        confidence: Option<&Self>,
-    ) -> Self {
+    pub fn filter_rows(&self, rows: (usize, usize), k: usize, logits: &Self, confidence: &Self) -> Self {
         let (_, _, _, w) = self.extent();
         let h = rows.1 - rows.0;
         let values = |field: &Self| field.saved.values.clone();
-        let problem = (values(self), values(logits), confidence.map(values));
+        let problem = (values(self), values(logits), Some(values(confidence)));
         let (mut output, mut total) = (plane_buffer(3 * h * w), plane_buffer(h * w));
         filter_of(&problem, 0, k, rows).apply(Tier::detect(), &mut output, &mut total);
         Self::from_buffer((1, 3, h, w), output)
@@ -410,7 +442,6 @@ impl Field<NoneTape> {
 
 /// Calls `put(out, a, b)` value by value.
 fn combine(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32, f32) + Sync) {
-    const CHUNK: usize = 16384;
     out.par_chunks_mut(CHUNK).zip(a.par_chunks(CHUNK)).zip(b.par_chunks(CHUNK)).for_each(|((out, a), b)| {
         out.iter_mut().zip(a.iter().zip(b)).for_each(|(out, (a, b))| put(out, *a, *b));
     });

@@ -180,6 +180,15 @@ impl PassSet {
         part
     }
 
+    /// Every pass grown to a width and height, as [`Planes::padded_to`] does.
+    ///
+    /// # Panics
+    /// As that.
+    pub fn padded_to(self, (width, height): (usize, usize)) -> Self {
+        let planes = self.planes.into_iter().map(|(pass, planes)| (pass, planes.padded_to((width, height))));
+        Self { width, height, planes: planes.collect(), ..self }
+    }
+
     /// What `change` makes of every pass, of one new size.
     ///
     /// # Panics

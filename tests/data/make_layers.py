@@ -163,6 +163,10 @@ def amplified(image, logits):
     return image * jnp.exp(2 * jnp.tanh(logits / 2))
 
 
+def redivided(logits, image, ratio):
+    return image * jnp.exp(ratio * jax.nn.sigmoid(logits))
+
+
 def shuffled(x):
     """Channels 3..15 of 17: each four in a row are the pixels of a 2x2 square."""
     n, _, h, w = x.shape
@@ -182,6 +186,8 @@ def fields():
         case(name, blended, fine=normal(2, 3, h, w), coarse=coarse, alpha=normal(2, 1, h, w))
     case("shuffle", shuffled, x=normal(2, 17, 2, 3))
     case("amplify", amplified, image=normal(2, 3, 5, 7), logits=2 * normal(2, 3, 5, 7))
+    fixed = {"image": normal(2, 3, 5, 7), "ratio": normal(2, 3, 5, 7)}
+    case("redivide", redivided, fixed, logits=2 * normal(2, 1, 5, 7))
 
 
 if __name__ == "__main__":

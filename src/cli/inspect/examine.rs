@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::{
     Result,
     frame::{Frame, Window},
-    models::{self, Denoiser, learned::Learned, nfor},
+    models::{self, learned::BUILT_IN, nfor},
     passes::{self, Layer, POSITION_AOV, Pass},
     planes::Planes,
 };
@@ -79,19 +79,18 @@ pub struct Method {
 
 /// The networks, the classical methods and the peers, with the passes they need.
 pub fn methods() -> Vec<Method> {
-    let networks = models::trainable().into_iter().map(|(name, config)| {
-        let passes = match Learned::built_in(name) {
-            Some(model) => model.passes().to_vec(),
-            // The passes follow from the architecture alone: any seed will do.
-            None => models::build(&config, 0).passes().to_vec(),
-        };
-        Method { name: name.into(), passes }
+    let built_in = BUILT_IN.into_iter().map(|(name, _)| name);
+    // The passes of a network follow from its architecture alone: any seed will do.
+    let untrained = models::untrained().map(|(name, config)| Method {
+        name: name.into(),
+        passes: models::build(&config, 0).passes().to_vec(),
     });
-    let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES).filter_map(|name| {
+    let opened = |name: &str| {
         let model = models::open(name).ok()?;
         Some(Method { name: name.into(), passes: model.passes().to_vec() })
-    });
-    networks.chain(others).collect()
+    };
+    let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES);
+    built_in.filter_map(opened).chain(untrained).chain(others.filter_map(opened)).collect()
 }
 
 /// Reads and decodes a whole file.

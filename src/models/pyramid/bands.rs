@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{ALBEDO_KERNEL, Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
@@ -50,17 +50,16 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     if let Some(prefilter) = &network.prefilter {
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         for band in bands {
-            let band = albedo_as_radiance(&passes.rows(network.passes(), band), NEEDED_BY)?;
+            let band = albedo_as_radiance(passes, band, NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
-            prefiltered.push(&band, &mut |first, clean| {
-                let mut band = network.rows(passes, first..first + clean.height, exposure)?;
-                band.insert(Pass::DenoisingAlbedo, radiance_as_albedo(clean));
-                beauty.push(&band, &mut write)
+            prefiltered.push(band, None, &mut |first, clean| {
+                let band = network.rows(passes, first..first + clean.height, exposure)?;
+                beauty.push(band, Some(radiance_as_albedo(clean)), &mut write)
             })?;
         }
     } else {
         for band in bands {
-            beauty.push(&network.rows(passes, band, exposure)?, &mut write)?;
+            beauty.push(network.rows(passes, band, exposure)?, None, &mut write)?;
         }
     }
     keep_black(&mut image, radiance, albedo);
@@ -86,13 +85,20 @@ impl<'a> Feed<'a> {
         Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
     }
 
-    /// Takes in the next rows, an even number unless they are the last, and hands out what is denoised with it:
-    /// its first row, and radiance.
-    fn push(&mut self, band: &PassSet, done: &mut dyn FnMut(usize, Planes) -> Result<()>) -> Result<()> {
+    /// Takes in the next rows, an even number unless they are the last, with their albedo denoised where the network has
+    /// a prefilter, and hands out what is denoised with it: its first row, and radiance.
+    fn push(
+        &mut self,
+        band: PassSet,
+        clean: Option<Planes>,
+        done: &mut dyn FnMut(usize, Planes) -> Result<()>,
+    ) -> Result<()> {
         let before = self.rows;
         self.rows += band.height;
         let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
-        let inputs = guides(band, self.exposure, NEEDED_BY)?.padded_to(self.padded.0, end - before);
+        let padded = (self.padded.0, end - before);
+        let clean = clean.map(|clean| clean.padded_to(padded));
+        let inputs = guides(&band.padded_to(padded), clean, self.exposure, NEEDED_BY)?;
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {
@@ -129,6 +135,10 @@ struct Frame<'a> {
     /// Full resolution first.
     scales: Vec<Scale>,
     albedo: Line<Field>,
+    /// What was divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is
+    /// to divide; rows go to the finest scale's image at once where it does not say.
+    quotient: Line<Field>,
+    ratio: Line<Field>,
     /// One for each kernel of full resolution.
     finishes: VecDeque<Finish<NoneTape>>,
 }
@@ -191,17 +201,25 @@ impl<'a> Frame<'a> {
             decoder: (0..LEVELS).map(decoded).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
             albedo: Line::new(height),
+            quotient: Line::new(height),
+            ratio: Line::new(height),
             finishes: VecDeque::new(),
         }
     }
 
     /// Adds the inputs of the next rows.
     fn push(&mut self, inputs: &Inputs) {
-        let [irradiance, albedo, radiance, guide] = &inputs.planes[..] else {
-            unreachable!("`inputs` makes four planes")
+        let [irradiance, albedo, radiance, guide, ratio @ ..] = &inputs.planes[..] else {
+            unreachable!("`inputs` makes four planes and, with a prefilter, one more")
         };
         let field = |p: &Planes| Field::input((1, p.channels, p.height, p.width), &p.data);
-        self.scales[0].image.push(field(irradiance));
+        match ratio.first() {
+            Some(ratio) => {
+                self.quotient.push(field(irradiance));
+                self.ratio.push(field(ratio));
+            }
+            None => self.scales[0].image.push(field(irradiance)),
+        }
         self.albedo.push(field(albedo));
         for (encoder, planes) in self.encoders.iter_mut().zip([radiance, guide]) {
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
@@ -283,9 +301,14 @@ impl<'a> Frame<'a> {
             self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (prediction, finish) = Prediction::of_full(head);
+                let (prediction, mut finish) = Prediction::of_full(head);
+                let rows = 2 * rows.start..2 * rows.end;
+                if let Some(divisor) = finish.divisor.take() {
+                    let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
+                    self.scales[0].image.push(quotient.redivide(ratio, divisor));
+                }
                 self.finishes.push_back(finish);
-                self.scales[0].predicted(2 * rows.start..2 * rows.end, prediction);
+                self.scales[0].predicted(rows, prediction);
             }
         }
     }
@@ -330,20 +353,14 @@ impl<'a> Frame<'a> {
             let (rows, kernel) = kernels.pop_front().expect("there is one");
             let (near, inside) = around(&rows, reach, source.total());
             let (source, trust) = (source.rows(near.clone()), confidence.rows(near));
-            let output = source.filter_rows(inside, k, &kernel, Some(&trust));
+            let output = source.filter_rows(inside, k, &kernel, &trust);
             *filtered = rows.end;
             if scale > 0 {
                 smooth.push(output);
                 continue;
             }
             let finish = self.finishes.pop_front().expect("there is one for each kernel");
-            let albedo = match finish.albedo {
-                Some(kernel) => {
-                    let (near, inside) = around(&rows, ALBEDO_KERNEL / 2, self.albedo.total());
-                    self.albedo.rows(near).filter_rows(inside, ALBEDO_KERNEL, &kernel, None)
-                }
-                None => self.albedo.rows(rows.clone()),
-            };
+            let albedo = self.albedo.rows(rows.clone());
             done(rows.start, &output.product(albedo).amplify(finish.gain));
         }
     }
@@ -375,7 +392,9 @@ impl<'a> Frame<'a> {
             blended.forget(reach);
             smooth.forget(above.saturating_sub(1));
         }
-        self.albedo.forget(self.scales[0].filtered.saturating_sub(ALBEDO_KERNEL / 2));
+        self.quotient.forget(self.scales[0].image.end());
+        self.ratio.forget(self.scales[0].image.end());
+        self.albedo.forget(self.scales[0].filtered);
     }
 }
 

@@ -1,0 +1,51 @@
+#!/usr/bin/env python3
+"""Tells what dividing radiance by its own noisy albedo is worth: quotients.py FRAME_0004spp.exr... --clean DIR
+
+Of the pixels of each frame whose albedo is more than 5% off, prints the median RelMSE of the radiance as it is, and of the
+radiance times the clean albedo over the noisy one. DIR holds the frames with their albedo denoised (`clean_guides.py FRAMES DIR
+--oidn PATH/oidnDenoise --guides albedo`), the reference lies beside each frame. Needs numpy and openexr.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "blender_scripts"))
+from demc_blender import exr  # noqa: E402
+
+FLOOR = 0.05  # ALBEDO_FLOOR in src/features.rs
+NOISE = 0.05
+EPSILON = 1e-3  # of RelMSE
+
+
+def colours(path, render_pass):
+    channels = exr.read(str(path))
+    names = [next(name for name in channels if name.endswith(f"{render_pass}.{c}")) for c in "RGB"]
+    return np.stack([channels[name].astype(np.float64) for name in names], axis=-1)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("frames", nargs="+", type=Path)
+    parser.add_argument("--clean", required=True, type=Path)
+    args = parser.parse_args()
+
+    for frame in args.frames:
+        scene = frame.name.rsplit("_", 1)[0]
+        radiance = colours(frame, "Combined")
+        reference = colours(frame.with_name(f"{scene}_ref.exr"), "Combined")
+        noisy, clean = (
+            colours(path, "Denoising Albedo").clip(0, 1) + FLOOR for path in (frame, args.clean / frame.name)
+        )
+        off = np.abs(noisy - clean).mean(axis=-1) > NOISE * clean.mean(axis=-1)
+        errors = [
+            ((image - reference) ** 2 / (reference**2 + EPSILON)).mean(axis=-1)[off]
+            for image in (radiance, radiance * clean / noisy)
+        ]
+        print(f"{scene}: {off.mean():.1%} of pixels, {np.median(errors[0]):.4f} as it is, {np.median(errors[1]):.4f}")
+
+
+if __name__ == "__main__":
+    main()
