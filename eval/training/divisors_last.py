@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes weights of commit 8695dd6 and before, with a prefilter, what the program now reads: add_divisor.py IN OUT
+"""Makes weights of commit 8695dd6 and before, with a prefilter, what the program now reads: divisors_last.py IN OUT
 
 The guide encoder reads the ratio of the albedos too, and makes nothing of it yet; the head of full resolution has no kernels
 for the albedo any more, and has each pixel divide by the noisy albedo as to a quarter. Needs numpy.
