@@ -22,7 +22,7 @@ fn value(row: &Row, column: &str) -> f64 {
 fn tells_what_changes_results_and_what_does_not() {
     let out = tempfile::tempdir().unwrap();
     demc()
-        .args(["stability", "--models", "demc-m:f32", "--test-set"])
+        .args(["stability", "--models", "demc-s:f32", "--test-set"])
         .arg(data(""))
         .arg("--out")
         .arg(out.path())
