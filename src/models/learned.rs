@@ -70,7 +70,7 @@ impl Learned {
         if precision == Some(Precision::Int8) && !quantizable {
             return Err(Error::Usage(format!(
                 "{name}: no ranges of activations are known for 8 bits; use :bf16 or :f32 (`demc train` measures \
-                 the ranges of demc-s, demc-m and demc-l wherever it validates)"
+                 the ranges of demc-s and demc-m wherever it validates)"
             )));
         }
         let precision = precision.unwrap_or_else(|| Precision::fastest(quantizable));
