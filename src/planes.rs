@@ -30,6 +30,18 @@ impl Planes {
         Self { channels, width, height, data }
     }
 
+    /// What `fill(channel, row's number, row)` writes into each row; rows are filled on all threads.
+    pub fn from_rows(
+        channels: usize,
+        (width, height): (usize, usize),
+        fill: impl Fn(usize, usize, &mut [f32]) + Sync,
+    ) -> Self {
+        let mut planes = Self::new(channels, width, height);
+        let rows = planes.data.par_chunks_mut(width.max(1)).enumerate();
+        rows.for_each(|(i, row)| fill(i / height, i % height, row));
+        planes
+    }
+
     /// Pixels in one plane.
     pub fn pixels(&self) -> usize {
         self.width * self.height
@@ -52,23 +64,18 @@ impl Planes {
     /// If the rectangle leaves the planes.
     pub fn window(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Self {
         assert!(x + width <= self.width && y + height <= self.height, "the rectangle lies inside");
-        let mut out = Self::new(self.channels, width, height);
-        out.data.par_chunks_mut(width.max(1)).enumerate().for_each(|(i, row)| {
-            let from = self.channel(i / height);
-            row.copy_from_slice(&from[(y + i % height) * self.width + x..][..width]);
-        });
-        out
+        Self::from_rows(self.channels, (width, height), |c, row, out| {
+            out.copy_from_slice(&self.channel(c)[(y + row) * self.width + x..][..width]);
+        })
     }
 
     /// The planes after half a turn: the last pixel becomes the first.
     pub fn turned(&self) -> Self {
         let (w, h) = (self.width, self.height);
-        let mut out = Self::new(self.channels, w, h);
-        out.data.par_chunks_mut(w.max(1)).enumerate().for_each(|(i, row)| {
-            let from = &self.channel(i / h)[(h - 1 - i % h) * w..][..w];
-            row.iter_mut().zip(from.iter().rev()).for_each(|(to, from)| *to = *from);
-        });
-        out
+        Self::from_rows(self.channels, (w, h), |c, y, out| {
+            let from = &self.channel(c)[(h - 1 - y) * w..][..w];
+            out.iter_mut().zip(from.iter().rev()).for_each(|(out, from)| *out = *from);
+        })
     }
 
     /// Grows the planes, to the right and below, by repeating the last column and row.
@@ -80,14 +87,11 @@ impl Planes {
             return self;
         }
         assert!(self.width <= width && self.height <= height, "padding only adds");
-        let mut out = Self::new(self.channels, width, height);
-        out.data.par_chunks_mut(width).enumerate().for_each(|(i, row)| {
-            let y = (i % height).min(self.height - 1);
-            let source = &self.channel(i / height)[y * self.width..][..self.width];
-            row[..self.width].copy_from_slice(source);
-            row[self.width..].fill(source[self.width - 1]);
-        });
-        out
+        Self::from_rows(self.channels, (width, height), |c, y, out| {
+            let from = &self.channel(c)[y.min(self.height - 1) * self.width..][..self.width];
+            out[..self.width].copy_from_slice(from);
+            out[self.width..].fill(from[self.width - 1]);
+        })
     }
 
     /// How many values are NaN or infinite.

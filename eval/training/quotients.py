@@ -7,23 +7,19 @@ radiance times the clean albedo over the noisy one. DIR holds the frames with th
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "blender_scripts"))
-from demc_blender import exr  # noqa: E402
+from clean_guides import ALBEDO_FLOOR
+from clean_references import exr, planes
 
-FLOOR = 0.05  # ALBEDO_FLOOR in src/features.rs
 NOISE = 0.05
 EPSILON = 1e-3  # of RelMSE
 
 
 def colours(path, render_pass):
-    channels = exr.read(str(path))
-    names = [next(name for name in channels if name.endswith(f"{render_pass}.{c}")) for c in "RGB"]
-    return np.stack([channels[name].astype(np.float64) for name in names], axis=-1)
+    return planes(exr.read(str(path)), render_pass, "RGB")[0].astype(np.float64)
 
 
 def main():
@@ -37,7 +33,7 @@ def main():
         radiance = colours(frame, "Combined")
         reference = colours(frame.with_name(f"{scene}_ref.exr"), "Combined")
         noisy, clean = (
-            colours(path, "Denoising Albedo").clip(0, 1) + FLOOR for path in (frame, args.clean / frame.name)
+            colours(path, "Denoising Albedo").clip(0, 1) + ALBEDO_FLOOR for path in (frame, args.clean / frame.name)
         )
         off = np.abs(noisy - clean).mean(axis=-1) > NOISE * clean.mean(axis=-1)
         errors = [

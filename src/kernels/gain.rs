@@ -7,14 +7,11 @@ use rayon::prelude::*;
 
 use super::{
     filter::{exp, logistic},
-    vectorised::{self, Vectorised},
+    vectorised::{self, CHUNK, Vectorised},
 };
 
 /// The logarithm of the largest gain.
 const LARGEST: f32 = 2.0;
-
-/// Values that one thread takes at a time.
-const CHUNK: usize = 1 << 14;
 
 /// The gain of a logit, and its slope.
 #[inline(always)]

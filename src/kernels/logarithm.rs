@@ -2,10 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::vectorised::{self, Vectorised};
-
-/// Values that one thread takes at a time.
-const CHUNK: usize = 1 << 14;
+use super::vectorised::{self, CHUNK, Vectorised};
 
 /// Writes `ln(1 + steepness * v) / ln(1 + steepness)` of each value `v`: 0 of 0, 1 of 1, nearly linear below
 /// `1 / steepness`. Values are finite and not negative.

@@ -5,6 +5,9 @@
 
 use super::simd::{Kernel, Simd, Tier};
 
+/// Values that one thread takes at a time, where each is computed by itself.
+pub const CHUNK: usize = 1 << 14;
+
 /// A computation in plain, safe loops; its `run` and what it calls are `#[inline(always)]`, since only
 /// what is inlined is compiled for the tier.
 pub trait Vectorised {

@@ -12,6 +12,7 @@ use crate::{
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
+    train::Augment,
 };
 
 const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
@@ -20,6 +21,9 @@ const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
 /// network gets wrong depends on how its squares and levels happen to lie on the picture, and half of that averages out
 /// (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
+
+/// What [`TURNED`] does to a frame.
+const HALF_TURN: Augment = Augment { turns: 2, ..Augment::IDENTITY };
 
 /// The built-in weights, name and file: ours, fastest first, then the paper's networks and its rivals.
 pub const BUILT_IN: [(&str, &[u8]); 8] = [
@@ -93,19 +97,6 @@ impl Learned {
     }
 }
 
-/// The passes of a network after half a turn of the picture, and of camera-space vectors with it.
-fn turned(network: &dyn Network, passes: &PassSet) -> PassSet {
-    let passes = passes.rows(network.passes(), 0..passes.height);
-    passes.map((passes.width, passes.height), |pass, planes| {
-        let mut planes = planes.turned();
-        if pass == Pass::DenoisingNormal {
-            let n = planes.pixels();
-            planes.data[..2 * n].iter_mut().for_each(|v| *v = -*v);
-        }
-        planes
-    })
-}
-
 impl Denoiser for Learned {
     fn name(&self) -> &str {
         &self.name
@@ -130,12 +121,10 @@ impl Denoiser for Learned {
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         let mut image = self.network.infer(passes, tile)?;
         if self.turned {
-            let second = self.network.infer(&turned(&*self.network, passes), tile)?.turned();
-            image
-                .data
-                .iter_mut()
-                .zip(&second.data)
-                .for_each(|(first, second)| *first = 0.5 * (*first + second));
+            let read = passes.rows(self.network.passes(), 0..passes.height);
+            let second = self.network.infer(&HALF_TURN.passes(&read), tile)?.turned();
+            let values = image.data.iter_mut().zip(&second.data);
+            values.for_each(|(first, second)| *first = 0.5 * (*first + second));
         }
         Ok(image)
     }

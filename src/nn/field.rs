@@ -16,10 +16,8 @@ use crate::kernels::{
     layout::{from_blocked_shuffled, to_blocked_shuffled},
     redivide::{redivide, redivide_gradient},
     simd::Tier,
+    vectorised::CHUNK,
 };
-
-/// Values that one thread takes at a time.
-const CHUNK: usize = 1 << 14;
 
 /// Images, channels, rows, columns.
 pub type Extent = (usize, usize, usize, usize);

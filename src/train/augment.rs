@@ -80,23 +80,19 @@ impl Augment {
     fn moved(&self, planes: &Planes) -> Planes {
         let (w, h) = (planes.width, planes.height);
         assert!(self.turns.is_multiple_of(2) || w == h, "only squares turn by a quarter");
-        let mut out = Planes::new(planes.channels, w, h);
-        for c in 0..planes.channels {
+        Planes::from_rows(planes.channels, (w, h), |c, y, row| {
             let from = planes.channel(c);
-            for (y, row) in out.channel_mut(c).chunks_mut(w).enumerate() {
-                for (x, value) in row.iter_mut().enumerate() {
-                    // Where the pixel that a counter-clockwise turn brings to (x, y) came from.
-                    let (sx, sy) = match self.turns {
-                        0 => (x, y),
-                        1 => (w - 1 - y, x),
-                        2 => (w - 1 - x, h - 1 - y),
-                        _ => (y, h - 1 - x),
-                    };
-                    *value = from[sy * w + if self.flip { w - 1 - sx } else { sx }];
-                }
+            for (x, value) in row.iter_mut().enumerate() {
+                // Where the pixel that a counter-clockwise turn brings to (x, y) came from.
+                let (sx, sy) = match self.turns {
+                    0 => (x, y),
+                    1 => (w - 1 - y, x),
+                    2 => (w - 1 - x, h - 1 - y),
+                    _ => (y, h - 1 - x),
+                };
+                *value = from[sy * w + if self.flip { w - 1 - sx } else { sx }];
             }
-        }
-        out
+        })
     }
 
     /// Turns the first two axes of a vector pass as the picture turned (y points up).

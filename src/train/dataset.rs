@@ -159,13 +159,9 @@ impl Stored {
 
     fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
         let cut = |data: &[f16], channels: usize| {
-            let mut planes = Planes::new(channels, width, height);
-            for c in 0..channels {
-                for (row, out) in planes.channel_mut(c).chunks_mut(width).enumerate() {
-                    data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
-                }
-            }
-            planes
+            Planes::from_rows(channels, (width, height), |c, row, out| {
+                data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
+            })
         };
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
         for (pass, data) in &self.passes {

@@ -7,7 +7,11 @@ use serde::Serialize;
 use crate::{
     Result,
     frame::{Frame, Window},
-    models::{self, learned::BUILT_IN, nfor},
+    models::{
+        self, Denoiser,
+        learned::{BUILT_IN, Learned},
+        nfor,
+    },
     passes::{self, Layer, POSITION_AOV, Pass},
     planes::Planes,
 };
@@ -79,18 +83,15 @@ pub struct Method {
 
 /// The networks, the classical methods and the peers, with the passes they need.
 pub fn methods() -> Vec<Method> {
-    let built_in = BUILT_IN.into_iter().map(|(name, _)| name);
+    let method = |name: &str, passes: &[Pass]| Method { name: name.into(), passes: passes.to_vec() };
+    let built_in =
+        BUILT_IN.into_iter().filter_map(|(name, _)| Some(method(name, Learned::built_in(name)?.passes())));
     // The passes of a network follow from its architecture alone: any seed will do.
-    let untrained = models::untrained().map(|(name, config)| Method {
-        name: name.into(),
-        passes: models::build(&config, 0).passes().to_vec(),
-    });
-    let opened = |name: &str| {
-        let model = models::open(name).ok()?;
-        Some(Method { name: name.into(), passes: model.passes().to_vec() })
-    };
+    let untrained =
+        models::untrained().map(|(name, config)| method(name, models::build(&config, 0).passes()));
     let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES);
-    built_in.filter_map(opened).chain(untrained).chain(others.filter_map(opened)).collect()
+    let others = others.filter_map(|name| Some(method(name, models::open(name).ok()?.passes())));
+    built_in.chain(untrained).chain(others).collect()
 }
 
 /// Reads and decodes a whole file.
