@@ -1,5 +1,7 @@
 //! Training frames in memory, and the crops drawn from them.
 
+use std::collections::HashMap;
+
 use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
@@ -18,8 +20,11 @@ pub struct Dataset {
     frames: Vec<Stored>,
     /// Pixels of all frames up to and with each.
     pixels: Vec<usize>,
+    /// Of each frame the others that differ from it by their noise alone.
+    seeds: Vec<Vec<usize>>,
 }
 
+#[cfg_attr(test, derive(Clone))]
 struct Stored {
     pair: Pair,
     view_layer: String,
@@ -73,7 +78,7 @@ impl Dataset {
             total += f.width * f.height;
             total
         });
-        Ok(Self { pixels: pixels.collect(), frames })
+        Ok(Self { pixels: pixels.collect(), seeds: seeds(&frames), frames })
     }
 
     /// Frames held.
@@ -93,16 +98,52 @@ impl Dataset {
     }
 
     /// A random square crop of `patch` pixels, augmented; all of it decided by `rng`. A frame is drawn as
-    /// often as it is large.
+    /// often as it is large. Where there are more renders of it with as many samples, each pixel comes from
+    /// one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
+    /// and no network gets to learn the noise of those that there are by heart.
     pub fn draw(&self, patch: usize, rng: &mut Rng) -> Sample {
         let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
-        let stored = &self.frames[self.pixels.partition_point(|&end| end <= pixel)];
+        let index = self.pixels.partition_point(|&end| end <= pixel);
+        let stored = &self.frames[index];
         let x = rng.below(stored.width - patch + 1);
         let y = rng.below(stored.height - patch + 1);
         let mut sample = stored.crop(x, y, patch, patch);
+        if let seeds @ [_, ..] = self.seeds[index].as_slice() {
+            let other = &self.frames[seeds[rng.below(seeds.len())]];
+            sample.passes = mixed(&sample.passes, &other.crop(x, y, patch, patch).passes, rng);
+        }
         Augment::draw(rng).apply(&mut sample);
         sample
     }
+}
+
+/// Of each frame the others that have its reference, its number of samples and its passes.
+fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
+    let key = |frame: &Stored| {
+        let passes: Vec<Pass> = frame.passes.iter().map(|(pass, _)| *pass).collect();
+        (frame.pair.reference.clone(), frame.pair.spp, passes)
+    };
+    let mut groups: HashMap<_, Vec<usize>> = HashMap::new();
+    for (index, frame) in frames.iter().enumerate() {
+        groups.entry(key(frame)).or_default().push(index);
+    }
+    let others =
+        |(index, frame)| groups[&key(frame)].iter().copied().filter(|other| *other != index).collect();
+    frames.iter().enumerate().map(others).collect()
+}
+
+/// Takes each pixel, all passes of it, from either of two crops.
+fn mixed(one: &PassSet, other: &PassSet, rng: &mut Rng) -> PassSet {
+    let pick: Vec<bool> = (0..one.width * one.height).map(|_| rng.below(2) == 1).collect();
+    one.map((one.width, one.height), |pass, planes| {
+        let mut planes = planes.clone();
+        let from = other.get(pass).expect("renders of one view have the same passes");
+        for c in 0..planes.channels {
+            let pixels = planes.channel_mut(c).iter_mut().zip(from.channel(c)).zip(&pick);
+            pixels.filter(|(_, pick)| **pick).for_each(|((pixel, other), _)| *pixel = *other);
+        }
+        planes
+    })
 }
 
 impl Stored {
@@ -169,5 +210,58 @@ impl Stored {
         }
         let raw_reference = self.raw_reference.as_ref().map(|raw| cut(raw, 3));
         Sample { passes, reference: cut(&self.reference, 3), raw_reference }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    /// A frame all of whose passes are `value` everywhere.
+    fn stored(reference: &str, spp: u32, value: f32) -> Stored {
+        let plane = |channels: usize| vec![f16::from_f32(value); channels * 64];
+        let pair = Pair {
+            scene: "scene".into(),
+            noisy: "noisy.exr".into(),
+            reference: reference.into(),
+            spp,
+            frame: None,
+        };
+        Stored {
+            pair,
+            view_layer: "ViewLayer".into(),
+            width: 8,
+            height: 8,
+            passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
+            reference: plane(3),
+            raw_reference: None,
+        }
+    }
+
+    fn dataset(frames: Vec<Stored>) -> Dataset {
+        Dataset { pixels: (1..=frames.len()).map(|n| 64 * n).collect(), seeds: seeds(&frames), frames }
+    }
+
+    #[test]
+    fn renders_of_one_view_with_as_many_samples_are_mixed_pixel_by_pixel() {
+        let frames = [("a", 4, 1.0), ("a", 4, 2.0), ("a", 8, 4.0), ("b", 4, 8.0)];
+        let data = dataset(frames.map(|(reference, spp, value)| stored(reference, spp, value)).to_vec());
+        let mut rng = Rng::new(1, 0);
+        let mut met = BTreeSet::new();
+        for _ in 0..64 {
+            let sample = data.draw(8, &mut rng);
+            let depth = &sample.passes.get(Pass::Depth).unwrap().data;
+            let values: BTreeSet<u32> = depth.iter().map(|v| *v as u32).collect();
+            // All passes of a pixel come from one render; exposure alone may scale radiance.
+            let combined = sample.passes.get(Pass::Combined).unwrap();
+            let scale = combined.data[0] / depth[0];
+            for (pixel, depth) in combined.channel(2).iter().zip(depth) {
+                assert!((pixel - depth * scale).abs() < 1e-5 * pixel);
+            }
+            met.insert(values);
+        }
+        assert_eq!(met, [[1, 2].into(), [4].into(), [8].into()].into());
     }
 }
