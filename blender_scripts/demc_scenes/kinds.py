@@ -1,11 +1,24 @@
 """The kinds of scenes by name: what builds each, and the cameras that suit it."""
 
-from . import outside, rooms, studio, views
+from . import outside, relief, rooms, studio, views
 
 
 def _room(stage, mood=None):
     shell = rooms.room(stage, mood)
     return lambda: views.room_camera(stage, shell)
+
+
+def _relief(stage):
+    """Mouldings and boards that are of one colour with their walls, inside or out."""
+    if stage.rng.random() < 0.7:
+        shell = rooms.room(stage, relief=True)
+        return lambda: views.room_camera(stage, shell)
+    relief.house(stage)
+    outside.sun(stage)
+
+    def camera():
+        return views.around_camera(stage, stage.rng.choice(stage.interest), (6, 18), (0.5, 2.5), (20, 45), 0.5)
+    return camera
 
 
 def _table(build):
@@ -71,6 +84,7 @@ def _fog(stage):
 # Name -> (builder, weight). A builder fills the stage and returns a function that places a camera.
 KINDS = {
     "room": (_room, 12),
+    "relief": (_relief, 6),
     "street": (_street, 2),
     "outdoor": (_outdoor, 3),
     "studio": (_table(studio.studio), 2),

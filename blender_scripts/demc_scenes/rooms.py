@@ -9,7 +9,7 @@ import math
 from mathutils import Vector
 
 from . import materials as m
-from . import palette, props, shapes
+from . import palette, props, relief, shapes
 from .stage import darkness, environment
 
 _THICK = 0.25
@@ -18,8 +18,9 @@ _THICK = 0.25
 class Room:
     """The shell of a room and what light it has."""
 
-    def __init__(self, stage, width, depth, height):
+    def __init__(self, stage, width, depth, height, relief=False):
         self.stage, self.width, self.depth, self.height = stage, width, depth, height
+        self.relief = relief  # whether walls and ceiling are dressed
         self.windows = []  # (centre, inward normal, width, height)
 
     def wall_point(self, wall, along, off=0.0):
@@ -36,11 +37,11 @@ class Room:
         return (math.pi, -math.pi / 2, 0.0, math.pi / 2)[wall]
 
 
-def room(stage, mood=None):
+def room(stage, mood=None, relief=False):
     """A furnished room; `mood` is day, night or dim."""
     rng = stage.rng
     mood = mood or rng.choice(("day", "day", "day", "night", "dim"))
-    shell = Room(stage, rng.uniform(2.8, 6.5), rng.uniform(3.0, 7.5), rng.uniform(2.35, 3.4))
+    shell = Room(stage, rng.uniform(2.8, 6.5), rng.uniform(3.0, 7.5), rng.uniform(2.35, 3.4), relief)
     build_shell(shell, windows=rng.randint(1, 4))
     furnish(shell)
     decorate_walls(shell)
@@ -57,7 +58,8 @@ def build_shell(shell, windows):
     stage.add(floor, palette.choose(rng, lib, "floor", 0.15))
     ceiling = palette.choose(rng, lib, "floor") if rng.random() < 0.1 else m.paint(rng, (0.75, 0.95))
     stage.add(shapes.box((w + 0.4, d + 0.4, 0.1), 0, (w / 2, d / 2, h + 0.05)), ceiling)
-    base, accent = palette.walls(rng, lib), palette.walls(rng, lib)
+    paint = (lambda rng, _: m.paint(rng)) if shell.relief else palette.walls
+    base, accent = paint(rng, lib), paint(rng, lib)
     trim = m.paint(rng, (0.1, 0.95)) if rng.random() < 0.6 else palette.choose(rng, lib, "furniture")
     per_wall = [[] for _ in range(4)]
     for _ in range(windows):
@@ -70,7 +72,10 @@ def build_shell(shell, windows):
             per_wall[wall].append((u, u + ww, sill, sill + wh))
     for wall in range(4):
         parts = wall_parts(shell.wall_length(wall), h, per_wall[wall])
-        stage.add(shapes.boxes(parts), accent if rng.random() < 0.3 else base, shell.wall_point(wall, 0), wall * math.pi / 2)
+        material = accent if rng.random() < 0.3 else base
+        stage.add(shapes.boxes(parts), material, shell.wall_point(wall, 0), wall * math.pi / 2)
+        if shell.relief:
+            relief.dress(shell, wall, per_wall[wall], material, trim)
         for opening in per_wall[wall]:
             window(shell, wall, opening, trim)
         if rng.random() < 0.8:
@@ -78,7 +83,9 @@ def build_shell(shell, windows):
             skirting = [((x1 - x0, 0.02, height), ((x0 + x1) / 2, 0.01, height / 2))
                         for x0, x1 in gaps(shell.wall_length(wall), [o for o in per_wall[wall] if o[2] < height])]
             stage.add(shapes.boxes(skirting, 0.004), trim, shell.wall_point(wall, 0), wall * math.pi / 2)
-    if rng.random() < 0.2:
+    if shell.relief and rng.random() < 0.4:
+        stage.add(shapes.boxes(relief.coffers(rng, w, d, h)), ceiling)
+    elif rng.random() < 0.2:
         beams = [((w, 0.12, 0.16), (w / 2, d * (i + 0.5) / 4, h - 0.08)) for i in range(4)]
         stage.add(shapes.boxes(beams, 0.01), palette.choose(rng, lib, "furniture"))
 
