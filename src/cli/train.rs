@@ -16,6 +16,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::{
     Error, Result,
     frame::Frame,
+    metrics::ssim,
     models::{self, learned::TURNED, network::Architecture, weights_file},
     nn::Precision,
     passes::{self, Pass},
@@ -52,8 +53,8 @@ pub struct Args {
     /// Learning rate of the first and last step
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
-    /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, or geomean, the
-    /// logarithm of each crop's relmse
+    /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, geomean, the
+    /// logarithm of each crop's relmse, or ssim, which adds ten times 1 - SSIM to that
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
     /// Take squared errors, not their denominators, against what references were before Blender denoised them,
@@ -188,6 +189,9 @@ impl Args {
         let multiple = models::build(&network, 0).multiple();
         if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
+        }
+        if self.loss == Loss::Ssim && self.patch < ssim::WINDOW {
+            return Err(usage(format!("--patch {}: --loss ssim takes {} at least", self.patch, ssim::WINDOW)));
         }
         for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {
             if value == 0 {

@@ -49,6 +49,71 @@ pub fn ssim(image: &Planes, reference: &Planes) -> Option<f64> {
     Some(sums.iter().sum::<f64>() / (image.channels * rows * (image.width - 2 * RADIUS)) as f64)
 }
 
+/// The sum of SSIM over all windows of one plane, and its derivative by each pixel of `image`, for training.
+///
+/// # Panics
+/// If the plane is smaller than the window.
+pub fn slope(image: &[f32], reference: &[f32], width: usize) -> (f64, Vec<f32>) {
+    let gaussian = weights().map(|w| w as f32);
+    let moment = |of: fn(f32, f32) -> f32| {
+        let values: Vec<f32> = image.iter().zip(reference).map(|(x, r)| of(*x, *r)).collect();
+        windows(&values, width, &gaussian)
+    };
+    let (mut ux, ur) = (moment(|x, _| x), moment(|_, r| r));
+    let (mut uxx, urr, mut uxr) = (moment(|x, _| x * x), moment(|_, r| r * r), moment(|x, r| x * r));
+    let (c1, c2) = (C1 as f32, C2 as f32);
+    let mut sum = 0.0;
+    // Each moment of x gives way to the derivative by it.
+    for ((((ux, uxx), uxr), ur), urr) in ux.iter_mut().zip(&mut uxx).zip(&mut uxr).zip(&ur).zip(&urr) {
+        let (vx, vr, vxr) = (*uxx - *ux * *ux, urr - ur * ur, *uxr - *ux * ur);
+        let (a1, a2) = (2.0 * *ux * ur + c1, 2.0 * vxr + c2);
+        let (b1, b2) = (*ux * *ux + ur * ur + c1, vx + vr + c2);
+        let value = a1 * a2 / (b1 * b2);
+        sum += f64::from(value);
+        let mean = *ux;
+        *ux = 2.0 * (ur * (a2 - a1) / (b1 * b2) + mean * value * (b2.recip() - b1.recip()));
+        *uxx = -value / b2;
+        *uxr = 2.0 * a1 / (b1 * b2);
+    }
+    let [ux, uxx, uxr] = [ux, uxx, uxr].map(|slope| spread(&slope, width, &gaussian));
+    let pixels = image.iter().zip(reference).zip(ux).zip(uxx).zip(uxr);
+    (sum, pixels.map(|((((x, r), ux), uxx), uxr)| ux + 2.0 * x * uxx + r * uxr).collect())
+}
+
+/// The weighted sums of all windows of a plane, 10 fewer in either direction.
+fn windows(plane: &[f32], width: usize, weights: &[f32; WINDOW]) -> Vec<f32> {
+    let (height, inner) = (plane.len() / width, width - 2 * RADIUS);
+    let mut sums = vec![0.0; inner * (height - 2 * RADIUS)];
+    let mut column = vec![0.0; width];
+    for (y, sums) in sums.chunks_mut(inner).enumerate() {
+        column.fill(0.0);
+        for (row, weight) in plane[y * width..].chunks(width).zip(weights) {
+            column.iter_mut().zip(row).for_each(|(sum, value)| *sum += weight * value);
+        }
+        for (dx, weight) in weights.iter().enumerate() {
+            sums.iter_mut().zip(&column[dx..]).for_each(|(sum, value)| *sum += weight * value);
+        }
+    }
+    sums
+}
+
+/// The transpose of [`windows`]: gives each pixel its share of the windows that it lies in.
+fn spread(sums: &[f32], width: usize, weights: &[f32; WINDOW]) -> Vec<f32> {
+    let inner = width - 2 * RADIUS;
+    let mut plane = vec![0.0; width * (sums.len() / inner + 2 * RADIUS)];
+    let mut column = vec![0.0; width];
+    for (y, sums) in sums.chunks(inner).enumerate() {
+        column.fill(0.0);
+        for (dx, weight) in weights.iter().enumerate() {
+            column[dx..].iter_mut().zip(sums).for_each(|(value, sum)| *value += weight * sum);
+        }
+        for (row, weight) in plane[y * width..].chunks_mut(width).zip(weights) {
+            row.iter_mut().zip(&column).for_each(|(value, sum)| *value += weight * sum);
+        }
+    }
+    plane
+}
+
 /// The window's weights along one axis; they add up to one.
 fn weights() -> [f64; WINDOW] {
     let raw: [f64; WINDOW] = std::array::from_fn(|i| {
@@ -153,6 +218,32 @@ mod tests {
             }
         }
         sum / f64::from(count)
+    }
+
+    #[test]
+    fn slope_is_the_derivative() {
+        let image = |seed: u32| -> Planes {
+            let value = |i: u32| (i.wrapping_mul(2654435761).wrapping_add(seed) >> 8) % 1000;
+            Planes::from_vec(1, 17, 14, (0..17 * 14).map(|i| value(i) as f32 / 999.0).collect())
+        };
+        let (x, r) = (image(5), image(77));
+        let windows = 7.0 * 4.0;
+        let (sum, slope) = slope(&x.data, &r.data, 17);
+        assert!((sum / windows - ssim(&x, &r).unwrap()).abs() < 1e-5);
+        // Corners, where few windows see a pixel, an edge and the middle.
+        for at in [0, 16, 17 * 13, 17 * 14 - 1, 8, 17 * 7 + 8, 17 * 6 + 3] {
+            let moved = |by: f32| {
+                let mut x = x.clone();
+                x.data[at] += by;
+                windows * ssim(&x, &r).unwrap()
+            };
+            let want = (moved(1e-3) - moved(-1e-3)) / 2e-3;
+            assert!(
+                (f64::from(slope[at]) - want).abs() < 1e-3 * (1.0 + want.abs()),
+                "{at}: {} {want}",
+                slope[at]
+            );
+        }
     }
 
     proptest! {
