@@ -2,10 +2,11 @@
 
     python teacher.py MANIFEST --out OUT --oidn PATH/oidnDenoise
 
-MANIFEST is a CSV with a column `noisy`, as `demc train --data` takes it. For each of its frames OUT gets <frame>_ref.exr, quality
-high with guides denoised first, and OUT/manifest.csv the pairs. A reference holds detail that no network can know from
-4 samples; a teacher's output does not, and so tells with less noise which way the weights should go. What is there
-already is kept.
+MANIFEST is a CSV of pairs as `demc train --data` takes it. Of each reference and number of samples OUT gets <frame>_ref.exr,
+named after the first of its noisy frames: the mean of what quality high makes of each, with guides denoised first. They share
+it in OUT/manifest.csv, since `demc train` mixes renders of one reference pixel by pixel. A reference holds detail that no network
+can know from 4 samples; a teacher's output does not, and so tells with less noise which way the weights should go. What is
+there already is kept.
 """
 
 import argparse
@@ -13,30 +14,42 @@ import csv
 import os
 import tempfile
 
+import numpy as np
+
 from clean_references import clean, exr, planes
+
+
+def teach(oidn, folder, frames):
+    """The mean of what the teacher makes of some frames, and the names of its channels."""
+    taught = []
+    for frame in frames:
+        channels = exr.read(frame)
+        radiance, names = planes(channels, "Combined", "RGB")
+        taught.append(clean(oidn, folder, radiance, channels).copy())
+    return np.mean(taught, axis=0), names
 
 
 def main():
     """Entry point of the script."""
     parser = argparse.ArgumentParser(prog="teacher.py", description="Denoises noisy frames for networks to imitate.")
-    parser.add_argument("manifest", help="CSV with a column noisy")
+    parser.add_argument("manifest", help="CSV with columns noisy, reference and spp")
     parser.add_argument("--out", required=True, help="folder for the references and their manifest.csv")
     parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
+    views = {}
     with open(options.manifest, encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+        for row in csv.DictReader(file):
+            views.setdefault((row["reference"], row["spp"]), []).append(row["noisy"])
     pairs = []
     with tempfile.TemporaryDirectory() as folder:
-        for row in rows:
-            scene = os.path.basename(row["noisy"]).removesuffix(".exr")
-            target = os.path.join(options.out, f"{scene}_ref.exr")
+        for (_, spp), frames in views.items():
+            scenes = [os.path.basename(frame).removesuffix(".exr") for frame in frames]
+            target = os.path.join(options.out, f"{scenes[0]}_ref.exr")
             if not os.path.exists(target):
-                channels = exr.read(row["noisy"])
-                radiance, names = planes(channels, "Combined", "RGB")
-                taught = clean(options.oidn, folder, radiance, channels)
+                taught, names = teach(options.oidn, folder, frames)
                 exr.write_half(target, {name: taught[..., c] for c, name in enumerate(names)})
-            pairs.append([f"{scene}_taught", row["noisy"], target, row["spp"]])
+            pairs += [[f"{scene}_taught", frame, target, spp] for scene, frame in zip(scenes, frames)]
     with open(os.path.join(options.out, "manifest.csv"), "w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([["scene", "noisy", "reference", "spp"], *pairs])
     print(f"{len(pairs)} pairs in {options.out}")
