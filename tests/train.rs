@@ -186,6 +186,7 @@ fn refuses_what_cannot_be_trained() {
     let says = |text: &'static str| predicate::str::contains(text);
     run(&mut train_with("noisy", "64", &out, 4)).code(2).stderr(says("trainable: demc-s"));
     run(&mut train_with("demc-s", "50", &out, 4)).code(2).stderr(says("multiple of 16"));
+    run(train_with("kpcn", "8", &out, 4).args(["--loss", "ssim"])).code(2).stderr(says("11 at least"));
     run(&mut train_with("demc-s", "256", &out, 4)).code(1).stderr(says("--patch"));
     fs::remove_dir_all(&out).expect("the folder of the run that could not start");
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
