@@ -34,7 +34,7 @@ pub enum Loss {
     /// brightness: steps in a smooth gradient and soft edges weigh little as errors of pixels, but are what
     /// people see first (and what SSIM measures).
     Edges,
-    /// Mean over images of `ln(1 + RelMSE / 0.001)`, for the geometric mean over scenes by which methods are compared. A
+    /// Mean over images of `ln(1 + RelMSE / 0.0002)`, for the geometric mean over scenes by which methods are compared. A
     /// plain mean is all but made of the noisiest images; what is left to gain on even walls counts for nothing in it.
     Geomean,
     /// [`Loss::Geomean`] and ten times `1 - SSIM` of what a display would show, at each image's exposure, against the
@@ -102,7 +102,7 @@ const RAW_LIMIT: f32 = 8.0;
 const SSIM_WEIGHT: f32 = 10.0;
 
 /// A RelMSE below which there is little left to gain.
-const SMALL_ERROR: f32 = 1e-3;
+const SMALL_ERROR: f32 = 2e-4;
 
 fn relmse(
     image: Images<Taped>,
