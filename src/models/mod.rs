@@ -157,7 +157,7 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     };
     let kpcn = |architecture| Config::new(architecture, &[32]);
     vec![
-        ("demc-s", pyramid([24, 48, 64, 64])),
+        ("demc-s", pyramid([16, 48, 64, 64])),
         ("demc-m", pyramid([80, 96, 96, 112])),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
