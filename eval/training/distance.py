@@ -1,0 +1,70 @@
+"""Tells how far a model is from Open Image Denoise, quality high with guides denoised first, on the pairs of a manifest.
+
+    python distance.py MANIFEST --model WEIGHTS --oidn PATH/oidnDenoise [--demc PATH/demc] [--most 110]
+
+Pairs of 4 samples whose references were denoised and keep what they were as Noisy Image. Printed for all of them and for
+each third, ordered by the RelMSE of Open Image Denoise: the geometric mean of the ratio of RelMSE, both against the
+denoised reference, and the median of (ours - its) / ours with both taken against the noisy one. The former favours whoever
+errs as the denoiser of the references does; the noise of the latter is the same for both and cancels.
+"""
+
+import argparse
+import csv
+import os
+import random
+import subprocess
+import tempfile
+
+import numpy as np
+
+from clean_references import clean, exr, planes
+
+
+def errors(ours, theirs, reference):
+    """RelMSE of both against the denoised reference, and the difference of both against the noisy one."""
+    denoised, raw = (planes(reference, name, "RGB")[0] for name in ("Combined", "Noisy Image"))
+    weight = 1 / (denoised**2 + 1e-3)
+    relmse = [float(((image - denoised) ** 2 * weight).mean()) for image in (ours, theirs)]
+    return *relmse, float(((ours - theirs) * (ours + theirs - 2 * raw) * weight).mean())
+
+
+def tell(name, rows):
+    ours, theirs, difference = np.array(rows).T
+    ratio, median = np.exp(np.log(ours / theirs).mean()), np.median(difference / ours)
+    print(f"{name:8} {len(rows):4} pairs, RelMSE {theirs.min():.4f} to {theirs.max():.4f}: ratio {ratio:.3f}, unbiased {median:+.3f}")
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="distance.py", description="Compares a model with Open Image Denoise.")
+    parser.add_argument("manifest", help="CSV with columns noisy, reference and spp")
+    parser.add_argument("--model", required=True, help="a model's name or a weights file")
+    parser.add_argument("--demc", default="demc", help="the program demc")
+    parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    parser.add_argument("--most", type=int, default=110, help="pairs drawn from the manifest, if it has more")
+    options = parser.parse_args()
+    with open(options.manifest, encoding="utf-8", newline="") as file:
+        pairs = [row for row in csv.DictReader(file) if row["spp"] == "4"]
+    random.Random(3).shuffle(pairs)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for pair in pairs:
+            if len(rows) == options.most:
+                break
+            reference = exr.read(pair["reference"])
+            if not any("Noisy Image." in name for name in reference):
+                continue
+            command = [options.demc, "denoise", pair["noisy"], "--model", options.model, "--out", folder, "--overwrite"]
+            subprocess.run(command, check=True, capture_output=True)
+            ours, _ = planes(exr.read(os.path.join(folder, os.path.basename(pair["noisy"]))), "Denoised", "RGB")
+            frame = exr.read(pair["noisy"])
+            theirs = clean(options.oidn, folder, planes(frame, "Combined", "RGB")[0], frame)
+            rows.append(errors(ours, theirs, reference))
+    rows.sort(key=lambda row: row[1])
+    tell("all", rows)
+    for k, name in enumerate(("lowest", "middle", "highest")):
+        tell(name, rows[len(rows) * k // 3 : len(rows) * (k + 1) // 3])
+
+
+if __name__ == "__main__":
+    main()
