@@ -191,7 +191,11 @@ impl Args {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
         }
         if self.loss == Loss::Ssim && self.patch < ssim::WINDOW {
-            return Err(usage(format!("--patch {}: --loss ssim takes {} at least", self.patch, ssim::WINDOW)));
+            return Err(usage(format!(
+                "--patch {}: --loss ssim takes {} at least",
+                self.patch,
+                ssim::WINDOW
+            )));
         }
         for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {
             if value == 0 {

@@ -321,8 +321,7 @@ mod tests {
         const SHAPE: (usize, usize, usize, usize) = (2, 3, 16, 13);
         let count = 2 * 3 * 16 * 13;
         let mut rng = Rng::new(4, 1);
-        let mut noise =
-            |size: f32| -> Vec<f32> { (0..count).map(|_| 0.2 + size * rng.uniform() as f32).collect() };
+        let mut noise = |size: f32| -> Vec<f32> { (0..count).map(|_| 0.2 + size * rng.uniform()).collect() };
         let (values, reference) = (noise(0.3), noise(0.2));
         let at = |values: &[f32]| {
             let image: Images = Cpu::default().tensor_from_vec(values.to_vec(), SHAPE);
