@@ -1,7 +1,6 @@
 """Detail that normals alone show: mouldings, panelling, boards, fins and rails, of one colour with what they are on.
 
-Parts are (size, centre) boxes of a wall that runs along +X with its face at y = 0 and rises along +Z; `front` is +1
-where the viewer stands at positive y, -1 otherwise.
+Parts are (size, centre) boxes of a wall that runs along +X with its face at y = 0, seen from positive y, and rises along +Z.
 """
 
 import math
@@ -12,22 +11,27 @@ from . import materials as m
 from . import palette, shapes
 
 
-def frame(x0, x1, z0, z1, width, depth, front=1):
+def moved(parts, x, y, z, side=1):
+    """Parts elsewhere, with `side` -1 seen from negative y."""
+    return [(size, (cx + x, side * cy + y, cz + z)) for size, (cx, cy, cz) in parts]
+
+
+def frame(x0, x1, z0, z1, width, depth):
     """Four strips around a rectangle."""
-    y, x, z = front * depth / 2, (x0 + x1) / 2, (z0 + z1) / 2
+    y, x, z = depth / 2, (x0 + x1) / 2, (z0 + z1) / 2
     return [((x1 - x0, depth, width), (x, y, z0 + width / 2)), ((x1 - x0, depth, width), (x, y, z1 - width / 2)),
             ((width, depth, z1 - z0 - 2 * width), (x0 + width / 2, y, z)),
             ((width, depth, z1 - z0 - 2 * width), (x1 - width / 2, y, z))]
 
 
-def moulding(rng, x0, x1, z0, z1, front=1):
+def moulding(rng, x0, x1, z0, z1):
     """Frames one inside the other, each of its own height, as planed from one profile."""
     parts = []
     for _ in range(rng.randint(1, 4)):
         width = rng.uniform(0.008, 0.03)
         if min(x1 - x0, z1 - z0) < 4 * width:
             break
-        parts += frame(x0, x1, z0, z1, width, rng.uniform(0.006, 0.03), front)
+        parts += frame(x0, x1, z0, z1, width, rng.uniform(0.006, 0.03))
         step = width + rng.choice((0.0, rng.uniform(0.005, 0.06)))
         x0, x1, z0, z1 = x0 + step, x1 - step, z0 + step, z1 - step
     return parts
@@ -101,7 +105,7 @@ def door(rng, x, height):
         for j in range(rows):
             field = (x0 + 0.1 + (width - 0.2) * i / columns, x0 + 0.1 + (width - 0.2) * (i + 1) / columns - 0.04,
                      0.15 + (height - 0.25) * j / rows, 0.15 + (height - 0.25) * (j + 1) / rows - 0.06)
-            parts += [(size, (cx, cy + 0.03, cz)) for size, (cx, cy, cz) in moulding(rng, *field)]
+            parts += moved(moulding(rng, *field), 0, 0.03, 0)
     return parts + [((0.12, 0.06, 0.02), (x1 - 0.1, 0.06, 1.0))]
 
 
@@ -118,11 +122,8 @@ def dress(shell, wall, openings, material, trim):
     stage, rng = shell.stage, shell.stage.rng
     length, height = shell.wall_length(wall), shell.height
     cover = rng.choice((panels, panels, boards, battens, None))
-    edges = [0.0] + [v for a, b, *_ in sorted(openings) for v in (a - 0.12, b + 0.12)] + [length]
     parts, trims = [], []
-    for x0, x1 in zip(edges[::2], edges[1::2]):
-        if x1 - x0 < 0.15:
-            continue
+    for x0, x1 in shell.gaps(wall, openings, margin=0.12, least=0.15):
         if x1 - x0 > 1.6 and rng.random() < 0.35:
             at = rng.uniform(x0 + 0.75, x1 - 0.75)
             trims += door(rng, at, min(rng.uniform(1.95, 2.2), height - 0.15))
@@ -184,12 +185,12 @@ def house(stage):
         w, d, h = rng.uniform(5, 11), rng.uniform(4, 8), rng.uniform(2.8, 6.5)
         at, turn = ((rng.uniform(-4, 4) if k else 0.0), 5.0 + 2.5 * k, 0.0), rng.choice((0.0, 0.0, math.pi / 2))
         stage.add(shapes.box((w, d, h), 0, (0, d / 2, h / 2)), walls, at, turn)
-        pitch, clad = rng.uniform(0.09, 0.25), []
-        for i in range(int(h / pitch)):
-            for out, share, level in ((0.03, 0.55, 0.275), (0.012, 0.45, 0.775)):
-                clad.append(((w + 2 * out, d + 2 * out, pitch * share), (0, d / 2, pitch * (i + level))))
-        if rng.random() < 0.3:  # upright boards
-            clad = [(s, (x - w / 2, -y, z)) for s, (x, y, z) in battens(rng, 0, w, h)]
+        pitch = rng.uniform(0.09, 0.25)
+        if rng.random() < 0.3:
+            clad = moved(battens(rng, 0, w, h), -w / 2, 0, 0, -1)
+        else:
+            clad = [((w + 2 * out, d + 2 * out, pitch * share), (0, d / 2, pitch * (i + level))) for i in range(int(h / pitch))
+                    for out, share, level in ((0.03, 0.55, 0.275), (0.012, 0.45, 0.775))]
         stage.add(shapes.boxes(clad), walls, at, turn)
         details, columns = [], max(2, int(w / rng.uniform(1.4, 2.6)))
         glass = []
@@ -200,8 +201,8 @@ def house(stage):
                 if z + wh / 2 > h - 0.2:
                     continue
                 glass.append(((ww, 0.02, wh), (x, -0.035, z)))
-                around = moulding(rng, x - ww / 2 - 0.1, x + ww / 2 + 0.1, z - wh / 2 - 0.1, z + wh / 2 + 0.1, -1)
-                details += [(size, (cx, cy - 0.03, cz)) for size, (cx, cy, cz) in around]
+                around = moulding(rng, x - ww / 2 - 0.1, x + ww / 2 + 0.1, z - wh / 2 - 0.1, z + wh / 2 + 0.1)
+                details += moved(around, 0, -0.03, 0, -1)
                 bars = rng.randint(1, 4)
                 details += [((0.03, 0.05, wh), (x + ww * (b / bars - 0.5), -0.05, z)) for b in range(bars + 1)]
                 details += [((ww, 0.05, 0.03), (x, -0.05, z + wh * (b / bars - 0.5))) for b in range(bars + 1)]
@@ -212,12 +213,12 @@ def house(stage):
             details += [((w, out, 0.2), (0, -out / 2, 0.1)), ((w, out + 0.2, 0.12), (0, -out / 2, 2.6))]
             details += rails(rng, -w / 2 + 0.05, w / 2 - rng.uniform(0.05, w * 0.4), 0.2, -out + 0.1)
             details += [((0.14, 0.14, 2.4), (-w / 2 + 0.1 + (w - 0.2) * i / 4, -out + 0.1, 1.4)) for i in range(5)]
-        details += [(s, (x - w / 2, -y, z)) for s, (x, y, z) in cornice(rng, w, h)]
+        details += moved(cornice(rng, w, h), -w / 2, 0, 0, -1)
         dark = m.Nodes("window").principled(Base_Color=(0.02, 0.025, 0.03), Roughness=0.03, Coat_Weight=1.0)
         for parts, material in ((glass, dark), (details, trim)):
             if parts:
                 stage.add(shapes.boxes(parts), material, at, turn)
-        shingles = [(s, (x, y + d / 2, z + h)) for s, (x, y, z) in roof(rng, w, d, rng.uniform(1.0, 3.0), rng.uniform(0.1, 0.5))]
+        shingles = moved(roof(rng, w, d, rng.uniform(1.0, 3.0), rng.uniform(0.1, 0.5)), 0, d / 2, h)
         stage.add(shapes.boxes(shingles), tiles, at, turn)
         stage.interest += [Vector((at[0] + rng.uniform(-w / 2, w / 2), at[1], rng.uniform(0.5, h))) for _ in range(3)]
     fence = rails(rng, -10, 10, 0, 0)

@@ -31,6 +31,11 @@ class Room:
     def wall_length(self, wall):
         return self.width if wall % 2 == 0 else self.depth
 
+    def gaps(self, wall, openings, margin=0.0, least=0.01):
+        """The stretches of a wall's foot outside its openings and a margin around each."""
+        edges = [0.0] + [v for a, b, *_ in sorted(openings) for v in (a - margin, b + margin)] + [self.wall_length(wall)]
+        return [(a, b) for a, b in zip(edges[::2], edges[1::2]) if b - a > least]
+
     # A thing made to face -Y, standing with its back to a wall, faces into the room after this turn.
     @staticmethod
     def wall_turn(wall):
@@ -81,19 +86,13 @@ def build_shell(shell, windows):
         if rng.random() < 0.8:
             height = rng.uniform(0.06, 0.14)
             skirting = [((x1 - x0, 0.02, height), ((x0 + x1) / 2, 0.01, height / 2))
-                        for x0, x1 in gaps(shell.wall_length(wall), [o for o in per_wall[wall] if o[2] < height])]
+                        for x0, x1 in shell.gaps(wall, [o for o in per_wall[wall] if o[2] < height])]
             stage.add(shapes.boxes(skirting, 0.004), trim, shell.wall_point(wall, 0), wall * math.pi / 2)
     if shell.relief and rng.random() < 0.4:
         stage.add(shapes.boxes(relief.coffers(rng, w, d, h)), ceiling)
     elif rng.random() < 0.2:
         beams = [((w, 0.12, 0.16), (w / 2, d * (i + 0.5) / 4, h - 0.08)) for i in range(4)]
         stage.add(shapes.boxes(beams, 0.01), palette.choose(rng, lib, "furniture"))
-
-
-def gaps(length, openings):
-    """The stretches of a wall's foot outside its openings."""
-    edges = [0.0] + [v for a, b, *_ in sorted(openings) for v in (a, b)] + [length]
-    return [(a, b) for a, b in zip(edges[::2], edges[1::2]) if b - a > 0.01]
 
 
 def wall_parts(length, height, openings):
