@@ -110,7 +110,7 @@ impl Dataset {
         let mut sample = stored.crop(x, y, patch, patch);
         if let seeds @ [_, ..] = self.seeds[index].as_slice() {
             let other = &self.frames[seeds[rng.below(seeds.len())]];
-            sample.passes = mixed(&sample.passes, &other.crop(x, y, patch, patch).passes, rng);
+            sample.passes = mixed(&sample.passes, &other.passes((x, y), (patch, patch)), rng);
         }
         Augment::draw(rng).apply(&mut sample);
         sample
@@ -199,17 +199,33 @@ impl Stored {
     }
 
     fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
-        let cut = |data: &[f16], channels: usize| {
-            Planes::from_rows(channels, (width, height), |c, row, out| {
-                data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
-            })
-        };
+        let cut = |data: &[f16]| self.cut(data, 3, (x, y), (width, height));
+        Sample {
+            passes: self.passes((x, y), (width, height)),
+            reference: cut(&self.reference),
+            raw_reference: self.raw_reference.as_deref().map(cut),
+        }
+    }
+
+    /// The noisy passes of a crop.
+    fn passes(&self, at: (usize, usize), (width, height): (usize, usize)) -> PassSet {
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
         for (pass, data) in &self.passes {
-            passes.insert(*pass, cut(data, pass.channels()));
+            passes.insert(*pass, self.cut(data, pass.channels(), at, (width, height)));
         }
-        let raw_reference = self.raw_reference.as_ref().map(|raw| cut(raw, 3));
-        Sample { passes, reference: cut(&self.reference, 3), raw_reference }
+        passes
+    }
+
+    fn cut(
+        &self,
+        data: &[f16],
+        channels: usize,
+        (x, y): (usize, usize),
+        (width, height): (usize, usize),
+    ) -> Planes {
+        Planes::from_rows(channels, (width, height), |c, row, out| {
+            data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
+        })
     }
 }
 
