@@ -5,6 +5,7 @@ mod black;
 mod fireflies;
 mod kpcn;
 mod lbf;
+mod shading;
 
 pub use black::keep_black;
 pub use fireflies::{FIREFLY, tame_fireflies};
@@ -13,6 +14,7 @@ pub use kpcn::{
     kpcn_streams,
 };
 pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
+pub use shading::Shading;
 
 use rayon::prelude::*;
 
@@ -132,40 +134,59 @@ pub fn guide_rows(
     Ok(part)
 }
 
+/// What is made of a frame for a network with a prefilter before the network reads it.
+#[derive(Clone, Debug)]
+pub struct Refined {
+    /// The denoised albedo, (3, H, W).
+    pub albedo: Planes,
+    /// What normals tell of the light, (1, H, W). See [`Shading`].
+    pub shading: Planes,
+}
+
+impl Refined {
+    /// Grown to (width, height) by repeating the last row and column.
+    pub fn padded_to(self, size: (usize, usize)) -> Self {
+        Self { albedo: self.albedo.padded_to(size), shading: self.shading.padded_to(size) }
+    }
+}
+
 /// The built-in models' inputs, in this order:
 /// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
 /// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
-/// camera-space normal (6, H, W). With a `clean` albedo, (3, H, W), that is the one meant; the logarithm of what radiance
-/// is divided by over what the noisy albedo would make of that is then the last of the inputs (3, H, W), and its mean
-/// over the colours another channel of the guide encoder's. The scale is the inverse of the exposure, that of the whole frame,
-/// of which `passes` may be some rows.
+/// camera-space normal (6, H, W). With a `refined` albedo, that is the one meant; the logarithm of what radiance
+/// is divided by over what the noisy albedo would make of that comes next (3, H, W), and last the shading (1, H, W); the mean
+/// of the former over the colours and the latter are two channels more of the guide encoder's. The scale is the inverse of the
+/// exposure, that of the whole frame, of which `passes` may be some rows.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guides(passes: &PassSet, clean: Option<Planes>, exposure: f32, needed_by: &str) -> Result<Inputs> {
+pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let mut guide = Planes::new(if clean.is_some() { 7 } else { 6 }, passes.width, passes.height);
+    let mut guide = Planes::new(if refined.is_some() { 8 } else { 6 }, passes.width, passes.height);
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
-    let (directions, mean) = rest.split_at_mut(noisy.data.len());
-    map(&clean.as_ref().unwrap_or(noisy).data, colours, texture);
+    let (directions, rest) = rest.split_at_mut(noisy.data.len());
+    map(&refined.as_ref().map_or(noisy, |refined| &refined.albedo).data, colours, texture);
     map(&normal.data, directions, |v| v.clamp(-1.0, 1.0));
     let mut albedo = Planes::new(3, passes.width, passes.height);
     map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
-    let ratio = clean.map(|mut other| {
+    let further = refined.map(|Refined { albedo: mut other, shading }| {
         map(&noisy.data, &mut other.data, |a| texture(a) + ALBEDO_FLOOR);
         let mut ratio = Planes::new(3, passes.width, passes.height);
         log_ratio(&albedo.data, &other.data, &mut ratio.data);
+        let (mean, shade) = rest.split_at_mut(shading.data.len());
         let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
         mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
-        ratio
+        shade.copy_from_slice(&shading.data);
+        [ratio, shading]
     });
     let mut irradiance = radiance.clone();
     irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
     let mut encoded = Planes::new(3, passes.width, passes.height);
     log_transfer(&irradiance.data, STEEPNESS, &mut encoded.data);
-    let planes = [irradiance, albedo, encoded, guide].into_iter().chain(ratio).collect();
+    let planes =
+        [irradiance, albedo, encoded, guide].into_iter().chain(further.into_iter().flatten()).collect();
     Ok(Inputs { planes, scale: exposure.recip() })
 }
 

@@ -282,6 +282,16 @@ fn amplifying_by_predicted_gains() {
 }
 
 #[test]
+fn adding_a_product_to_every_channel() {
+    let case = Case::new("plus_product");
+    let [sum, a, b] = ["sum", "a", "b"].map(|key| case.images(key));
+    let fixed = Field::input(*a.shape(), &a.as_vec());
+    let gradients = case.project(traced_field(&sum).plus_product(fixed, traced_field(&b)).into_images());
+    case.compare_image("d_sum", &gradients, &sum);
+    case.compare_image("d_b", &gradients, &b);
+}
+
+#[test]
 fn dividing_by_another_albedo() {
     let case = Case::new("redivide");
     let logits = case.images("logits");

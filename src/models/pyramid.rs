@@ -15,6 +15,9 @@
 //! prefilter, a small network of the same kind, which was trained to denoise albedo in the place of radiance and is not
 //! trained any further. The samples that made an albedo noisy made the radiance noisy alike, though, and their quotient
 //! is free of that noise: so each pixel says how far it is to be divided by the noisy albedo, not by the clean one.
+//!
+//! What normals alone show, such as a moulding, is often thinner than any kernel that is wide enough to average its noise. A fit
+//! of light over normals ([`Shading`]) finds it; each pixel says how far its gain is to follow that.
 
 mod bands;
 
@@ -25,7 +28,10 @@ use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 use super::network::{Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
-    features::{GUIDE_PASSES, Inputs, albedo_as_radiance, exposure, guide_rows, guides, radiance_as_albedo},
+    features::{
+        GUIDE_PASSES, Inputs, Refined, Shading, albedo_as_radiance, exposure, guide_rows, guides,
+        radiance_as_albedo,
+    },
     kernels::blend::CORNERS,
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
@@ -40,9 +46,10 @@ const KERNEL: usize = 5;
 const FULL_KERNEL: usize = 3;
 
 /// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where there is a
-/// prefilter, which albedo to divide by.
+/// prefilter, which albedo to divide by, and how far to follow the shading.
 const GAINS: usize = 3;
 const DIVISOR: usize = 1;
+const SHADE: usize = 1;
 
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
@@ -60,7 +67,7 @@ const NEEDED_BY: &str = "this model";
 /// besides where there is a prefilter.
 const RADIANCE_CHANNELS: usize = 3;
 const GUIDE_CHANNELS: usize = 6;
-const RATIO_CHANNELS: usize = 1;
+const REFINED_CHANNELS: usize = 2;
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]
@@ -71,7 +78,7 @@ pub struct Pyramid {
     encoders: [Encoder; 2],
     /// Coarsest level first.
     decoder: Vec<Level>,
-    /// Full resolution: radiance kernels, confidence, mask, corners, gains and divisors of four pixels.
+    /// Full resolution: radiance kernels, confidence, mask, corners, gains, divisors and shades of four pixels.
     full: Conv,
     /// One head a trunk level, finest first.
     heads: Vec<Conv>,
@@ -121,6 +128,8 @@ struct Finish<T> {
     gain: Field<T>,
     /// How far to divide by the noisy albedo, before its logistic, (N, 1, H, W), if it says.
     divisor: Option<Field<T>>,
+    /// What the shading is multiplied by before it is added to all gains' logits, (N, 1, H, W), if it says.
+    shade: Option<Field<T>>,
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
@@ -139,8 +148,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
             (end <= head.shape().c).then(|| Field::from_activation(head.fork(), first, 4 * planes, 2))
         };
         let gain = planes(GAINS).expect("every head of full resolution has gains");
-        let divisor = planes(DIVISOR);
-        (Self::split(head, FULL_KERNEL, 2), Finish { gain, divisor })
+        let (divisor, shade) = (planes(DIVISOR), planes(SHADE));
+        (Self::split(head, FULL_KERNEL, 2), Finish { gain, divisor, shade })
     }
 
     /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
@@ -207,10 +216,13 @@ impl Pyramid {
     fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
-        let (ratios, divisor) = if config.prefilter.is_empty() { (0, 0) } else { (RATIO_CHANNELS, DIVISOR) };
+        let (refined, finish) = match config.prefilter[..] {
+            [] => (0, GAINS),
+            _ => (REFINED_CHANNELS, GAINS + DIVISOR + SHADE),
+        };
         let encoders = [
             Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + ratios, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + refined, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
         let decoder = (0..LEVELS).rev().map(|level| {
@@ -233,7 +245,7 @@ impl Pyramid {
             Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
-            full: head("head.full".into(), decoder_width(0), 4 * (head_of(0) + GAINS + divisor)),
+            full: head("head.full".into(), decoder_width(0), 4 * (head_of(0) + finish)),
             heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), head_of(l + 1))).collect(),
             config,
             prefilter: None,
@@ -259,8 +271,8 @@ impl Pyramid {
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
-        let [irradiance, albedo, radiance_input, guide_input, ratio @ ..] = &batch[..] else {
-            unreachable!("`inputs` makes four planes and, with a prefilter, one more")
+        let [irradiance, albedo, radiance_input, guide_input, refined @ ..] = &batch[..] else {
+            unreachable!("`inputs` makes four planes and, with a prefilter, two more")
         };
         let field = |(shape, values): &(crate::kernels::Shape, Vec<f32>)| {
             Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values)
@@ -283,15 +295,16 @@ impl Pyramid {
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, finish) = Prediction::of_full(full);
+        let (finest, Finish { mut gain, divisor, shade }) = Prediction::of_full(full);
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(Prediction::of_level));
 
         // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
         // filtering made of the one below, and filtered.
         let mut image = field(irradiance);
-        if let Some((ratio, divisor)) = ratio.first().zip(finish.divisor) {
+        if let ([ratio, shading], Some(divisor), Some(shade)) = (refined, divisor, shade) {
             image = image.redivide(field(ratio), divisor);
+            gain = gain.plus_product(field(shading), shade);
         }
         let mut pyramid = Vec::with_capacity(levels.len());
         let last = levels.len() - 1;
@@ -314,7 +327,7 @@ impl Pyramid {
             };
             let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
             if pyramid.is_empty() {
-                return filtered.product(field(albedo)).amplify(finish.gain).into_images();
+                return filtered.product(field(albedo)).amplify(gain).into_images();
             }
             below = Some(filtered);
         }
@@ -351,8 +364,16 @@ impl Network for Pyramid {
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
-        let clean = self.prefiltered(passes)?;
-        guides(&self.rows(passes, 0..passes.height, exposure)?, clean, exposure, NEEDED_BY)
+        let rows = 0..passes.height;
+        let refined = match self.prefiltered(passes)? {
+            Some(albedo) => {
+                let shading =
+                    Shading::of(passes, exposure, NEEDED_BY)?.rows(passes, rows.clone(), NEEDED_BY)?;
+                Some(Refined { albedo, shading })
+            }
+            None => None,
+        };
+        guides(&self.rows(passes, rows, exposure)?, refined, exposure, NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {

@@ -274,6 +274,47 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
+    /// Every channel, (N, C, H, W), plus the product of two fields (N, 1, H, W).
+    ///
+    /// # Panics
+    /// If extents differ.
+    pub fn plus_product(self, a: Self, b: Self) -> Self {
+        let (images, channels, h, w) = self.extent();
+        assert_eq!([a.extent(), b.extent()], [(images, 1, h, w); 2]);
+        let tape = self.tape.merge(a.tape).merge(b.tape);
+        let (sum, a, b) = (self.saved, a.saved, b.saved);
+        let mut output = plane_buffer(sum.values.data.len());
+        let planes = output.chunks_mut(h * w).zip(sum.values.data.chunks(h * w)).enumerate();
+        planes.for_each(|(plane, (output, sum))| {
+            let (a, b) = (a.values.image(plane / channels), b.values.image(plane / channels));
+            combine(output, a, b, |out, a, b| *out = a * b);
+            output.par_iter_mut().zip(sum).for_each(|(out, sum)| *out += sum);
+        });
+        let (mut field, out) = Self::output(sum.values.extent, output, tape);
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                sum.accumulate(|into| {
+                    if let Some(into) = into {
+                        into.par_iter_mut().zip(&gradient[..]).for_each(|(sum, g)| *sum += g);
+                    }
+                });
+                for (into, other) in [(&a, &b), (&b, &a)] {
+                    into.accumulate(|into| {
+                        let Some(into) = into else { return };
+                        for (plane, gradient) in gradient.chunks(h * w).enumerate() {
+                            let image = plane / channels;
+                            let into = &mut into[image * h * w..][..h * w];
+                            combine(into, gradient, other.values.image(image), |sum, g, v| *sum += g * v);
+                        }
+                    });
+                }
+                Ok(())
+            });
+        }
+        field
+    }
+
     /// Every value times the gain of a logit in a field of the same extent. See [`crate::kernels::gain`].
     ///
     /// # Panics

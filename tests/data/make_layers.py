@@ -188,6 +188,8 @@ def fields():
     case("amplify", amplified, image=normal(2, 3, 5, 7), logits=2 * normal(2, 3, 5, 7))
     fixed = {"image": normal(2, 3, 5, 7), "ratio": normal(2, 3, 5, 7)}
     case("redivide", redivided, fixed, logits=2 * normal(2, 1, 5, 7))
+    product = lambda sum, a, b: sum + a * b
+    case("plus_product", product, {"a": normal(2, 1, 5, 7)}, sum=normal(2, 3, 5, 7), b=normal(2, 1, 5, 7))
 
 
 if __name__ == "__main__":

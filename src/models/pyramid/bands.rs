@@ -12,7 +12,8 @@ use super::{Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
-        Inputs, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black, radiance_as_albedo,
+        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black,
+        radiance_as_albedo,
     },
     kernels::{Shape, blend::Place},
     models::network::Network,
@@ -48,13 +49,16 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     };
     let mut beauty = Feed::new(network, passes, exposure, rows);
     if let Some(prefilter) = &network.prefilter {
+        let shading = Shading::of(passes, exposure, NEEDED_BY)?;
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         for band in bands {
             let band = albedo_as_radiance(passes, band, NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
             prefiltered.push(band, None, &mut |first, clean| {
-                let band = network.rows(passes, first..first + clean.height, exposure)?;
-                beauty.push(band, Some(radiance_as_albedo(clean)), &mut write)
+                let rows = first..first + clean.height;
+                let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
+                let refined = Refined { albedo: radiance_as_albedo(clean), shading };
+                beauty.push(network.rows(passes, rows, exposure)?, Some(refined), &mut write)
             })?;
         }
     } else {
@@ -85,20 +89,19 @@ impl<'a> Feed<'a> {
         Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
     }
 
-    /// Takes in the next rows, an even number unless they are the last, with their albedo denoised where the network has
-    /// a prefilter, and hands out what is denoised with it: its first row, and radiance.
+    /// Takes in the next rows, an even number unless they are the last, refined where the network has a prefilter, and hands out what is denoised with it: its first row, and radiance.
     fn push(
         &mut self,
         band: PassSet,
-        clean: Option<Planes>,
+        refined: Option<Refined>,
         done: &mut dyn FnMut(usize, Planes) -> Result<()>,
     ) -> Result<()> {
         let before = self.rows;
         self.rows += band.height;
         let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
         let padded = (self.padded.0, end - before);
-        let clean = clean.map(|clean| clean.padded_to(padded));
-        let inputs = guides(&band.padded_to(padded), clean, self.exposure, NEEDED_BY)?;
+        let refined = refined.map(|refined| refined.padded_to(padded));
+        let inputs = guides(&band.padded_to(padded), refined, self.exposure, NEEDED_BY)?;
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {
@@ -139,8 +142,10 @@ struct Frame<'a> {
     /// to divide; rows go to the finest scale's image at once where it does not say.
     quotient: Line<Field>,
     ratio: Line<Field>,
-    /// One for each kernel of full resolution.
-    finishes: VecDeque<Finish<NoneTape>>,
+    /// What normals tell of the light, until the network says how far to follow it.
+    shading: Line<Field>,
+    /// Their logits, one for each kernel of full resolution.
+    gains: VecDeque<Field>,
 }
 
 /// A level of an encoder.
@@ -203,22 +208,23 @@ impl<'a> Frame<'a> {
             albedo: Line::new(height),
             quotient: Line::new(height),
             ratio: Line::new(height),
-            finishes: VecDeque::new(),
+            shading: Line::new(height),
+            gains: VecDeque::new(),
         }
     }
 
     /// Adds the inputs of the next rows.
     fn push(&mut self, inputs: &Inputs) {
-        let [irradiance, albedo, radiance, guide, ratio @ ..] = &inputs.planes[..] else {
-            unreachable!("`inputs` makes four planes and, with a prefilter, one more")
+        let [irradiance, albedo, radiance, guide, refined @ ..] = &inputs.planes[..] else {
+            unreachable!("`inputs` makes four planes and, with a prefilter, two more")
         };
         let field = |p: &Planes| Field::input((1, p.channels, p.height, p.width), &p.data);
-        match ratio.first() {
-            Some(ratio) => {
-                self.quotient.push(field(irradiance));
-                self.ratio.push(field(ratio));
-            }
-            None => self.scales[0].image.push(field(irradiance)),
+        if let [ratio, shading] = refined {
+            self.quotient.push(field(irradiance));
+            self.ratio.push(field(ratio));
+            self.shading.push(field(shading));
+        } else {
+            self.scales[0].image.push(field(irradiance));
         }
         self.albedo.push(field(albedo));
         for (encoder, planes) in self.encoders.iter_mut().zip([radiance, guide]) {
@@ -301,13 +307,14 @@ impl<'a> Frame<'a> {
             self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (prediction, mut finish) = Prediction::of_full(head);
+                let (prediction, Finish { mut gain, divisor, shade }) = Prediction::of_full(head);
                 let rows = 2 * rows.start..2 * rows.end;
-                if let Some(divisor) = finish.divisor.take() {
+                if let (Some(divisor), Some(shade)) = (divisor, shade) {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
                     self.scales[0].image.push(quotient.redivide(ratio, divisor));
+                    gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
                 }
-                self.finishes.push_back(finish);
+                self.gains.push_back(gain);
                 self.scales[0].predicted(rows, prediction);
             }
         }
@@ -359,9 +366,9 @@ impl<'a> Frame<'a> {
                 smooth.push(output);
                 continue;
             }
-            let finish = self.finishes.pop_front().expect("there is one for each kernel");
+            let gain = self.gains.pop_front().expect("there is one for each kernel");
             let albedo = self.albedo.rows(rows.clone());
-            done(rows.start, &output.product(albedo).amplify(finish.gain));
+            done(rows.start, &output.product(albedo).amplify(gain));
         }
     }
 
@@ -394,6 +401,7 @@ impl<'a> Frame<'a> {
         }
         self.quotient.forget(self.scales[0].image.end());
         self.ratio.forget(self.scales[0].image.end());
+        self.shading.forget(self.scales[0].image.end());
         self.albedo.forget(self.scales[0].filtered);
     }
 }
