@@ -154,9 +154,9 @@ impl Refined {
 /// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
 /// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
 /// camera-space normal (6, H, W). With a `refined` albedo, that is the one meant; the logarithm of what radiance
-/// is divided by over what the noisy albedo would make of that comes next (3, H, W), and last the shading (1, H, W); the mean
-/// of the former over the colours and the latter are two channels more of the guide encoder's. The scale is the inverse of the
-/// exposure, that of the whole frame, of which `passes` may be some rows.
+/// is divided by over what the noisy albedo would make of that comes next (3, H, W), and its mean over the colours is another
+/// channel of the guide encoder's; the shading is the last (1, H, W). The scale is the inverse of the exposure, that of the
+/// whole frame, of which `passes` may be some rows.
 ///
 /// # Errors
 /// A pass is missing.
@@ -164,9 +164,9 @@ pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let mut guide = Planes::new(if refined.is_some() { 8 } else { 6 }, passes.width, passes.height);
+    let mut guide = Planes::new(if refined.is_some() { 7 } else { 6 }, passes.width, passes.height);
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
-    let (directions, rest) = rest.split_at_mut(noisy.data.len());
+    let (directions, mean) = rest.split_at_mut(noisy.data.len());
     map(&refined.as_ref().map_or(noisy, |refined| &refined.albedo).data, colours, texture);
     map(&normal.data, directions, |v| v.clamp(-1.0, 1.0));
     let mut albedo = Planes::new(3, passes.width, passes.height);
@@ -175,10 +175,8 @@ pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_
         map(&noisy.data, &mut other.data, |a| texture(a) + ALBEDO_FLOOR);
         let mut ratio = Planes::new(3, passes.width, passes.height);
         log_ratio(&albedo.data, &other.data, &mut ratio.data);
-        let (mean, shade) = rest.split_at_mut(shading.data.len());
         let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
         mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
-        shade.copy_from_slice(&shading.data);
         [ratio, shading]
     });
     let mut irradiance = radiance.clone();

@@ -67,7 +67,7 @@ const NEEDED_BY: &str = "this model";
 /// besides where there is a prefilter.
 const RADIANCE_CHANNELS: usize = 3;
 const GUIDE_CHANNELS: usize = 6;
-const REFINED_CHANNELS: usize = 2;
+const RATIO_CHANNELS: usize = 1;
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]
@@ -216,13 +216,13 @@ impl Pyramid {
     fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
-        let (refined, finish) = match config.prefilter[..] {
+        let (ratios, finish) = match config.prefilter[..] {
             [] => (0, GAINS),
-            _ => (REFINED_CHANNELS, GAINS + DIVISOR + SHADE),
+            _ => (RATIO_CHANNELS, GAINS + DIVISOR + SHADE),
         };
         let encoders = [
             Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + refined, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + ratios, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
         let decoder = (0..LEVELS).rev().map(|level| {
