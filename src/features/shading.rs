@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use super::{ALBEDO_FLOOR, STEEPNESS, texture};
 use crate::{
     Result,
+    filters::solve::{LANES, Lanes, Symmetric},
     kernels::logarithm::log_transfer,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -21,19 +22,17 @@ use crate::{
 const SQUARE: usize = 4;
 
 /// Weights of the squares on either side of one, binomial: a deviation of 1.4 squares.
-const WINDOW: [f32; 9] = {
-    let mut weights = [1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0];
-    let mut i = 0;
-    while i < weights.len() {
-        weights[i] /= 256.0;
-        i += 1;
-    }
-    weights
-};
+const WINDOW: [f32; 9] = [1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0];
+
+/// How many squares the window reaches to either side.
+const REACH: usize = WINDOW.len() / 2;
 
 /// Added to the variance of each axis of the normal, in variances of the light: 8 times the variance with which
 /// the 400 pixels of a window decide on a slope, by which slopes that noise alone may explain shrink.
 const RIDGE: f32 = 0.02;
+
+/// Light counts as no brighter than this, 2.5 times middle grey: lamps and fireflies would decide on slopes all around them.
+const BRIGHTEST: f32 = 0.75;
 
 /// A variance of the light below which there is no noise to speak of.
 const LEAST_VARIANCE: f32 = 1e-4;
@@ -41,12 +40,18 @@ const LEAST_VARIANCE: f32 = 1e-4;
 /// The shading that [`Shading::rows`] gives is at most this, either way.
 const LARGEST: f32 = 1.0;
 
-/// Sums over pixels: their number, normal, light, its square, its products with the normal, and those of the normal with
-/// itself.
-const MOMENTS: usize = 1 + 3 + 1 + 1 + 3 + 6;
+/// What is fitted: a constant and the three axes of the normal.
+const UNKNOWNS: usize = 4;
 
-/// What is kept of each square: the mean normal around, and the slope of light over it.
-const KEPT: usize = 6;
+/// Lines of a row of pixels: one, the three axes of the normal, and the light.
+const LINES: usize = UNKNOWNS + 1;
+
+/// Sums over pixels of the products of every two of those, a lower triangle row by row: the matrix of the fit, its right-hand
+/// side, and the square of the light.
+const MOMENTS: usize = LINES * (LINES + 1) / 2;
+
+/// What is kept of each square: the slope of light over the normal, and what it makes of the mean normal around.
+const KEPT: usize = UNKNOWNS;
 
 /// The slopes of light over normals, all over a frame.
 pub struct Shading {
@@ -65,35 +70,47 @@ impl Shading {
         let radiance = passes.require(Pass::Combined, needed_by)?;
         let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-        let squares = passes.width.div_ceil(SQUARE);
+        let (width, squares) = (passes.width, passes.width.div_ceil(SQUARE));
         let mut moments = vec![0.0; passes.height.div_ceil(SQUARE) * MOMENTS * squares];
         moments.par_chunks_mut(MOMENTS * squares).enumerate().for_each(|(row, moments)| {
-            let (mut irradiance, mut light) = (vec![0.0; passes.width], vec![0.0; passes.width]);
+            let mut of_columns = vec![0.0; MOMENTS * width];
+            let mut lines = vec![1.0; LINES * width];
+            let mut irradiance = vec![0.0; width];
             for y in SQUARE * row..(SQUARE * (row + 1)).min(passes.height) {
                 irradiance.fill(0.0);
-                for c in 0..3 {
-                    let of = |planes: &'_ Planes| y * planes.width..(y + 1) * planes.width;
-                    let (radiance, albedo) =
-                        (&radiance.channel(c)[of(radiance)], &albedo.channel(c)[of(albedo)]);
-                    for (sum, (v, a)) in irradiance.iter_mut().zip(radiance.iter().zip(albedo)) {
+                let (known, light) = lines.split_at_mut(UNKNOWNS * width);
+                for (c, axis) in known[width..].chunks_mut(width).enumerate() {
+                    let [v, a, n] = [radiance, albedo, normal].map(|p| &p.channel(c)[y * width..][..width]);
+                    for (sum, (v, a)) in irradiance.iter_mut().zip(v.iter().zip(a)) {
                         *sum += v.max(0.0) * exposure / (3.0 * (texture(*a) + ALBEDO_FLOOR));
                     }
+                    axis.iter_mut().zip(n).for_each(|(axis, n)| *axis = unit(*n));
                 }
-                log_transfer(&irradiance, STEEPNESS, &mut light);
-                let normal = [0, 1, 2].map(|c| &normal.channel(c)[y * passes.width..][..passes.width]);
-                gather(&light, normal, moments, squares);
+                log_transfer(&irradiance, STEEPNESS, light);
+                light.iter_mut().for_each(|light| *light = light.min(BRIGHTEST));
+                gather(&lines, width, &mut of_columns);
+            }
+            for (moment, of_columns) in moments.chunks_mut(squares).zip(of_columns.chunks(width)) {
+                let of_squares = of_columns.chunks(SQUARE).map(|part| part.iter().sum());
+                moment.iter_mut().zip(of_squares).for_each(|(moment, sum)| *moment = sum);
             }
         });
         let around = columns(&rows(&moments, MOMENTS * squares), squares);
         let mut lines = vec![0.0; around.len() / MOMENTS * KEPT];
-        lines.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares)).for_each(
-            |(lines, moments)| {
-                for x in 0..squares {
-                    let kept = fit(std::array::from_fn(|k| moments[k * squares + x]));
-                    kept.into_iter().enumerate().for_each(|(k, v)| lines[k * squares + x] = v);
+        let rows = lines.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares));
+        rows.for_each(|(lines, moments)| {
+            for first in (0..squares).step_by(LANES) {
+                let part = first..(first + LANES).min(squares);
+                let kept = fit(std::array::from_fn(|k| {
+                    let mut lanes = [0.0; LANES];
+                    lanes[..part.len()].copy_from_slice(&moments[k * squares..][part.clone()]);
+                    lanes
+                }));
+                for (line, kept) in lines.chunks_mut(squares).zip(kept) {
+                    line[part.clone()].copy_from_slice(&kept[..part.len()]);
                 }
-            },
-        );
+            }
+        });
         Ok(Self { squares, lines })
     }
 
@@ -120,7 +137,7 @@ impl Shading {
                     let (a, b) = (line[*left], line[(left + 1).min(self.squares - 1)]);
                     a + (b - a) * share
                 };
-                let light: f32 = (0..3).map(|k| at(3 + k) * (unit(normal[k][x]) - at(k))).sum();
+                let light = (0..3).map(|k| at(k) * unit(normal[k][x])).sum::<f32>() - at(3);
                 *output = light.clamp(-LARGEST, LARGEST);
             }
         });
@@ -139,16 +156,12 @@ fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
-/// Adds a row of pixels to the moments of their squares.
-fn gather(light: &[f32], normal: [&[f32]; 3], moments: &mut [f32], squares: usize) {
-    for (square, light) in light.chunks(SQUARE).enumerate() {
-        for (i, light) in light.iter().enumerate() {
-            let [a, b, c] = normal.map(|axis| unit(axis[SQUARE * square + i]));
-            let p = *light;
-            let of_pixel =
-                [1.0, a, b, c, p, p * p, p * a, p * b, p * c, a * a, a * b, b * b, a * c, b * c, c * c];
-            of_pixel.into_iter().enumerate().for_each(|(k, v)| moments[k * squares + square] += v);
-        }
+/// Adds the products of every two lines of `width` pixels to the sums over each column.
+fn gather(lines: &[f32], width: usize, sums: &mut [f32]) {
+    let line = |k: usize| &lines[k * width..][..width];
+    let pairs = (0..LINES).flat_map(|i| (0..=i).map(move |j| (i, j)));
+    for ((i, j), sums) in pairs.zip(sums.chunks_mut(width)) {
+        sums.iter_mut().zip(line(i).iter().zip(line(j))).for_each(|(sum, (a, b))| *sum += a * b);
     }
 }
 
@@ -156,10 +169,9 @@ fn gather(light: &[f32], normal: [&[f32]; 3], moments: &mut [f32], squares: usiz
 fn rows(values: &[f32], len: usize) -> Vec<f32> {
     let mut output = vec![0.0; values.len()];
     output.par_chunks_mut(len).enumerate().for_each(|(row, output)| {
-        for (weight, from) in WINDOW.iter().zip(row as isize - 4..) {
-            let Some(line) = usize::try_from(from).ok().and_then(|from| values.chunks(len).nth(from)) else {
-                continue;
-            };
+        // The window begins above the first row where that is nearer than it reaches.
+        let (first, skipped) = (row.saturating_sub(REACH), REACH.saturating_sub(row));
+        for (weight, line) in WINDOW[skipped..].iter().zip(values.chunks(len).skip(first)) {
             output.iter_mut().zip(line).for_each(|(sum, v)| *sum += weight * v);
         }
     });
@@ -170,34 +182,29 @@ fn rows(values: &[f32], len: usize) -> Vec<f32> {
 fn columns(values: &[f32], len: usize) -> Vec<f32> {
     let mut output = vec![0.0; values.len()];
     output.par_chunks_mut(len).zip(values.par_chunks(len)).for_each(|(output, line)| {
-        for (weight, shift) in WINDOW.iter().zip(-4isize..) {
-            let (to, from) = (shift.min(0).unsigned_abs().min(len), shift.max(0).unsigned_abs().min(len));
+        for (tap, weight) in WINDOW.iter().enumerate() {
+            let (to, from) = (REACH.saturating_sub(tap).min(len), tap.saturating_sub(REACH).min(len));
             output[to..].iter_mut().zip(&line[from..]).for_each(|(sum, v)| *sum += weight * v);
         }
     });
     output
 }
 
-/// The mean normal and the slope of light over it, as a natural logarithm, from sums of moments.
-fn fit(sums: [f32; MOMENTS]) -> [f32; KEPT] {
-    let count = sums[0];
-    let [_, a, b, c, p, pp, pa, pb, pc, aa, ab, bb, ac, bc, cc] = sums.map(|sum| sum / count);
-    let ridge = RIDGE * (pp - p * p).max(LEAST_VARIANCE);
-    let covariance = [pa - p * a, pb - p * b, pc - p * c];
-    // Cholesky's factors, row by row.
-    let root = |v: f32| v.max(ridge).sqrt();
-    let l00 = root(aa - a * a + ridge);
-    let (l10, l20) = ((ab - a * b) / l00, (ac - a * c) / l00);
-    let l11 = root(bb - b * b + ridge - l10 * l10);
-    let l21 = (bc - b * c - l20 * l10) / l11;
-    let l22 = root(cc - c * c + ridge - l20 * l20 - l21 * l21);
-    let x = covariance[0] / l00;
-    let y = (covariance[1] - l10 * x) / l11;
-    let z = (covariance[2] - l20 * x - l21 * y) / l22 / l22;
-    let y = (y - l21 * z) / l11;
-    let x = (x - l10 * y - l20 * z) / l00;
+/// The slopes of light, as a natural logarithm, over the normal, and what they make of the mean normal, from moments.
+fn fit(moments: [Lanes; MOMENTS]) -> [Lanes; KEPT] {
+    let (matrix, rest) = moments.split_at(MOMENTS - LINES);
+    let [mut solution @ .., square] = <[Lanes; LINES]>::try_from(rest).expect("the last row of a triangle");
+    let (count, light): (Lanes, Lanes) = (matrix[0].map(|count| count.max(1.0)), solution[0]);
+    let mean: Lanes = std::array::from_fn(|l| light[l] / count[l]);
+    let variance = std::array::from_fn(|l| square[l] / count[l] - mean[l] * mean[l]);
+    let mut matrix = Symmetric::of(UNKNOWNS, matrix.to_vec());
+    matrix.ridge(0.0, variance.map(|v: f32| RIDGE * v.max(LEAST_VARIANCE)));
+    matrix.factor();
+    matrix.solve(&mut solution);
     let unit = STEEPNESS.ln_1p();
-    [a, b, c, x * unit, y * unit, z * unit]
+    let [constant, slopes @ ..] = solution;
+    let [x, y, z] = slopes.map(|slope| slope.map(|v| v * unit));
+    [x, y, z, std::array::from_fn(|l| (mean[l] - constant[l]) * unit)]
 }
 
 #[cfg(test)]
@@ -242,11 +249,13 @@ mod tests {
 
     #[test]
     fn finds_the_slope_of_light_over_normals_and_through_noise() {
-        // Brighter than the bend of the logarithm, where slopes are those of the light.
-        for (want, noise) in [(0.5, 0.0), (-0.5, 0.0), (0.5, 0.9), (0.0, 0.0)] {
-            let found = slope(&frame(want, 4.0, noise), 1.0);
+        for (slope, noise) in [(0.5, 0.0), (-0.5, 0.0), (0.5, 0.4), (0.0, 0.0)] {
+            let found = self::slope(&frame(slope, 0.25, noise), 1.0);
+            // The transfer is linear below and logarithmic above a sixteenth.
+            let steepness = STEEPNESS * 0.25 / (1.0 + ALBEDO_FLOOR);
+            let want = slope * steepness / (1.0 + steepness);
             assert!(
-                (found - want).abs() < 0.15 * want.abs().max(0.1),
+                (found - want).abs() < 0.1 * want.abs().max(0.1),
                 "{found} for {want} with noise {noise}"
             );
         }
@@ -254,15 +263,28 @@ mod tests {
 
     #[test]
     fn noise_alone_has_next_to_no_shading() {
-        let passes = frame(0.0, 4.0, 0.9);
+        let passes = frame(0.0, 0.25, 0.9);
         let size = shading(&passes, 1.0).data.iter().map(|v| v * v).sum::<f32>() / (SIZE.0 * SIZE.1) as f32;
         assert!(size.sqrt() < 0.05, "{}", size.sqrt());
     }
 
     #[test]
+    fn a_firefly_changes_little() {
+        let clean = frame(0.5, 0.25, 0.2);
+        let mut passes = clean.clone();
+        let mut radiance = passes.require(Pass::Combined, "test").unwrap().clone();
+        (0..3).for_each(|c| radiance.channel_mut(c)[20 * SIZE.0 + 30] = 1e4);
+        passes.insert(Pass::Combined, radiance);
+        let (with, without) = (shading(&passes, 1.0), shading(&clean, 1.0));
+        let worst = with.data.iter().zip(&without.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst > 0.0 && worst < 0.05, "{worst}");
+    }
+
+    #[test]
     fn radiance_and_exposure_cancel() {
-        let (bright, dark) = (frame(0.7, 4.0, 0.5), frame(0.7, 0.25, 0.5));
+        let (bright, dark) = (frame(0.7, 1.0, 0.5), frame(0.7, 0.0625, 0.5));
         let (bright, dark) = (shading(&bright, 0.25), shading(&dark, 4.0));
+        assert!(bright.data.iter().any(|v| v.abs() > 0.1));
         assert!(bright.data.iter().zip(&dark.data).all(|(a, b)| (a - b).abs() < 1e-4));
     }
 

@@ -170,7 +170,7 @@ impl Input<'_> {
                     }
                 }
             }
-            matrix.ridge(RIDGE, FLAT);
+            matrix.ridge(RIDGE, [FLAT; LANES]);
             matrix.factor();
             right.chunks_exact_mut(unknowns).for_each(|right| matrix.solve(right));
             // What each fit says about its window.

@@ -60,6 +60,15 @@ pub struct Symmetric {
 }
 
 impl Symmetric {
+    /// Matrices of `size` rows, whose lower triangles `values` holds row by row.
+    ///
+    /// # Panics
+    /// If there are not as many values.
+    pub fn of(size: usize, values: Vec<Lanes>) -> Self {
+        assert_eq!(values.len(), at(size, 0));
+        Self { size, values }
+    }
+
     /// Zero matrices.
     pub fn new(size: usize) -> Self {
         Self { size, values: vec![[0.0; LANES]; at(size, 0)] }
@@ -85,12 +94,12 @@ impl Symmetric {
     /// Adds to each diagonal value but the first `relative` times itself and `absolute` times the
     /// first: a prior that slopes are small, in units of the sum of weights.
     #[inline(always)]
-    pub fn ridge(&mut self, relative: f32, absolute: f32) {
+    pub fn ridge(&mut self, relative: f32, absolute: Lanes) {
         let first = self.values[0];
         for i in 1..self.size {
             let diagonal = &mut self.values[at(i, i)];
             for l in 0..LANES {
-                diagonal[l] += relative * diagonal[l] + absolute * first[l];
+                diagonal[l] += relative * diagonal[l] + absolute[l] * first[l];
             }
         }
     }
@@ -192,7 +201,7 @@ mod tests {
         let mut v = [[1.0; LANES], [2.0; LANES], [2.0; LANES]];
         v.iter_mut().for_each(|v| v[0] = 0.0);
         a.add_outer(&v, &v);
-        a.ridge(1e-4, 1e-4);
+        a.ridge(1e-4, [1e-4; LANES]);
         a.factor();
         let mut b = [[3.0; LANES]; 3];
         a.solve(&mut b);
