@@ -37,9 +37,12 @@ impl Oidn {
     /// environment variable `OIDN_DENOISE`, else the one on the search path. None for other names.
     pub fn new(name: &str, program: Option<PathBuf>) -> Option<Self> {
         let name = NAMES.into_iter().find(|n| *n == name)?;
-        let program =
+        let program: PathBuf =
             program.or_else(|| std::env::var_os(VARIABLE).map(Into::into)).unwrap_or_else(|| PROGRAM.into());
-        Some(Self { name, program })
+        // It runs in another folder, to which a path must not refer; a bare name is looked for on the search path.
+        let is_bare = program.components().count() == 1;
+        let absolute = (!is_bare).then(|| std::path::absolute(&program).ok()).flatten();
+        Some(Self { name, program: absolute.unwrap_or(program) })
     }
 
     /// `oidn-high-prefilter` is high quality on guides that were denoised first.
@@ -241,5 +244,8 @@ mod tests {
         let message = method.denoise(&passes).unwrap_err().to_string();
         assert!(message.contains("/no/such/program") && message.contains("--oidn"), "{message}");
         assert!(Oidn::new("oidn-best", None).is_none());
+        let program = |path: &str| Oidn::new("oidn-high", Some(path.into())).unwrap().program;
+        assert_eq!(program("bin/oidnDenoise"), std::env::current_dir().unwrap().join("bin/oidnDenoise"));
+        assert_eq!(program("oidnDenoise"), Path::new("oidnDenoise"));
     }
 }
