@@ -1,7 +1,7 @@
 //! The networks as contracts: sizes of the paper's, reach and scaling of the built-in ones.
 
 use demc::{
-    features::{self, Inputs},
+    features::{self, Inputs, Shading},
     models::{
         self,
         demc::{Demc, PAPER_WIDTHS, semc_widths},
@@ -173,7 +173,9 @@ fn a_prefilter_does_what_its_network_does_alone() {
     assert_ne!(Some(&clean), passes.get(Pass::DenoisingAlbedo));
     assert!(clean.data.iter().all(|a| (0.0..=1.0).contains(a)));
     let Inputs { planes, scale } = network.inputs(&passes).unwrap();
-    let [irradiance, albedo, _, _, ratio] = &planes[..] else { panic!("{} inputs", planes.len()) };
+    let [irradiance, albedo, _, _, ratio, shading] = &planes[..] else { panic!("{} inputs", planes.len()) };
+    let fit = Shading::of(&passes, scale.recip(), "the test").unwrap();
+    assert_eq!(*shading, fit.rows(&passes, 0..passes.height, "the test").unwrap());
     // The file holds halves of what the network alone holds.
     for (a, b) in albedo.data.iter().zip(&clean.data) {
         assert!((a - (b + 0.05)).abs() <= 2e-3, "{a} of {b}");
@@ -322,7 +324,7 @@ fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-m").expect("it is trainable").1;
     let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
-    assert_eq!(planes.len(), 5);
+    assert_eq!(planes.len(), 6);
     // The gains of four pixels follow their kernels, confidences, masks and corners.
     const GAINS: std::ops::Range<usize> = 60..72;
     for (logit, gain) in [(0.0, 1.0), (-50.0, (-2.0f32).exp()), (50.0, 2.0f32.exp())] {
