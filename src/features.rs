@@ -168,7 +168,7 @@ pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
     let (directions, mean) = rest.split_at_mut(noisy.data.len());
     map(&refined.as_ref().map_or(noisy, |refined| &refined.albedo).data, colours, texture);
-    map(&normal.data, directions, |v| v.clamp(-1.0, 1.0));
+    map(&normal.data, directions, unit);
     let mut albedo = Planes::new(3, passes.width, passes.height);
     map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
     let further = refined.map(|Refined { albedo: mut other, shading }| {
@@ -200,6 +200,11 @@ fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item 
     let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     let columns = around(x, w);
     around(y, h).flat_map(move |y| columns.clone().map(move |x| (x, y)))
+}
+
+/// An axis of a normal, which is no longer than 1.
+fn unit(axis: f32) -> f32 {
+    axis.clamp(-1.0, 1.0)
 }
 
 /// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says

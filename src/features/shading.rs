@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{ALBEDO_FLOOR, STEEPNESS, texture};
+use super::{ALBEDO_FLOOR, STEEPNESS, texture, unit};
 use crate::{
     Result,
     filters::solve::{LANES, Lanes, Symmetric},
@@ -145,11 +145,6 @@ impl Shading {
     }
 }
 
-/// An axis of a normal; what filters and depth of field make of one is not longer.
-fn unit(axis: f32) -> f32 {
-    axis.clamp(-1.0, 1.0)
-}
-
 /// The square before a pixel, counted from middle to middle, and how far on towards the next it is.
 fn between(at: usize, squares: usize) -> (usize, f32) {
     let place = ((at as f32 + 0.5) / SQUARE as f32 - 0.5).clamp(0.0, (squares - 1) as f32);
@@ -201,10 +196,10 @@ fn fit(moments: [Lanes; MOMENTS]) -> [Lanes; KEPT] {
     matrix.ridge(0.0, variance.map(|v: f32| RIDGE * v.max(LEAST_VARIANCE)));
     matrix.factor();
     matrix.solve(&mut solution);
-    let unit = STEEPNESS.ln_1p();
+    let natural = STEEPNESS.ln_1p();
     let [constant, slopes @ ..] = solution;
-    let [x, y, z] = slopes.map(|slope| slope.map(|v| v * unit));
-    [x, y, z, std::array::from_fn(|l| (mean[l] - constant[l]) * unit)]
+    let [x, y, z] = slopes.map(|slope| slope.map(|v| v * natural));
+    [x, y, z, std::array::from_fn(|l| (mean[l] - constant[l]) * natural)]
 }
 
 #[cfg(test)]

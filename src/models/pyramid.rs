@@ -126,10 +126,9 @@ struct Prediction<T> {
 struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     gain: Field<T>,
-    /// How far to divide by the noisy albedo, before its logistic, (N, 1, H, W), if it says.
-    divisor: Option<Field<T>>,
-    /// What the shading is multiplied by before it is added to all gains' logits, (N, 1, H, W), if it says.
-    shade: Option<Field<T>>,
+    /// Where there is a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading is
+    /// multiplied by before it is added to all gains' logits, both (N, 1, H, W).
+    refined: Option<(Field<T>, Field<T>)>,
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
@@ -149,7 +148,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
         };
         let gain = planes(GAINS).expect("every head of full resolution has gains");
         let (divisor, shade) = (planes(DIVISOR), planes(SHADE));
-        (Self::split(head, FULL_KERNEL, 2), Finish { gain, divisor, shade })
+        (Self::split(head, FULL_KERNEL, 2), Finish { gain, refined: divisor.zip(shade) })
     }
 
     /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
@@ -295,14 +294,14 @@ impl Pyramid {
         let full = self.full.forward(vec![x.expect("there are levels")]);
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, Finish { mut gain, divisor, shade }) = Prediction::of_full(full);
+        let (finest, Finish { mut gain, refined: predicted }) = Prediction::of_full(full);
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(Prediction::of_level));
 
         // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
         // filtering made of the one below, and filtered.
         let mut image = field(irradiance);
-        if let ([ratio, shading], Some(divisor), Some(shade)) = (refined, divisor, shade) {
+        if let ([ratio, shading], Some((divisor, shade))) = (refined, predicted) {
             image = image.redivide(field(ratio), divisor);
             gain = gain.plus_product(field(shading), shade);
         }

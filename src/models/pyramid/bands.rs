@@ -89,7 +89,8 @@ impl<'a> Feed<'a> {
         Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
     }
 
-    /// Takes in the next rows, an even number unless they are the last, refined where the network has a prefilter, and hands out what is denoised with it: its first row, and radiance.
+    /// Takes in the next rows, an even number unless they are the last, and what is refined of them where the network has a
+    /// prefilter, and hands out what is denoised with it: its first row, and radiance.
     fn push(
         &mut self,
         band: PassSet,
@@ -144,7 +145,7 @@ struct Frame<'a> {
     ratio: Line<Field>,
     /// What normals tell of the light, until the network says how far to follow it.
     shading: Line<Field>,
-    /// Their logits, one for each kernel of full resolution.
+    /// Logits of the gains, a field for each kernel of full resolution.
     gains: VecDeque<Field>,
 }
 
@@ -307,9 +308,9 @@ impl<'a> Frame<'a> {
             self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
             if level == 0 {
                 let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (prediction, Finish { mut gain, divisor, shade }) = Prediction::of_full(head);
+                let (prediction, Finish { mut gain, refined }) = Prediction::of_full(head);
                 let rows = 2 * rows.start..2 * rows.end;
-                if let (Some(divisor), Some(shade)) = (divisor, shade) {
+                if let Some((divisor, shade)) = refined {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
                     self.scales[0].image.push(quotient.redivide(ratio, divisor));
                     gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
