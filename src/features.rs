@@ -144,7 +144,7 @@ pub struct Refined {
 }
 
 impl Refined {
-    /// Grown to (width, height) by repeating the last row and column.
+    /// Grown to (width, height), as [`Planes::padded_to`] does.
     pub fn padded_to(self, size: (usize, usize)) -> Self {
         Self { albedo: self.albedo.padded_to(size), shading: self.shading.padded_to(size) }
     }
@@ -302,8 +302,8 @@ pub struct Inputs {
 }
 
 impl Inputs {
-    /// Grows every input to a multiple of `multiple` in both directions by repeating the last row and column:
-    /// what a network that halves its input `log2(multiple)` times needs.
+    /// Grows every input to a multiple of `multiple` in both directions, as [`Planes::padded_to`] does: what a network
+    /// that halves its input `log2(multiple)` times needs.
     pub fn padded(mut self, multiple: usize) -> Self {
         let grow = |planes: Planes| {
             let size = [planes.width, planes.height].map(|size| size.next_multiple_of(multiple));

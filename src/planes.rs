@@ -78,7 +78,8 @@ impl Planes {
         })
     }
 
-    /// Grows the planes, to the right and below, by repeating the last column and row.
+    /// Grows the planes, to the right and below, by their mirror image, the last column and row the axes: repeated, those
+    /// would draw their noise out to streaks, which a network takes for something that is there.
     ///
     /// # Panics
     /// If they are empty, or larger.
@@ -88,9 +89,22 @@ impl Planes {
         }
         assert!(self.width <= width && self.height <= height, "padding only adds");
         Self::from_rows(self.channels, (width, height), |c, y, out| {
-            let from = &self.channel(c)[y.min(self.height - 1) * self.width..][..self.width];
-            out[..self.width].copy_from_slice(from);
-            out[self.width..].fill(from[self.width - 1]);
+            let from = &self.channel(c)[mirrored(y, self.height) * self.width..][..self.width];
+            let (inside, beyond) = out.split_at_mut(self.width);
+            inside.copy_from_slice(from);
+            beyond.iter_mut().zip(self.width..).for_each(|(out, x)| *out = from[mirrored(x, self.width)]);
+        })
+    }
+
+    /// The planes with those of the same width and number `below` them.
+    ///
+    /// # Panics
+    /// If widths or channels differ.
+    pub fn above(&self, below: &Self) -> Self {
+        assert_eq!((self.channels, self.width), (below.channels, below.width), "planes that fit");
+        Self::from_rows(self.channels, (self.width, self.height + below.height), |c, y, out| {
+            let (from, y) = if y < self.height { (self, y) } else { (below, y - self.height) };
+            out.copy_from_slice(&from.channel(c)[y * self.width..][..self.width]);
         })
     }
 
@@ -100,17 +114,33 @@ impl Planes {
     }
 }
 
+/// The one of `n` that lies where `i` does, to and fro between the first and the last.
+fn mirrored(i: usize, n: usize) -> usize {
+    let period = (2 * n).saturating_sub(2).max(1);
+    (i % period).min(period - i % period)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn padding_repeats_the_edge_and_a_window_undoes_it() {
-        let planes = Planes::from_vec(2, 3, 1, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        let padded = planes.clone().padded_to((4, 4));
-        assert_eq!((padded.width, padded.height), (4, 4));
-        assert_eq!(padded.channel(1), [4.0, 5.0, 6.0, 6.0].repeat(4));
-        assert_eq!(padded.window((0, 0), (3, 1)), planes);
+    fn padding_mirrors_and_a_window_undoes_it() {
+        let planes = Planes::from_vec(2, 3, 2, (0..12).map(|v| v as f32).collect());
+        let padded = planes.clone().padded_to((8, 4));
+        assert_eq!((padded.width, padded.height), (8, 4));
+        let (above, below) =
+            ([6.0, 7.0, 8.0, 7.0, 6.0, 7.0, 8.0, 7.0], [9.0, 10.0, 11.0, 10.0, 9.0, 10.0, 11.0, 10.0]);
+        assert_eq!(padded.channel(1), [above, below, above, below].concat());
+        assert_eq!(padded.window((0, 0), (3, 2)), planes);
+        assert_eq!(Planes::from_vec(1, 1, 1, vec![5.0]).padded_to((3, 2)).data, [5.0; 6]);
+    }
+
+    #[test]
+    fn planes_above_others_are_those_that_were_cut_apart() {
+        let planes = Planes::from_vec(2, 3, 4, (0..24).map(|v| v as f32).collect());
+        let [above, below] = [(0, 1), (1, 3)].map(|(y, rows)| planes.window((0, y), (3, rows)));
+        assert_eq!(above.above(&below), planes);
     }
 
     #[test]

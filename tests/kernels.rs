@@ -4,7 +4,7 @@
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
-    layout::{from_blocked, to_blocked},
+    layout::{from_blocked, from_blocked_shuffled, to_blocked},
     narrow::{self, Engine, Format},
     pool::{max_pool, max_pool_gradient},
     simd::Tier,
@@ -131,6 +131,17 @@ impl Arithmetic {
                         for (rounded, full) in rounded.0.iter().zip(full.0) {
                             assert_eq!(*rounded, half::bf16::from_f32(full).to_f32());
                         }
+                    }
+                    // What it writes as planes is that, unpacked.
+                    let shape = output.shape;
+                    let factors = [1, 2].into_iter().filter(|f| shape.c.is_multiple_of(f * f));
+                    for factor in factors.filter(|_| used != Geometry::Transposed) {
+                        let mut unpacked = vec![0.0; shape.n * shape.c * shape.h * shape.w];
+                        from_blocked_shuffled(View::new(shape, output.data), 0, factor, &mut unpacked);
+                        let mut planes = vec![f32::NAN; unpacked.len()];
+                        let to = narrow::conv::Output::Planes { shape, factor, values: &mut planes };
+                        narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
+                        assert!(planes == unpacked, "{geometry:?} as planes, factor {factor}");
                     }
                 } else {
                     let to = narrow::conv::Output::F32(output);

@@ -44,10 +44,10 @@ pub struct Args {
     /// Optimiser steps
     #[arg(long, default_value_t = 20_000)]
     steps: usize,
-    /// Crops a step
+    /// Crops a step; more where they are smaller than --patch says, so that they have as many pixels
     #[arg(long, default_value_t = 8)]
     batch: usize,
-    /// Rows and columns of a crop, a multiple of 32
+    /// Rows and columns of a crop, a multiple of 32; of a step's crops fewer, if the frame drawn first has not as many
     #[arg(long, default_value_t = 128)]
     patch: usize,
     /// Learning rate of the first and last step
@@ -275,7 +275,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         options
     };
     eprintln!(
-        "{} pairs to train on, {} to validate on; {} steps of {} crops of {p}x{p}",
+        "{} pairs to train on, {} to validate on; {} steps of {} crops of up to {p}x{p}",
         options.train.len(),
         options.validation.len(),
         options.steps,

@@ -87,9 +87,8 @@ pub fn from_blocked(input: View, output: &mut [f32]) {
 /// # Panics
 /// If `output` does not hold whole channels of the input.
 pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &mut [f32]) {
-    let map = Map::new(input.shape, first, factor, output.len());
-    let planes = SharedValues(output.as_mut_ptr());
-    each_band(map, |n, plane, rows| Tier::detect().run(Unpack { map, input, planes, n, plane, rows }));
+    let to = Unpacked::new(input.shape, first, factor, output);
+    each_band(to.map, |n, plane, rows| Tier::detect().run(Unpack { to, input, n, plane, rows }));
 }
 
 /// The inverse of [`from_blocked_shuffled`], which leaves every other channel as it is.
@@ -116,19 +115,78 @@ fn each_band(map: Map, work: impl Fn(usize, usize, std::ops::Range<usize>) + Syn
     });
 }
 
-/// A pointer that tasks share to write disjoint values of one buffer.
+/// Planes that tasks share, to write what channels of an activation hold.
 #[derive(Clone, Copy)]
-struct SharedValues(*mut f32);
+pub(super) struct Unpacked {
+    map: Map,
+    values: *mut f32,
+}
 
-// SAFETY: every task writes the values of its own channels and rows, so no two ever touch the same.
-unsafe impl Send for SharedValues {}
+// SAFETY: every task writes the values of its own channels and pixels, so no two ever touch the same.
+unsafe impl Send for Unpacked {}
 // SAFETY: as above.
-unsafe impl Sync for SharedValues {}
+unsafe impl Sync for Unpacked {}
+
+impl Unpacked {
+    /// Planes of `factor` times the size of an activation of `shape`, for its channels from `first` on.
+    ///
+    /// # Panics
+    /// If `output` does not hold whole channels of it.
+    pub fn new(shape: Shape, first: usize, factor: usize, output: &mut [f32]) -> Self {
+        Self { map: Map::new(shape, first, factor, output.len()), values: output.as_mut_ptr() }
+    }
+
+    /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose channels of blocked
+    /// plane `plane` are `blocks`.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`; the pixels lie inside the row and nobody else writes them; the planes
+    /// are still there.
+    #[inline(always)]
+    pub unsafe fn put<S: Simd>(
+        self,
+        (n, plane): (usize, usize),
+        (y, x): (usize, usize),
+        blocks: &[Block],
+        lanes: &mut [Block; LANES],
+    ) {
+        let Self { map, values } = self;
+        let used = map.lanes(plane);
+        // SAFETY: the caller's promise.
+        unsafe {
+            transpose::<S>(blocks, lanes);
+            let mut lane = used.start;
+            while lane < used.end {
+                let out = values.add(map.value(n, plane, lane, y, x));
+                if map.paired(plane, lane, &used) {
+                    let out = std::slice::from_raw_parts_mut(out, 2 * blocks.len());
+                    let (a, b) = (&lanes[lane].0, &lanes[lane + 1].0);
+                    let pairs: [f32; 2 * LANES] =
+                        std::array::from_fn(|i| if i % 2 == 0 { a[i / 2] } else { b[i / 2] });
+                    match <&mut [f32; 2 * LANES]>::try_from(&mut *out) {
+                        Ok(out) => *out = pairs,
+                        Err(_) => out.copy_from_slice(&pairs[..2 * blocks.len()]),
+                    }
+                    lane += 2;
+                } else {
+                    let channel = &lanes[lane].0;
+                    if map.factor == 1 && blocks.len() == LANES {
+                        out.cast::<[f32; LANES]>().write(*channel);
+                    } else {
+                        for i in 0..blocks.len() {
+                            *out.add(i * map.factor) = channel[i];
+                        }
+                    }
+                    lane += 1;
+                }
+            }
+        }
+    }
+}
 
 struct Unpack<'a> {
-    map: Map,
+    to: Unpacked,
     input: View<'a>,
-    planes: SharedValues,
     n: usize,
     plane: usize,
     rows: std::ops::Range<usize>,
@@ -137,42 +195,14 @@ struct Unpack<'a> {
 impl Kernel for Unpack<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { map, input, planes, n, plane, rows } = self;
-        let s = map.shape;
-        let lanes = map.lanes(plane);
-        let mut pixels = [Block::default(); LANES];
+        let Self { to, input, n, plane, rows } = self;
+        let s = input.shape;
+        let mut lanes = [Block::default(); LANES];
         for y in rows {
             let row = &input.data[s.row(n, plane, y)..][..s.w];
             for (x, blocks) in (0..s.w).step_by(LANES).zip(row.chunks(LANES)) {
-                // SAFETY: vectors are the tier's; every value belongs to this task, see `SharedValues`.
-                unsafe {
-                    transpose::<S>(blocks, &mut pixels);
-                    let mut lane = lanes.start;
-                    while lane < lanes.end {
-                        let out = planes.0.add(map.value(n, plane, lane, y, x));
-                        if map.paired(plane, lane, &lanes) {
-                            let out = std::slice::from_raw_parts_mut(out, 2 * blocks.len());
-                            let (a, b) = (&pixels[lane].0, &pixels[lane + 1].0);
-                            let pairs: [f32; 2 * LANES] =
-                                std::array::from_fn(|i| if i % 2 == 0 { a[i / 2] } else { b[i / 2] });
-                            match <&mut [f32; 2 * LANES]>::try_from(&mut *out) {
-                                Ok(out) => *out = pairs,
-                                Err(_) => out.copy_from_slice(&pairs[..2 * blocks.len()]),
-                            }
-                            lane += 2;
-                        } else {
-                            let values = &pixels[lane].0;
-                            if map.factor == 1 && blocks.len() == LANES {
-                                out.cast::<[f32; LANES]>().write(*values);
-                            } else {
-                                for i in 0..blocks.len() {
-                                    *out.add(i * map.factor) = values[i];
-                                }
-                            }
-                            lane += 1;
-                        }
-                    }
-                }
+                // SAFETY: vectors are the tier's; every value belongs to this task.
+                unsafe { to.put::<S>((n, plane), (y, x), blocks, &mut lanes) }
             }
         }
     }

@@ -131,37 +131,38 @@ struct Finish<T> {
     refined: Option<(Field<T>, Field<T>)>,
 }
 
-impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
-    /// What a trunk level's head says.
-    fn of_level(head: Activation<T>) -> Self {
-        Self::split(head, KERNEL, 1)
-    }
-
-    /// What the head of full resolution says.
-    fn of_full(head: Activation<T>) -> (Self, Finish<T>) {
-        let mut end = 4 * head_of(0);
-        // The planes that the next channels make, if there are any.
-        let mut planes = |planes: usize| {
-            let first = end;
-            end += 4 * planes;
-            (end <= head.shape().c).then(|| Field::from_activation(head.fork(), first, 4 * planes, 2))
-        };
-        let gain = planes(GAINS).expect("every head of full resolution has gains");
-        let (divisor, shade) = (planes(DIVISOR), planes(SHADE));
-        (Self::split(head, FULL_KERNEL, 2), Finish { gain, refined: divisor.zip(shade) })
-    }
-
-    /// Parts a head's channels, k x k kernels first; `factor` 2 where each 2x2 square of pixels shares one pixel of
-    /// the trunk.
-    fn split(head: Activation<T>, k: usize, factor: usize) -> Self {
-        let area = factor * factor;
-        let taps = k * k * area;
+impl<T> Prediction<T> {
+    /// Parts what a level's head says, k x k kernels first: `planes(first, count)` are some of its planes.
+    fn split(k: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> Self {
+        let taps = k * k;
         Self {
-            kernel: Field::from_activation(head.fork(), 0, taps, factor),
-            confidence: Field::from_activation(head.fork(), taps, area, factor),
-            mask: Field::from_activation(head.fork(), taps + area, area, factor),
-            corners: Field::from_activation(head, taps + 2 * area, CORNERS * area, factor),
+            kernel: planes(0, taps),
+            confidence: planes(taps, 1),
+            mask: planes(taps + 1, 1),
+            corners: planes(taps + 2, CORNERS),
         }
+    }
+
+    /// Parts what the head of full resolution says, which has `count` planes.
+    fn split_full(count: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> (Self, Finish<T>) {
+        let prediction = Self::split(FULL_KERNEL, &mut planes);
+        let (divisor, shade) = (head_of(0) + GAINS, head_of(0) + GAINS + DIVISOR);
+        let refined = (shade < count).then(|| (planes(divisor, DIVISOR), planes(shade, SHADE)));
+        (prediction, Finish { gain: planes(head_of(0), GAINS), refined })
+    }
+}
+
+/// Some planes of a head's output; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk. The tape goes
+/// with the first that are asked for.
+fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
+    mut head: Activation<T>,
+    factor: usize,
+) -> impl FnMut(usize, usize) -> Field<T> {
+    let area = factor * factor;
+    move |first, count| {
+        let rest = head.fork();
+        let head = std::mem::replace(&mut head, rest);
+        Field::from_activation(head, area * first, area * count, factor)
     }
 }
 
@@ -292,11 +293,13 @@ impl Pyramid {
             x = Some(fused);
         }
         let full = self.full.forward(vec![x.expect("there are levels")]);
+        let count = full.shape().c / 4;
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, Finish { mut gain, refined: predicted }) = Prediction::of_full(full);
+        let (finest, Finish { mut gain, refined: predicted }) =
+            Prediction::split_full(count, planes_of(full, 2));
         let mut levels = vec![finest];
-        levels.extend(heads.into_iter().rev().map(Prediction::of_level));
+        levels.extend(heads.into_iter().rev().map(|head| Prediction::split(KERNEL, planes_of(head, 1))));
 
         // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
         // filtering made of the one below, and filtered.

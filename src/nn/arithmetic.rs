@@ -2,10 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{activation::Data, pool::Buffer};
+use super::{
+    activation::Data,
+    pool::{Buffer, PlaneBuffer, plane_buffer},
+};
 use crate::kernels::{
     Block, Shape, View, ViewMut,
     conv::{self, Direction, Epilogue, Geometry},
+    layout::from_blocked_shuffled,
     narrow::{self, Engine, Format, Operand},
     simd::Tier,
     weight_grad,
@@ -107,19 +111,8 @@ impl Arithmetic {
                 }
             }
             Packed::Narrow(weights) => {
-                let narrowed: Vec<Option<Operand>> = sources
-                    .iter()
-                    .map(|source| match source {
-                        Data::F32(buffer) => Some(Operand::narrow(engine, buffer.view(), self.geometry)),
-                        Data::Narrow(_) => None,
-                    })
-                    .collect();
-                let operands: Vec<&Operand> = (sources.iter().zip(&narrowed))
-                    .map(|(source, narrowed)| match source {
-                        Data::Narrow(operand) => operand,
-                        Data::F32(_) => narrowed.as_ref().expect("f32 sources were narrowed"),
-                    })
-                    .collect();
+                let narrowed = self.narrowed(sources);
+                let operands = operands(sources, &narrowed);
                 if let Some(format) = format {
                     let mut output = Operand::new(shape, format);
                     let to = narrow::conv::Output::Narrow(&mut output);
@@ -133,6 +126,41 @@ impl Arithmetic {
                 }
             }
         }
+    }
+
+    /// `bias + conv(sources, weights)` as planes of `factor` times the size of `shape`; see
+    /// [`crate::kernels::layout`].
+    pub(super) fn forward_planes(
+        &self,
+        sources: &[&Data],
+        weights: &Packed,
+        bias: &[Block],
+        (shape, factor): (Shape, usize),
+    ) -> PlaneBuffer {
+        let mut values = plane_buffer(shape.n * shape.c * shape.h * shape.w);
+        match weights {
+            Packed::F32(_) => {
+                let blocked = self.forward(sources, weights, bias, false, (shape, None));
+                from_blocked_shuffled(blocked.view(), 0, factor, &mut values);
+            }
+            Packed::Narrow(weights) => {
+                let epilogue = Epilogue { relu: false, accumulate: false };
+                let narrowed = self.narrowed(sources);
+                let to = narrow::conv::Output::Planes { shape, factor, values: &mut values };
+                let operands = operands(sources, &narrowed);
+                narrow::conv::convolve(Engine::detect(), &operands, weights, bias, epilogue, to);
+            }
+        }
+        values
+    }
+
+    /// Those of a layer's sources that are not narrow, rounded.
+    fn narrowed(&self, sources: &[&Data]) -> Vec<Option<Operand>> {
+        let narrow = |source: &&Data| match source {
+            Data::F32(buffer) => Some(Operand::narrow(Engine::detect(), buffer.view(), self.geometry)),
+            Data::Narrow(_) => None,
+        };
+        sources.iter().map(narrow).collect()
     }
 
     /// Adds the gradient of the weights to `into`.
@@ -194,4 +222,13 @@ impl Arithmetic {
             }
         }
     }
+}
+
+/// The sources of a layer, all narrow; `narrowed` are those that were not.
+fn operands<'a>(sources: &[&'a Data], narrowed: &'a [Option<Operand>]) -> Vec<&'a Operand> {
+    let operand = |(source, narrowed): (&&'a Data, &'a Option<Operand>)| match source {
+        Data::Narrow(operand) => operand,
+        Data::F32(_) => narrowed.as_ref().expect("f32 sources were narrowed"),
+    };
+    sources.iter().zip(narrowed).map(operand).collect()
 }

@@ -27,9 +27,20 @@ pub type Extent = (usize, usize, usize, usize);
 struct Values {
     extent: Extent,
     data: Arc<PlaneBuffer>,
+    /// Where they begin.
+    first: usize,
 }
 
 impl Values {
+    fn all(extent: Extent, data: PlaneBuffer) -> Self {
+        Self { extent, data: Arc::new(data), first: 0 }
+    }
+
+    fn as_slice(&self) -> &[f32] {
+        let (n, c, h, w) = self.extent;
+        &self.data[self.first..][..n * c * h * w]
+    }
+
     fn size(&self) -> Size {
         Size { h: self.extent.2, w: self.extent.3 }
     }
@@ -37,7 +48,7 @@ impl Values {
     /// The values of image `n`, (C, H, W).
     fn image(&self, n: usize) -> &[f32] {
         let len = self.extent.1 * self.size().pixels();
-        &self.data[n * len..][..len]
+        &self.as_slice()[n * len..][..len]
     }
 }
 
@@ -60,7 +71,7 @@ impl Saved {
         match &self.gradient {
             Some(slot) => {
                 let mut slot = slot.borrow_mut();
-                add(Some(slot.get_or_insert_with(|| zeros(self.values.data.len()))));
+                add(Some(slot.get_or_insert_with(|| zeros(self.values.as_slice().len()))));
             }
             None => add(None),
         }
@@ -98,24 +109,23 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 
     /// An input from pooled memory.
     pub(super) fn from_buffer(extent: Extent, data: PlaneBuffer) -> Self {
-        let values = Values { extent, data: Arc::new(data) };
+        let values = Values::all(extent, data);
         Self { saved: Saved { values, gradient: None }, tape: T::default() }
     }
 
     /// Channel `c` of the first image.
     pub(super) fn plane(&self, c: usize) -> &[f32] {
         let pixels = self.saved.values.size().pixels();
-        &self.saved.values.data[c * pixels..][..pixels]
+        &self.saved.values.as_slice()[c * pixels..][..pixels]
     }
 
     /// All values, (N, C, H, W).
     pub fn values(&self) -> &[f32] {
-        &self.saved.values.data
+        self.saved.values.as_slice()
     }
 
     fn output(extent: Extent, data: PlaneBuffer, tape: T) -> (Self, Saved) {
-        let values = Values { extent, data: Arc::new(data) };
-        let saved = Saved { values, gradient: Some(Rc::default()) };
+        let saved = Saved { values: Values::all(extent, data), gradient: Some(Rc::default()) };
         (Self { saved: saved.clone(), tape }, saved)
     }
 
@@ -255,8 +265,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     pub fn product(self, other: Self) -> Self {
         assert_eq!(self.extent(), other.extent());
         let (a, b) = (self.saved, other.saved);
-        let mut output = plane_buffer(a.values.data.len());
-        combine(&mut output, &a.values.data, &b.values.data, |out, a, b| *out = a * b);
+        let mut output = plane_buffer(a.values.as_slice().len());
+        combine(&mut output, a.values.as_slice(), b.values.as_slice(), |out, a, b| *out = a * b);
         let (mut field, out) = Self::output(a.values.extent, output, self.tape.merge(other.tape));
         if T::OWNS_TAPE {
             field.tape.add_backward_op(move |_| {
@@ -264,7 +274,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                 for (into, other) in [(&a, &b), (&b, &a)] {
                     into.accumulate(|into| {
                         if let Some(into) = into {
-                            combine(into, &gradient, &other.values.data, |sum, g, b| *sum += g * b);
+                            combine(into, &gradient, other.values.as_slice(), |sum, g, b| *sum += g * b);
                         }
                     });
                 }
@@ -283,8 +293,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         assert_eq!([a.extent(), b.extent()], [(images, 1, h, w); 2]);
         let tape = self.tape.merge(a.tape).merge(b.tape);
         let (sum, a, b) = (self.saved, a.saved, b.saved);
-        let mut output = plane_buffer(sum.values.data.len());
-        let planes = output.chunks_mut(h * w).zip(sum.values.data.chunks(h * w)).enumerate();
+        let mut output = plane_buffer(sum.values.as_slice().len());
+        let planes = output.chunks_mut(h * w).zip(sum.values.as_slice().chunks(h * w)).enumerate();
         planes.for_each(|(plane, (output, sum))| {
             let (a, b) = (a.values.image(plane / channels), b.values.image(plane / channels));
             combine(output, a, b, |out, a, b| *out = a * b);
@@ -323,8 +333,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         assert_eq!(self.extent(), logits.extent());
         let tape = self.tape.merge(logits.tape);
         let (image, logits) = (self.saved, logits.saved);
-        let mut output = plane_buffer(image.values.data.len());
-        amplify(&image.values.data, &logits.values.data, &mut output);
+        let mut output = plane_buffer(image.values.as_slice().len());
+        amplify(image.values.as_slice(), logits.values.as_slice(), &mut output);
         let (mut field, out) = Self::output(image.values.extent, output, tape);
         if T::OWNS_TAPE {
             field.tape.add_backward_op(move |_| {
@@ -333,7 +343,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                     logits.accumulate(|into_logits| {
                         const LEARNED: &str = "what is amplified was filtered, its gain predicted";
                         let into = (into_image.expect(LEARNED), into_logits.expect(LEARNED));
-                        amplify_gradient((&image.values.data, &logits.values.data), &gradient, into);
+                        amplify_gradient(
+                            (image.values.as_slice(), logits.values.as_slice()),
+                            &gradient,
+                            into,
+                        );
                     });
                 });
                 Ok(())
@@ -438,8 +452,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 
     /// The values as a dfdx tensor, (N, C, H, W), with the tape.
     pub fn into_images(self) -> Images<T> {
-        let images: Images =
-            Cpu::default().tensor_from_vec(self.saved.values.data.to_vec(), self.saved.values.extent);
+        let images: Images = Cpu::default().tensor_from_vec(self.values().to_vec(), self.saved.values.extent);
         let mut tape = self.tape;
         if T::OWNS_TAPE {
             let (of_tensor, saved) = (images.clone(), self.saved);
@@ -457,6 +470,18 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 }
 
 impl Field<NoneTape> {
+    /// `count` channels of the one image that the field holds, from `first` on, which share its memory.
+    /// (1, C, H, W) -> (1, count, H, W)
+    ///
+    /// # Panics
+    /// If the field holds several images, or not as many channels.
+    pub fn channels(&self, first: usize, count: usize) -> Self {
+        let Values { extent: (n, c, h, w), ref data, first: begin } = self.saved.values;
+        assert!(n == 1 && first + count <= c, "channels {first}..{} of {c}", first + count);
+        let values = Values { extent: (1, count, h, w), data: data.clone(), first: begin + first * h * w };
+        Self { saved: Saved { values, gradient: None }, tape: NoneTape }
+    }
+
     /// [`Field::filter`] of some rows of the one image that the field holds more rows of: `logits` are of
     /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
     pub fn filter_rows(&self, rows: (usize, usize), k: usize, logits: &Self, confidence: &Self) -> Self {

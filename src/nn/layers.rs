@@ -11,13 +11,13 @@ use std::sync::{
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::{
-    Activation, Init, Param, Precision, Rng,
+    Activation, Field, Init, Param, Precision, Rng,
     activation::{Data, Saved},
     arithmetic::{Arithmetic, Packed},
     pool::Buffer,
 };
 use crate::kernels::{
-    Block, LANES,
+    Block, LANES, Shape,
     conv::{Geometry, weight_index},
     narrow::{self, Format},
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
@@ -232,18 +232,8 @@ impl Conv {
     /// # Panics
     /// If the sources do not have the layer's channels, or differ in size.
     pub fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, sources: Vec<Activation<T>>) -> Activation<T> {
-        let channels: Vec<usize> = sources.iter().map(|s| s.shape().c).collect();
-        let Arithmetic { inputs, outputs, geometry, .. } = &self.arithmetic;
-        assert_eq!(&channels, inputs, "{} reads {inputs:?} channels", self.weight.name);
-        let shape = sources[0].shape();
-        let (h, w) = geometry.output(shape.h, shape.w);
-        let shape_out = shape.with_channels(*outputs).with_size(h, w);
-
-        let weights = match &self.frozen {
-            Some(packed) => packed.clone(),
-            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec(), &[])),
-        };
-        let bias = to_blocks(&self.bias.tensor.as_vec());
+        let shape_out = self.output(&sources);
+        let (weights, bias) = (self.packed(), to_blocks(&self.bias.tensor.as_vec()));
         let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
         // Without a tape, what the next convolution would round anyway is rounded here.
         let format = match self.arithmetic.precision {
@@ -285,6 +275,39 @@ impl Conv {
             });
         }
         activation
+    }
+
+    /// [`Conv::forward`] of a layer without ReLU and without a tape, as planes at once: see
+    /// [`Field::from_activation`], whose `factor` this is. (N, I, H, W) -> (N, O / factor^2, factor * H, factor * W)
+    ///
+    /// # Panics
+    /// As [`Conv::forward`], if the layer has a ReLU, or if its channels are no whole planes.
+    pub fn forward_planes(&self, sources: &[Activation<NoneTape>], factor: usize) -> Field<NoneTape> {
+        assert!(!self.relu, "what is read as planes may be negative");
+        let shape = self.output(sources);
+        let (weights, bias) = (self.packed(), to_blocks(&self.bias.tensor.as_vec()));
+        let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
+        let values = self.arithmetic.forward_planes(&data, &weights, &bias, (shape, factor));
+        let Shape { n, c, h, w, .. } = shape;
+        Field::from_buffer((n, c / (factor * factor), factor * h, factor * w), values)
+    }
+
+    /// The shape of what it makes of these sources.
+    fn output<T: Tape<f32, Cpu>>(&self, sources: &[Activation<T>]) -> Shape {
+        let channels: Vec<usize> = sources.iter().map(|s| s.shape().c).collect();
+        let Arithmetic { inputs, outputs, geometry, .. } = &self.arithmetic;
+        assert_eq!(&channels, inputs, "{} reads {inputs:?} channels", self.weight.name);
+        let shape = sources[0].shape();
+        let (h, w) = geometry.output(shape.h, shape.w);
+        shape.with_channels(*outputs).with_size(h, w)
+    }
+
+    /// Its weights, packed.
+    fn packed(&self) -> Arc<Packed> {
+        match &self.frozen {
+            Some(packed) => packed.clone(),
+            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec(), &[])),
+        }
     }
 }
 

@@ -58,7 +58,7 @@ fn to_half(values: &[f32]) -> Vec<f16> {
 
 impl Dataset {
     /// Decodes of every pair the passes that must be there and those that may, and, if `raw_references`, what
-    /// the references were before they were denoised. Frames smaller than `patch` in either direction are an
+    /// the references were before they were denoised. Frames smaller than `least` in either direction are an
     /// error, since no crop fits them.
     ///
     /// # Errors
@@ -67,18 +67,22 @@ impl Dataset {
         pairs: &[Pair],
         passes: (&[Pass], &[Pass]),
         raw_references: bool,
-        patch: usize,
+        least: usize,
     ) -> Result<Self> {
         let frames: Vec<Stored> = pairs
             .par_iter()
-            .map(|pair| Stored::load(pair, passes, raw_references, patch))
+            .map(|pair| Stored::load(pair, passes, raw_references, least))
             .collect::<Result<_>>()?;
+        Ok(Self::of(frames))
+    }
+
+    fn of(frames: Vec<Stored>) -> Self {
         let mut total = 0;
         let pixels = frames.iter().map(|f| {
             total += f.width * f.height;
             total
         });
-        Ok(Self { pixels: pixels.collect(), seeds: seeds(&frames), frames })
+        Self { pixels: pixels.collect(), seeds: seeds(&frames), frames }
     }
 
     /// Frames held.
@@ -97,23 +101,41 @@ impl Dataset {
         (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
-    /// A random square crop of `patch` pixels, augmented; all of it decided by `rng`. A frame is drawn as
-    /// often as it is large. Where there are more renders of it with as many samples, each pixel comes from
-    /// one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
+    /// The side of a step's crops: `most` pixels, or as many as a frame drawn by `rng` holds, down to a multiple of
+    /// `multiple`.
+    pub fn draw_side(&self, most: usize, multiple: usize, rng: &mut Rng) -> usize {
+        let side = self.draw_frame(rng).1.side();
+        most.min(side / multiple * multiple)
+    }
+
+    /// A random square crop of `side` pixels, augmented; all of it decided by `rng`. A frame is drawn as
+    /// often as it is large, one that is too small never. Where there are more renders of it with as many samples, each pixel
+    /// comes from one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
     /// and no network gets to learn the noise of those that there are by heart.
-    pub fn draw(&self, patch: usize, rng: &mut Rng) -> Sample {
-        let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
-        let index = self.pixels.partition_point(|&end| end <= pixel);
-        let stored = &self.frames[index];
-        let x = rng.below(stored.width - patch + 1);
-        let y = rng.below(stored.height - patch + 1);
-        let mut sample = stored.crop(x, y, patch, patch);
+    /// A frame of `side` pixels must be there, as it is for a side from [`Self::draw_side`].
+    pub fn draw(&self, side: usize, rng: &mut Rng) -> Sample {
+        let (index, stored) = loop {
+            let drawn = self.draw_frame(rng);
+            if drawn.1.side() >= side {
+                break drawn;
+            }
+        };
+        let x = rng.below(stored.width - side + 1);
+        let y = rng.below(stored.height - side + 1);
+        let mut sample = stored.crop(x, y, side, side);
         if let seeds @ [_, ..] = self.seeds[index].as_slice() {
             let other = &self.frames[seeds[rng.below(seeds.len())]];
-            sample.passes = mixed(&sample.passes, &other.passes((x, y), (patch, patch)), rng);
+            sample.passes = mixed(&sample.passes, &other.passes((x, y), (side, side)), rng);
         }
         Augment::draw(rng).apply(&mut sample);
         sample
+    }
+
+    /// A frame and its index, drawn as often as it is large.
+    fn draw_frame(&self, rng: &mut Rng) -> (usize, &Stored) {
+        let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
+        let index = self.pixels.partition_point(|&end| end <= pixel);
+        (index, &self.frames[index])
     }
 }
 
@@ -151,7 +173,7 @@ impl Stored {
         pair: &Pair,
         (needed, optional): (&[Pass], &[Pass]),
         raw_references: bool,
-        patch: usize,
+        least: usize,
     ) -> Result<Self> {
         let frame = Frame::read(&pair.noisy)?;
         let mut noisy = passes::read(&frame, None)?;
@@ -175,11 +197,11 @@ impl Stored {
                 ),
             ));
         }
-        if noisy.width < patch || noisy.height < patch {
+        if noisy.width.min(noisy.height) < least {
             return Err(Error::invalid(
                 &pair.noisy,
                 format!(
-                    "{}x{} pixels hold no patch of {patch}x{patch}; pass --patch N with a smaller size",
+                    "{}x{} pixels hold no crop of {least}x{least}, the smallest that this network takes; render larger frames",
                     noisy.width, noisy.height
                 ),
             ));
@@ -196,6 +218,11 @@ impl Stored {
             reference: to_half(&target.data),
             raw_reference,
         })
+    }
+
+    /// Of the largest square crop.
+    fn side(&self) -> usize {
+        self.width.min(self.height)
     }
 
     fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
@@ -235,9 +262,13 @@ mod tests {
 
     use super::*;
 
-    /// A frame all of whose passes are `value` everywhere.
+    /// A frame of 8x8 pixels all of whose passes are `value` everywhere.
     fn stored(reference: &str, spp: u32, value: f32) -> Stored {
-        let plane = |channels: usize| vec![f16::from_f32(value); channels * 64];
+        stored_of(8, reference, spp, value)
+    }
+
+    fn stored_of(side: usize, reference: &str, spp: u32, value: f32) -> Stored {
+        let plane = |channels: usize| vec![f16::from_f32(value); channels * side * side];
         let pair = Pair {
             scene: "scene".into(),
             noisy: "noisy.exr".into(),
@@ -248,22 +279,18 @@ mod tests {
         Stored {
             pair,
             view_layer: "ViewLayer".into(),
-            width: 8,
-            height: 8,
+            width: side,
+            height: side,
             passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
             reference: plane(3),
             raw_reference: None,
         }
     }
 
-    fn dataset(frames: Vec<Stored>) -> Dataset {
-        Dataset { pixels: (1..=frames.len()).map(|n| 64 * n).collect(), seeds: seeds(&frames), frames }
-    }
-
     #[test]
     fn renders_of_one_view_with_as_many_samples_are_mixed_pixel_by_pixel() {
         let frames = [("a", 4, 1.0), ("a", 4, 2.0), ("a", 8, 4.0), ("b", 4, 8.0)];
-        let data = dataset(frames.map(|(reference, spp, value)| stored(reference, spp, value)).to_vec());
+        let data = Dataset::of(frames.map(|(reference, spp, value)| stored(reference, spp, value)).to_vec());
         let mut rng = Rng::new(1, 0);
         let mut met = BTreeSet::new();
         for _ in 0..64 {
@@ -279,5 +306,22 @@ mod tests {
             met.insert(values);
         }
         assert_eq!(met, [[1, 2].into(), [4].into(), [8].into()].into());
+    }
+
+    #[test]
+    fn crops_are_as_large_as_the_frame_drawn_first_and_come_from_frames_that_hold_them() {
+        let data = Dataset::of(vec![stored_of(12, "a", 4, 1.0), stored_of(20, "b", 4, 2.0)]);
+        let mut rng = Rng::new(2, 0);
+        let mut sides = [0; 2];
+        for _ in 0..400 {
+            let side = data.draw_side(16, 8, &mut rng);
+            sides[[8, 16].iter().position(|s| *s == side).expect("a multiple of 8")] += 1;
+            let sample = data.draw(side, &mut rng);
+            let depth = &sample.passes.get(Pass::Depth).unwrap().data;
+            assert_eq!(depth.len(), side * side);
+            assert!(side == 8 || depth[0] == 2.0, "a frame of 12x12 holds no crop of 16x16");
+        }
+        // By area 144 to 400 are drawn first: 106 of 400 steps.
+        assert!((80..132).contains(&sides[0]), "{sides:?}");
     }
 }

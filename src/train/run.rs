@@ -40,9 +40,9 @@ pub struct Options {
     pub validation: Vec<Pair>,
     /// Steps in all.
     pub steps: usize,
-    /// Crops a step.
+    /// Crops a step, if they are as large as can be; of smaller ones as many as have no more pixels.
     pub batch: usize,
-    /// Rows and columns of a crop.
+    /// Rows and columns of a crop, unless the frame that is drawn first for its step is smaller.
     pub patch: usize,
     /// Learning rate of the first and of the last step; it falls geometrically.
     pub lr: (f64, f64),
@@ -117,11 +117,11 @@ pub fn run(
         return Ok(());
     }
     let wanted = (network.passes(), network.optional_passes());
-    let training = Dataset::load(&options.train, wanted, options.raw_references, options.patch)?;
+    let training = Dataset::load(&options.train, wanted, options.raw_references, network.multiple())?;
     let validation = Dataset::load(&options.validation, wanted, false, 1)?;
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
-        let samples = draw(&training, options, progress.step);
+        let samples = draw(&training, options, network.multiple(), progress.step);
         let lr = learning_rate(options, progress.step);
         let (loss, finite) = step(&mut *network, &mut optimizer, options, lr, progress.step + 1, &samples)?;
         progress.step += 1;
@@ -193,14 +193,13 @@ fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
     weights_file::set_prefilter(network, bytes, Path::new(name))
 }
 
-/// The crops of a step, each from its own stream of the seed.
-fn draw(dataset: &Dataset, options: &Options, step: usize) -> Vec<Sample> {
-    let streams = step * options.batch..(step + 1) * options.batch;
+/// The crops of a step, all of one size and each from its own stream of a seed.
+fn draw(dataset: &Dataset, options: &Options, multiple: usize, step: usize) -> Vec<Sample> {
     // Stream 0 made the initial weights.
-    streams
-        .into_par_iter()
-        .map(|stream| dataset.draw(options.patch, &mut Rng::new(options.seed, 1 + stream as u64)))
-        .collect()
+    let rng = &mut Rng::new(options.seed, 1 + step as u64);
+    let side = dataset.draw_side(options.patch, multiple, rng);
+    let (count, seed) = (options.batch * options.patch.pow(2) / side.pow(2), rng.next_u64());
+    (0..count as u64).into_par_iter().map(|crop| dataset.draw(side, &mut Rng::new(seed, crop))).collect()
 }
 
 /// Falls geometrically from the first step to the last.

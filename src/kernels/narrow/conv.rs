@@ -11,6 +11,7 @@ use super::{CHUNK, Engine, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIG
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
+    layout::Unpacked,
     simd::{Kernel, Simd, Tier},
 };
 
@@ -209,6 +210,16 @@ pub enum Output<'a> {
     /// To a narrow one, without adding to it; the upper 16 of 32 channels become zero where it has none. Only
     /// a ReLU's output goes into 8 bits.
     Narrow(&'a mut Operand),
+    /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor` times its
+    /// size (see [`crate::kernels::layout`]).
+    Planes {
+        /// Of the activation.
+        shape: Shape,
+        /// 1, or 2 where four channels are the pixels of a square.
+        factor: usize,
+        /// (N, C / factor^2, factor H, factor W).
+        values: &'a mut [f32],
+    },
 }
 
 impl Output<'_> {
@@ -216,6 +227,7 @@ impl Output<'_> {
         match self {
             Output::F32(view) => view.shape,
             Output::Narrow(operand) => operand.shape,
+            Output::Planes { shape, .. } => *shape,
         }
     }
 }
@@ -291,6 +303,10 @@ pub fn convolve(
             };
             (Target::Narrow(SharedWide(operand.data.as_mut_ptr()), operand.grid, operand.format), step)
         }
+        Output::Planes { shape, factor, values } => {
+            assert!(!epilogue.accumulate && spread == 1);
+            (Target::Planes(Unpacked::new(shape, 0, factor, values)), 1.0)
+        }
     };
     // What is stored counts steps.
     let in_steps =
@@ -332,6 +348,7 @@ unsafe impl Sync for SharedWide {}
 enum Target {
     F32(Shared),
     Narrow(SharedWide, Grid, Format),
+    Planes(Unpacked),
 }
 
 /// The work of one task: some rows of all output planes of one image.
@@ -434,12 +451,22 @@ impl Band<'_> {
                         }
                     },
                     // SAFETY: a sum is a block of its own.
-                    Target::Narrow(..) => unsafe {
+                    Target::Narrow(..) | Target::Planes(_) => unsafe {
                         for sum in &mut sums.0[o][first..first + run] {
                             let value = finish(sum, bias);
                             S::store(sum, value);
                         }
                     },
+                }
+            }
+            if let Target::Planes(planes) = self.target {
+                let mut lanes = [Block::default(); LANES];
+                for o in 0..outputs {
+                    for (i, pixels) in sums.0[o][first..first + run].chunks(LANES).enumerate() {
+                        let at = (row, column + i * LANES);
+                        // SAFETY: vectors are the tier's; the pixels lie inside the row, which is this task's.
+                        unsafe { planes.put::<S>((self.n, plane + o), at, pixels, &mut lanes) }
+                    }
                 }
             }
             if let Target::Narrow(wides, grid, format) = self.target {

@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Finish, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
@@ -39,7 +39,10 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     let multiple = network.multiple();
     let width = passes.width.next_multiple_of(multiple);
     let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
-    let bands = (0..passes.height).step_by(rows).map(|y| y..(y + rows).min(passes.height));
+    // The last rows are mirrored below themselves, so as many come at once as that may take.
+    let is_last = |end: usize| passes.height < end + multiple;
+    let starts = (0..passes.height).step_by(rows).filter(|&y| y == 0 || !is_last(y));
+    let bands = starts.map(|y| y..if is_last(y + rows) { passes.height } else { y + rows });
     let mut image = Planes::new(3, passes.width, passes.height);
     let mut write = |first: usize, part: Planes| {
         for c in 0..3 {
@@ -51,11 +54,21 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     if let Some(prefilter) = &network.prefilter {
         let shading = Shading::of(passes, exposure, NEEDED_BY)?;
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
+        let mut held: Option<Planes> = None;
         for band in bands {
             let band = albedo_as_radiance(passes, band, NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
             prefiltered.push(band, None, &mut |first, clean| {
-                let rows = first..first + clean.height;
+                let end = first + clean.height;
+                let clean = match held.take() {
+                    Some(held) => held.above(&clean),
+                    None => clean,
+                };
+                if end < passes.height && is_last(end) {
+                    held = Some(clean);
+                    return Ok(());
+                }
+                let rows = end - clean.height..end;
                 let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
                 let refined = Refined { albedo: radiance_as_albedo(clean), shading };
                 beauty.push(network.rows(passes, rows, exposure)?, Some(refined), &mut write)
@@ -304,11 +317,15 @@ impl<'a> Frame<'a> {
             if rows.is_empty() {
                 continue;
             }
-            let head = self.network.heads[level].forward(vec![refined.rows(rows.clone())]);
-            self.scales[level + 1].predicted(rows.clone(), Prediction::of_level(head));
+            let fine = [refined.rows(rows.clone())];
+            let head = self.network.heads[level].forward_planes(&fine, 1);
+            let prediction = Prediction::split(KERNEL, |first, count| head.channels(first, count));
+            self.scales[level + 1].predicted(rows.clone(), prediction);
             if level == 0 {
-                let head = self.network.full.forward(vec![refined.rows(rows.clone())]);
-                let (prediction, Finish { mut gain, refined }) = Prediction::of_full(head);
+                let head = self.network.full.forward_planes(&fine, 2);
+                let planes = |first, count| head.channels(first, count);
+                let (prediction, Finish { mut gain, refined }) =
+                    Prediction::split_full(head.extent().1, planes);
                 let rows = 2 * rows.start..2 * rows.end;
                 if let Some((divisor, shade)) = refined {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
