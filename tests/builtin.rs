@@ -13,6 +13,7 @@ use std::{
 use assert_cmd::Command;
 use common::files::{bits, data, read_exr, values};
 use demc::{
+    features::GUIDE_PASSES,
     metrics,
     models::{self, learned, network::Architecture},
     passes::{self, Pass, PassSet},
@@ -290,6 +291,26 @@ fn frames_of_a_few_pixels() {
             for (got, want) in image.data.iter().zip(&noisy.data) {
                 assert!((got - want).abs() <= 0.02 * want, "{got} for {want}");
             }
+        }
+    }
+}
+
+#[test]
+fn a_frame_of_any_height_is_as_clean_at_its_end() {
+    const END: usize = 15;
+    let [noisy, reference] =
+        ["s0000_room_0004spp.exr", "s0000_room_ref.exr"].map(|name| passes::load(data(name), None).unwrap());
+    let reference = reference.require(Pass::Combined, "this test").unwrap();
+    for name in ["demc-s", "demc-m"] {
+        let model = models::open(name).unwrap();
+        let whole = model.denoise(&noisy).unwrap();
+        // None of these heights can be halved four times: up to fifteen rows are to be added.
+        for height in [113, 114, 122] {
+            let window = |planes: &Planes| planes.window((0, height - END), (noisy.width, END));
+            let error = |image: &Planes| metrics::error::relmse(&window(image), &window(reference));
+            let cut = model.denoise(&noisy.rows(&GUIDE_PASSES, 0..height)).unwrap();
+            let (cut, whole) = (error(&cut), error(&whole));
+            assert!(cut < 1.3 * whole, "{name}: RelMSE {cut} at the end of {height} rows, {whole} of all");
         }
     }
 }

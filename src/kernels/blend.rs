@@ -103,20 +103,23 @@ impl Kernel for Row<'_> {
         // Plain loops over whole rows, which the compiler vectorises with the tier's instructions.
         let alpha = &masks.alpha[row(masks.alpha, 0)];
         let corners: [&[f32]; CORNERS] = std::array::from_fn(|i| &masks.corners[row(masks.corners, i)]);
-        let mut weights: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
+        let mut scratch = vec![0.0; (2 * CORNERS + 2) * size.w];
+        let mut lines = scratch.chunks_exact_mut(size.w);
+        let mut line = || lines.next().expect("there are as many");
+        let mut weights: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
+        let (share, inverse) = (line(), line());
+        // Each corner's coarse pixels, drawn out to the fine row.
+        let mut drawn: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
         for i in 0..CORNERS {
             for (weight, logit) in weights[i].iter_mut().zip(corners[i]) {
                 *weight = BILINEAR[i] * exp(*logit);
             }
         }
         let [w0, w1, w2, w3] = weights.each_ref().map(|w| &w[..size.w]);
-        let (mut share, mut inverse) = (vec![0.0; size.w], vec![0.0; size.w]);
-        for (x, (share, inverse)) in share.iter_mut().zip(&mut inverse).enumerate() {
+        for (x, (share, inverse)) in share.iter_mut().zip(inverse.iter_mut()).enumerate() {
             *share = logistic(alpha[x]);
             *inverse = 1.0 / (w0[x] + w1[x] + w2[x] + w3[x]);
         }
-        // Each corner's coarse pixels, drawn out to the fine row.
-        let mut drawn: [Vec<f32>; CORNERS] = std::array::from_fn(|_| vec![0.0; size.w]);
         for (c, output) in output.into_iter().enumerate() {
             for (pair, row) in [own - place.coarse, other - place.coarse].into_iter().enumerate() {
                 let row = &coarse[(c * h + row) * w..][..w];

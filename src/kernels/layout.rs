@@ -64,12 +64,9 @@ impl Map {
 /// # Panics
 /// If `input` does not hold the output's shape.
 pub fn to_blocked(input: &[f32], factor: usize, output: ViewMut) {
-    let ViewMut { shape, data } = output;
-    assert_eq!(input.len(), shape.n * shape.c * shape.h * shape.w);
-    if !shape.c.is_multiple_of(LANES) {
-        data.par_chunks_mut(4096).for_each(|blocks| blocks.fill(Block::default()));
-    }
-    to_blocked_shuffled(input, 0, factor, ViewMut { shape, data });
+    let s = output.shape;
+    assert_eq!(input.len(), s.n * s.c * s.h * s.w);
+    pack(input, 0, factor, output, false);
 }
 
 /// From blocks to `(N, C, H, W)`.
@@ -96,9 +93,14 @@ pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &
 /// # Panics
 /// As [`from_blocked_shuffled`].
 pub fn to_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: ViewMut) {
+    pack(input, first, factor, output, true);
+}
+
+/// What both of them do; `keep` the other lanes of a block as they are, or else they become zero.
+fn pack(input: &[f32], first: usize, factor: usize, output: ViewMut, keep: bool) {
     let map = Map::new(output.shape, first, factor, input.len());
     let blocks = Shared(output.data.as_mut_ptr());
-    each_band(map, |n, plane, rows| Tier::detect().run(Pack { map, input, blocks, n, plane, rows }));
+    each_band(map, |n, plane, rows| Tier::detect().run(Pack { map, input, blocks, n, plane, rows, keep }));
 }
 
 /// Runs `work(image, blocked plane, rows)` over everything that `map` covers.
@@ -215,12 +217,14 @@ struct Pack<'a> {
     n: usize,
     plane: usize,
     rows: std::ops::Range<usize>,
+    /// Whether the lanes of other channels stay as they are.
+    keep: bool,
 }
 
 impl Kernel for Pack<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { map, input, blocks, n, plane, rows } = self;
+        let Self { map, input, blocks, n, plane, rows, keep } = self;
         let s = map.shape;
         let lanes = map.lanes(plane);
         let mut pixels = [Block::default(); LANES];
@@ -230,7 +234,7 @@ impl Kernel for Pack<'_> {
                 // SAFETY: vectors are the tier's; the row's blocks belong to this task.
                 unsafe {
                     let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y) + x), count);
-                    if lanes.len() < LANES {
+                    if keep && lanes.len() < LANES {
                         transpose::<S>(row, &mut pixels);
                     }
                     let mut lane = lanes.start;
