@@ -106,10 +106,10 @@ impl Kernel for Row<'_> {
         let mut scratch = vec![0.0; (2 * CORNERS + 2) * size.w];
         let mut lines = scratch.chunks_exact_mut(size.w);
         let mut line = || lines.next().expect("there are as many");
-        let mut weights: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
+        let weights: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
         let (share, inverse) = (line(), line());
         // Each corner's coarse pixels, drawn out to the fine row.
-        let mut drawn: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
+        let drawn: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
         for i in 0..CORNERS {
             for (weight, logit) in weights[i].iter_mut().zip(corners[i]) {
                 *weight = BILINEAR[i] * exp(*logit);

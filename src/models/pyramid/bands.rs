@@ -428,7 +428,8 @@ impl Scale {
     /// Takes in what a head predicted for `rows`.
     fn predicted(&mut self, rows: Range<usize>, prediction: Prediction<NoneTape>) {
         let Prediction { kernel, confidence, mask, corners } = prediction;
-        self.confidence.push(confidence);
+        // A copy, since it is kept for longer than all the head's planes, whose memory it would keep.
+        self.confidence.push(Field::input(confidence.extent(), confidence.values()));
         self.masks.push_back((rows.clone(), mask, corners));
         self.kernels.push_back((rows, kernel));
     }
