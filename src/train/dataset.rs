@@ -324,4 +324,21 @@ mod tests {
         // By area 144 to 400 are drawn first: 106 of 400 steps.
         assert!((80..132).contains(&sides[0]), "{sides:?}");
     }
+
+    #[test]
+    fn frames_that_hold_no_crop_at_all_are_named() {
+        let file =
+            |name: &str| std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+        let pair = Pair {
+            scene: "s0000_room".into(),
+            noisy: file("s0000_room_0004spp.exr"),
+            reference: file("s0000_room_ref.exr"),
+            spp: 4,
+            frame: None,
+        };
+        let load = |least| Dataset::load(std::slice::from_ref(&pair), (&[Pass::Combined], &[]), false, least);
+        assert_eq!(load(128).map(|data| data.len()).ok(), Some(1));
+        let error = load(144).err().expect("128x128 pixels hold none").to_string();
+        assert!(error.contains("s0000_room_0004spp.exr") && error.contains("144x144"), "{error}");
+    }
 }
