@@ -9,12 +9,12 @@ are geometric means over the frames: of everything, and of the last 16 rows and 
 import argparse
 import glob
 import os
-import subprocess
 import tempfile
 
 import numpy as np
 
 from clean_references import exr, planes
+from methods import demc
 
 LAST = 16
 
@@ -22,10 +22,9 @@ LAST = 16
 def errors(program, model, frame, reference, size, folder):
     """RelMSE of the frame cut to `size`, of its last rows and of its last columns."""
     width, height = size
-    source, target = (os.path.join(folder, name) for name in ("in.exr", "out"))
+    source = os.path.join(folder, "in.exr")
     exr.write_half(source, {name: plane[:height, :width] for name, plane in frame.items()})
-    subprocess.run([program, "denoise", source, "--model", model, "--out", target, "--overwrite"], check=True, capture_output=True)
-    image, _ = planes(exr.read(os.path.join(target, "in.exr")), "Denoised", "RGB")
+    image = demc(program, model, source, folder)
     error = ((image - reference[:height, :width]) ** 2 / (reference[:height, :width] ** 2 + 1e-3)).mean(-1)
     return error.mean(), error[-LAST:].mean(), error[:, -LAST:].mean()
 

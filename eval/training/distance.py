@@ -10,14 +10,13 @@ errs as the denoiser of the references does; the noise of the latter is the same
 
 import argparse
 import csv
-import os
 import random
-import subprocess
 import tempfile
 
 import numpy as np
 
-from clean_references import clean, exr, planes
+from clean_references import exr, planes
+from methods import add_options, both
 
 
 def errors(ours, theirs, reference):
@@ -38,9 +37,7 @@ def main():
     """Entry point of the script."""
     parser = argparse.ArgumentParser(prog="distance.py", description="Compares a model with Open Image Denoise.")
     parser.add_argument("manifest", help="CSV with columns noisy, reference and spp")
-    parser.add_argument("--model", required=True, help="a model's name or a weights file")
-    parser.add_argument("--demc", default="demc", help="the program demc")
-    parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    add_options(parser)
     parser.add_argument("--most", type=int, default=110, help="pairs drawn from the manifest, if it has more")
     options = parser.parse_args()
     with open(options.manifest, encoding="utf-8", newline="") as file:
@@ -54,11 +51,7 @@ def main():
             reference = exr.read(pair["reference"])
             if not any("Noisy Image." in name for name in reference):
                 continue
-            command = [options.demc, "denoise", pair["noisy"], "--model", options.model, "--out", folder, "--overwrite"]
-            subprocess.run(command, check=True, capture_output=True)
-            ours, _ = planes(exr.read(os.path.join(folder, os.path.basename(pair["noisy"]))), "Denoised", "RGB")
-            frame = exr.read(pair["noisy"])
-            theirs = clean(options.oidn, folder, planes(frame, "Combined", "RGB")[0], frame)
+            ours, theirs = both(options, pair["noisy"], folder)
             rows.append(errors(ours, theirs, reference))
     rows.sort(key=lambda row: row[1])
     tell("all", rows)

@@ -8,13 +8,12 @@ Printed is, for each, its share of Open Image Denoise's squared error (the mean 
 
 import argparse
 import glob
-import os
-import subprocess
 import tempfile
 
 import numpy as np
 
-from clean_references import clean, exr, planes
+from clean_references import exr, planes
+from methods import add_options, both
 
 OCTAVES = 6
 
@@ -34,18 +33,12 @@ def main():
     """Entry point of the script."""
     parser = argparse.ArgumentParser(prog="octaves.py", description="Compares a model with Open Image Denoise by octaves.")
     parser.add_argument("frames", help="quoted glob of noisy frames, <scene>_<spp>spp.exr beside <scene>_ref.exr")
-    parser.add_argument("--model", required=True, help="a model's name or a weights file")
-    parser.add_argument("--demc", default="demc", help="the program demc")
-    parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    add_options(parser)
     options = parser.parse_args()
     ours, theirs = [], []
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted(glob.glob(options.frames)):
-            command = [options.demc, "denoise", path, "--model", options.model, "--out", folder, "--overwrite"]
-            subprocess.run(command, check=True, capture_output=True)
-            image, _ = planes(exr.read(os.path.join(folder, os.path.basename(path))), "Denoised", "RGB")
-            frame = exr.read(path)
-            other = clean(options.oidn, folder, planes(frame, "Combined", "RGB")[0], frame)
+            image, other = both(options, path, folder)
             reference, _ = planes(exr.read(path[: path.rindex("_")] + "_ref.exr"), "Combined", "RGB")
             weight = 1 / np.sqrt(reference**2 + 1e-3)
             for found, result in ((ours, image), (theirs, other)):
