@@ -16,7 +16,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::{
     Error, Result,
     frame::Frame,
-    metrics::ssim,
     models::{self, learned::TURNED, network::Architecture, weights_file},
     nn::Precision,
     passes::{self, Pass},
@@ -190,11 +189,11 @@ impl Args {
         if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
         }
-        if self.loss == Loss::Ssim && self.patch < ssim::WINDOW {
+        let least = self.loss.least_side();
+        if self.patch < least {
             return Err(usage(format!(
-                "--patch {}: --loss ssim takes {} at least",
-                self.patch,
-                ssim::WINDOW
+                "--patch {}: --loss {} takes {least} at least",
+                self.patch, self.loss
             )));
         }
         for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {

@@ -139,7 +139,7 @@ impl Unpacked {
     }
 
     /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose channels of blocked
-    /// plane `plane` are `blocks`.
+    /// plane `plane` are `blocks`. What `lanes` holds is lost.
     ///
     /// # Safety
     /// The processor has the instructions of `S`; the pixels lie inside the row and nobody else writes them; the planes

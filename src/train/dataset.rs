@@ -201,7 +201,7 @@ impl Stored {
             return Err(Error::invalid(
                 &pair.noisy,
                 format!(
-                    "{}x{} pixels hold no crop of {least}x{least}, the smallest that this network takes; render larger frames",
+                    "{}x{} pixels hold no crop of {least}x{least}, the smallest that this network and loss take; render larger frames",
                     noisy.width, noisy.height
                 ),
             ));

@@ -60,6 +60,11 @@ impl Loss {
     pub const ALL: [Loss; 6] =
         [Loss::Relmse, Loss::Smape, Loss::Both, Loss::Edges, Loss::Geomean, Loss::Ssim];
 
+    /// Rows and columns that an image must have for it, at least.
+    pub fn least_side(self) -> usize {
+        if self == Loss::Ssim { ssim::WINDOW } else { 1 }
+    }
+
     /// The loss of `image` against `reference`, same shape and scale.
     ///
     /// Squared errors are against `raw` where it is given, with the denominators of `reference`: noise in the

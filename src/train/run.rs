@@ -117,7 +117,8 @@ pub fn run(
         return Ok(());
     }
     let wanted = (network.passes(), network.optional_passes());
-    let training = Dataset::load(&options.train, wanted, options.raw_references, network.multiple())?;
+    let least = network.multiple().max(options.loss.least_side());
+    let training = Dataset::load(&options.train, wanted, options.raw_references, least)?;
     let validation = Dataset::load(&options.validation, wanted, false, 1)?;
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
