@@ -164,24 +164,26 @@ pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let mut guide = Planes::new(if refined.is_some() { 7 } else { 6 }, passes.width, passes.height);
+    let unwritten = |channels: usize| Planes::unwritten(channels, passes.width, passes.height);
+    let mut guide = unwritten(if refined.is_some() { 7 } else { 6 });
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
     let (directions, mean) = rest.split_at_mut(noisy.data.len());
     map(&refined.as_ref().map_or(noisy, |refined| &refined.albedo).data, colours, texture);
     map(&normal.data, directions, unit);
-    let mut albedo = Planes::new(3, passes.width, passes.height);
+    let mut albedo = unwritten(3);
     map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
     let further = refined.map(|Refined { albedo: mut other, shading }| {
         map(&noisy.data, &mut other.data, |a| texture(a) + ALBEDO_FLOOR);
-        let mut ratio = Planes::new(3, passes.width, passes.height);
+        let mut ratio = unwritten(3);
         log_ratio(&albedo.data, &other.data, &mut ratio.data);
         let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
         mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
         [ratio, shading]
     });
-    let mut irradiance = radiance.clone();
-    irradiance.data.par_iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
-    let mut encoded = Planes::new(3, passes.width, passes.height);
+    let mut irradiance = unwritten(3);
+    let quotients = irradiance.data.par_iter_mut().zip(&radiance.data).zip(&albedo.data);
+    quotients.for_each(|((out, v), a)| *out = v.max(0.0) * exposure / a);
+    let mut encoded = unwritten(3);
     log_transfer(&irradiance.data, STEEPNESS, &mut encoded.data);
     let planes =
         [irradiance, albedo, encoded, guide].into_iter().chain(further.into_iter().flatten()).collect();
@@ -226,7 +228,7 @@ pub fn albedo_as_radiance(
     let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
     let mut lit = albedo.window((0, rows.start), (passes.width, rows.len()));
     lit.data.par_iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
-    let white = Planes { data: vec![1.0; lit.data.len()], ..lit };
+    let white = Planes::from_rows(3, (lit.width, lit.height), |_, _, row| row.fill(1.0));
     let mut frame = passes.rows(&[Pass::DenoisingNormal], rows);
     frame.insert(Pass::Combined, lit);
     frame.insert(Pass::DenoisingAlbedo, white);

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::kernels::memory::{PlaneBuffer, plane_buffer};
+
 /// `channels` planes of `height` x `width` f32, channel after channel, rows top to bottom.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planes {
@@ -12,13 +14,13 @@ pub struct Planes {
     /// Rows.
     pub height: usize,
     /// `channels * height * width` values, (C, H, W).
-    pub data: Vec<f32>,
+    pub data: PlaneBuffer,
 }
 
 impl Planes {
     /// All zero.
     pub fn new(channels: usize, width: usize, height: usize) -> Self {
-        Self { channels, width, height, data: vec![0.0; channels * width * height] }
+        Self { channels, width, height, data: vec![0.0; channels * width * height].into() }
     }
 
     /// Wraps (C, H, W) data.
@@ -27,16 +29,21 @@ impl Planes {
     /// If `data.len() != channels * width * height`.
     pub fn from_vec(channels: usize, width: usize, height: usize, data: Vec<f32>) -> Self {
         assert_eq!(data.len(), channels * width * height, "planes are channels x height x width");
-        Self { channels, width, height, data }
+        Self { channels, width, height, data: data.into() }
     }
 
-    /// What `fill(channel, row's number, row)` writes into each row; rows are filled on all threads.
+    /// Planes whose values are whatever was last in their memory, to be written over.
+    pub fn unwritten(channels: usize, width: usize, height: usize) -> Self {
+        Self { channels, width, height, data: plane_buffer(channels * width * height) }
+    }
+
+    /// What `fill(channel, row's number, row)` writes, all of it, into each row; rows are filled on all threads.
     pub fn from_rows(
         channels: usize,
         (width, height): (usize, usize),
         fill: impl Fn(usize, usize, &mut [f32]) + Sync,
     ) -> Self {
-        let mut planes = Self::new(channels, width, height);
+        let mut planes = Self::unwritten(channels, width, height);
         let rows = planes.data.par_chunks_mut(width.max(1)).enumerate();
         rows.for_each(|(i, row)| fill(i / height, i % height, row));
         planes

@@ -333,7 +333,7 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
             let values: Vec<f32> =
                 (0..shape.n).flat_map(|n| x[(n * shape.c + first) * area..][..c * area].to_vec()).collect();
             first += c;
-            let operand = narrow::Operand::quantize(engine, View::new(part, &blocked(part, &values)), step);
+            let operand = narrow::Operand::quantize(View::new(part, &blocked(part, &values)), step);
             let mut widened = vec![Block::default(); part.blocks()];
             operand.widen(ViewMut::new(part, &mut widened));
             assert_eq!(plain(part, &widened), values, "whole steps are kept");

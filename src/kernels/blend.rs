@@ -9,6 +9,7 @@
 use rayon::prelude::*;
 
 use super::{
+    LANES,
     filter::{Size, exp, logistic},
     simd::{Kernel, Simd, Tier},
 };
@@ -70,6 +71,7 @@ pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: 
     let n = size.pixels();
     assert_eq!((fine.len(), output.len(), coarse.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
     assert_eq!((masks.alpha.len(), masks.corners.len()), (n, CORNERS * n));
+    assert!(size.w.is_multiple_of(2), "only even rows have halves");
     let (red, rest) = output.split_at_mut(n);
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
@@ -92,50 +94,50 @@ struct Row<'a> {
 impl Kernel for Row<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { size, place, y, fine, coarse, masks, output } = self;
-        let (w, n) = (size.w / 2, size.pixels());
-        let h = coarse.len() / (3 * w).max(1);
+        let Self { size: Size { w, .. }, place, y, fine, coarse, masks, mut output } = self;
+        let (n, narrow) = (self.size.pixels(), w / 2);
+        let h = coarse.len() / (3 * narrow).max(1);
         let (own, other) = near(place.first + y, place.total / 2);
-        let row = |values: &'_ [f32], plane: usize| -> std::ops::Range<usize> {
-            debug_assert!(values.len() >= (plane + 1) * n);
-            plane * n + y * size.w..plane * n + (y + 1) * size.w
-        };
-        // Plain loops over whole rows, which the compiler vectorises with the tier's instructions.
-        let alpha = &masks.alpha[row(masks.alpha, 0)];
-        let corners: [&[f32]; CORNERS] = std::array::from_fn(|i| &masks.corners[row(masks.corners, i)]);
-        let mut scratch = vec![0.0; (2 * CORNERS + 2) * size.w];
-        let mut lines = scratch.chunks_exact_mut(size.w);
-        let mut line = || lines.next().expect("there are as many");
-        let weights: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
-        let (share, inverse) = (line(), line());
-        // Each corner's coarse pixels, drawn out to the fine row.
-        let drawn: [&mut [f32]; CORNERS] = std::array::from_fn(|_| line());
-        for i in 0..CORNERS {
-            for (weight, logit) in weights[i].iter_mut().zip(corners[i]) {
-                *weight = BILINEAR[i] * exp(*logit);
-            }
+        let of = |values: &'_ [f32], plane: usize| values[plane * n + y * w..][..w].as_ptr();
+        // The coarse lines of each colour, the edge repeated; and what a group of pixels may read beyond.
+        let stride = narrow + 2 + LANES;
+        let mut lines = vec![0.0; 6 * stride];
+        for (i, line) in lines.chunks_exact_mut(stride).enumerate() {
+            let row = [own, other][i % 2] - place.coarse;
+            let row = &coarse[(i / 2 * h + row) * narrow..][..narrow];
+            line[1..=narrow].copy_from_slice(row);
+            (line[0], line[narrow + 1]) = (row[0], row[narrow - 1]);
         }
-        let [w0, w1, w2, w3] = weights.each_ref().map(|w| &w[..size.w]);
-        for (x, (share, inverse)) in share.iter_mut().zip(inverse.iter_mut()).enumerate() {
-            *share = logistic(alpha[x]);
-            *inverse = 1.0 / (w0[x] + w1[x] + w2[x] + w3[x]);
-        }
-        for (c, output) in output.into_iter().enumerate() {
-            for (pair, row) in [own - place.coarse, other - place.coarse].into_iter().enumerate() {
-                let row = &coarse[(c * h + row) * w..][..w];
-                for x in 0..w {
-                    let (left, right) = (row[x.saturating_sub(1)], row[(x + 1).min(w - 1)]);
-                    drawn[2 * pair][2 * x..2 * x + 2].fill(row[x]);
-                    drawn[2 * pair + 1][2 * x] = left;
-                    drawn[2 * pair + 1][2 * x + 1] = right;
+        let alpha = of(masks.alpha, 0);
+        let corners: [_; CORNERS] = std::array::from_fn(|i| of(masks.corners, i));
+        for x in (0..w).step_by(LANES) {
+            let count = LANES.min(w - x);
+            // SAFETY: vectors are the tier's; of rows no more is read and written than they have, and a group of a
+            // line's pixels begins inside it.
+            unsafe {
+                let one = S::splat(1.0);
+                let read = |row: *const f32| S::read_some(row.add(x), 0..count, 0.0);
+                let mut weights = [one; CORNERS];
+                let mut total = S::splat(0.0);
+                for i in 0..CORNERS {
+                    weights[i] = S::mul(S::splat(BILINEAR[i]), S::exp(read(corners[i])));
+                    total = S::add(total, weights[i]);
                 }
-            }
-            let [d0, d1, d2, d3] = drawn.each_ref().map(|d| &d[..size.w]);
-            let fine = &fine[row(fine, c)][..size.w];
-            let (share, inverse) = (&share[..size.w], &inverse[..size.w]);
-            for (x, out) in output[..size.w].iter_mut().enumerate() {
-                let up = w0[x] * d0[x] + w1[x] * d1[x] + w2[x] * d2[x] + w3[x] * d3[x];
-                *out = fine[x] + share[x] * (up * inverse[x] - fine[x]);
+                let negative = S::mul(read(alpha), S::splat(-1.0));
+                let share = S::div(one, S::add(one, S::exp(negative)));
+                let part = S::div(share, total);
+                let weights = weights.map(|weight| S::mul(weight, part));
+                let rest = S::fma(share, S::splat(-1.0), one);
+                for (c, output) in output.iter_mut().enumerate() {
+                    let mut sum = S::mul(read(of(fine, c)), rest);
+                    for pair in 0..2 {
+                        let line = lines[(2 * c + pair) * stride..].as_ptr().add(x / 2);
+                        let [nearest, beside] = S::double(line);
+                        sum = S::fma(nearest, weights[2 * pair], sum);
+                        sum = S::fma(beside, weights[2 * pair + 1], sum);
+                    }
+                    S::write_first(output[x..].as_mut_ptr(), count, sum);
+                }
             }
         }
     }

@@ -15,7 +15,13 @@ use super::{
 };
 
 /// Exponents are kept within this of zero: `e^-40` is no weight beside 1.
-const LIMIT: f32 = 40.0;
+pub(super) const LIMIT: f32 = 40.0;
+
+/// ln 2 in two parts, and the polynomial for `e^r` on +-0.5 ln 2, highest power first, without `r + 1`: the minimax
+/// coefficients of Cephes' expf (Moshier).
+pub(super) const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
+pub(super) const EXP: [f32; 6] =
+    [1.987_569_1e-4, 1.398_199_9e-3, 8.333_452e-3, 4.166_579_6e-2, 1.666_666_5e-1, 0.5];
 
 /// Rows and columns of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,8 +66,7 @@ pub struct FilterGradient<'a> {
     pub confidence: Option<&'a mut [f32]>,
 }
 
-/// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2 (the minimax
-/// coefficients of Cephes' expf, Moshier).
+/// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2.
 #[inline(always)]
 pub(super) fn exp(x: f32) -> f32 {
     let x = x.clamp(-LIMIT, LIMIT);
@@ -69,13 +74,8 @@ pub(super) fn exp(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
     let n = shifted - ROUND;
-    let r = x - n * 0.693_359_4 + n * 2.121_944_4e-4;
-    let p = 1.987_569_1e-4;
-    let p = p * r + 1.398_199_9e-3;
-    let p = p * r + 8.333_452e-3;
-    let p = p * r + 4.166_579_6e-2;
-    let p = p * r + 1.666_666_5e-1;
-    let p = p * r + 0.5;
+    let r = x - n * LN_2[0] - n * LN_2[1];
+    let p = EXP.iter().fold(0.0, |p, c| p * r + c);
     let e = (p * r * r + r) + 1.0;
     let bits = (shifted.to_bits() << 23).wrapping_add(127 << 23);
     e * f32::from_bits(bits)
@@ -195,7 +195,18 @@ impl<'a> Filter<'a> {
         self.check();
         let (n, w) = (self.filtered(), self.size.w);
         assert_eq!((output.len(), total.len()), (3 * n, n));
-        each_row(w, output, total, |y, output, total| tier.run(Forward { filter: &self, y, output, total }));
+        // Equal trust is no change of any exponent.
+        let equal = vec![0.0; if self.confidence.is_none() { w } else { 0 }];
+        each_row(w, output, total, |y, output, total| {
+            let line = |values: &'a [f32], row: usize| &values[row * w..][..w];
+            let taps = self.taps(y).into_iter().map(|(tap, row, dx)| Tap {
+                logits: line(self.logits, tap * (n / w) + y),
+                confidence: self.confidence.map_or(&equal[..], |trust| line(trust, row)),
+                image: std::array::from_fn(|c| line(self.image, c * self.size.h + row)),
+                dx,
+            });
+            tier.run(Forward { taps: taps.collect(), reach: self.k / 2, output, total });
+        });
     }
 
     /// Adds what the output's gradient (3, H, W) sends back; `output` and `total` are those of
@@ -221,80 +232,102 @@ impl<'a> Filter<'a> {
     }
 }
 
-struct Forward<'a, 'f> {
-    filter: &'a Filter<'f>,
-    y: usize,
+/// One tap of a row: the rows that it reads, and how far to the right.
+struct Tap<'a> {
+    logits: &'a [f32],
+    confidence: &'a [f32],
+    image: [&'a [f32]; 3],
+    dx: isize,
+}
+
+struct Forward<'a> {
+    taps: Vec<Tap<'a>>,
+    /// Columns to either side that a tap reaches.
+    reach: usize,
     output: [&'a mut [f32]; 3],
     total: &'a mut [f32],
 }
 
-impl Kernel for Forward<'_, '_> {
+impl Kernel for Forward<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(mut self) {
-        let (w, reach) = (self.filter.size.w, self.filter.k / 2);
-        let taps = self.filter.taps(self.y);
-        // Sixteen pixels at a time where all their neighbours lie inside the row, the last of them once more if
-        // need be; one by one beside the ends.
-        let inner = reach..w.saturating_sub(reach);
-        let mut x = 0;
-        while x < w {
-            if inner.start <= x && inner.start + LANES <= inner.end && x < inner.end {
-                self.pixels::<LANES>(x.min(inner.end - LANES), &taps);
-                x = (x + LANES).min(inner.end);
-            } else {
-                self.pixels::<1>(x, &taps);
-                x += 1;
+        let w = self.total.len();
+        for x in (0..w).step_by(LANES) {
+            // SAFETY: vectors are the tier's; all columns that are read lie inside the row in the first case.
+            unsafe {
+                if x >= self.reach && x + LANES + self.reach <= w {
+                    self.pixels::<S, true>(x);
+                } else {
+                    self.pixels::<S, false>(x);
+                }
             }
         }
     }
 }
 
-impl Forward<'_, '_> {
-    /// Filters `N` pixels of the row from column `x` on: several only where no tap leaves the row.
+impl Forward<'_> {
+    /// Filters 16 pixels of the row from column `x` on, or those there are.
+    ///
+    /// # Safety
+    /// As for [`some_columns`].
     #[inline(always)]
-    fn pixels<const N: usize>(&mut self, x: usize, taps: &[(usize, usize, isize)]) {
-        let Filter { size, image, logits, confidence, .. } = *self.filter;
-        let (n, at) = (size.pixels(), self.y * size.w + x);
-        let column = |dx: isize| x.checked_add_signed(dx).filter(|column| *column < size.w);
-        let several = |values: &[f32], at: usize| *values[at..].first_chunk::<N>().expect("inside the row");
-        let exponents = |tap: usize, row: usize, column: usize| {
-            let mut exponents = several(logits, tap * self.filter.filtered() + at);
-            if let Some(confidence) = confidence {
-                let confidence = several(confidence, row * size.w + column);
-                (0..N).for_each(|i| exponents[i] += confidence[i]);
+    unsafe fn pixels<S: Simd, const INNER: bool>(&mut self, x: usize) {
+        let count = LANES.min(self.total.len() - x);
+        // SAFETY: the caller's promise; no more is written than there is.
+        unsafe {
+            let mut largest = S::splat(f32::NEG_INFINITY);
+            for tap in &self.taps {
+                largest = S::max(tap.exponents::<S, INNER>(x), largest);
             }
-            exponents
-        };
-        let mut largest = [f32::NEG_INFINITY; N];
-        for &(tap, row, dx) in taps {
-            let Some(column) = column(dx) else { continue };
-            let exponents = exponents(tap, row, column);
-            for i in 0..N {
-                largest[i] = if exponents[i] > largest[i] { exponents[i] } else { largest[i] };
-            }
-        }
-        let (mut sums, mut total) = ([[0.0; N]; 3], [0.0; N]);
-        for &(tap, row, dx) in taps {
-            let Some(column) = column(dx) else { continue };
-            let exponents = exponents(tap, row, column);
-            let mut weights = [0.0; N];
-            for i in 0..N {
-                weights[i] = exp(exponents[i] - largest[i]);
-                total[i] += weights[i];
-            }
-            for (c, sums) in sums.iter_mut().enumerate() {
-                let values = several(image, c * n + row * size.w + column);
-                for i in 0..N {
-                    sums[i] += values[i] * weights[i];
+            let (mut sums, mut total) = ([S::splat(0.0); 3], S::splat(0.0));
+            for tap in &self.taps {
+                let exponents = tap.exponents::<S, INNER>(x);
+                let weights = S::exp(S::fma(largest, S::splat(-1.0), exponents));
+                total = S::add(total, weights);
+                for (sum, row) in sums.iter_mut().zip(tap.image) {
+                    let values = some_columns::<S, INNER>(row, x as isize + tap.dx, 0.0);
+                    *sum = S::fma(values, weights, *sum);
                 }
             }
-        }
-        for (out, sums) in self.output.iter_mut().zip(&sums) {
-            for (i, out) in out[x..][..N].iter_mut().enumerate() {
-                *out = sums[i] / total[i];
+            for (out, sum) in self.output.iter_mut().zip(sums) {
+                S::write_first(out[x..].as_mut_ptr(), count, S::div(sum, total));
             }
+            S::write_first(self.total[x..].as_mut_ptr(), count, total);
         }
-        self.total[x..][..N].copy_from_slice(&total);
+    }
+}
+
+impl Tap<'_> {
+    /// The exponents of 16 pixels from column `x` on; no weight where there is no neighbour.
+    ///
+    /// # Safety
+    /// As for [`some_columns`].
+    #[inline(always)]
+    unsafe fn exponents<S: Simd, const INNER: bool>(&self, x: usize) -> S::V {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let logits = some_columns::<S, INNER>(self.logits, x as isize, 0.0);
+            let trust = some_columns::<S, INNER>(self.confidence, x as isize + self.dx, f32::NEG_INFINITY);
+            S::add(logits, trust)
+        }
+    }
+}
+
+/// Columns `x..x + 16` of a row, and `other` where it has none.
+///
+/// # Safety
+/// The processor has the instructions of `S`; if `INNER`, the row has all of them.
+#[inline(always)]
+unsafe fn some_columns<S: Simd, const INNER: bool>(row: &[f32], x: isize, other: f32) -> S::V {
+    let p = row.as_ptr().wrapping_offset(x);
+    // SAFETY: the caller's promise, or else only columns that the row has are read.
+    unsafe {
+        if INNER {
+            S::read(p)
+        } else {
+            let inside = |x: isize| x.clamp(0, LANES as isize) as usize;
+            S::read_some(p, inside(-x)..inside(row.len() as isize - x), other)
+        }
     }
 }
 

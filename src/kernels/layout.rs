@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::{
     Block, LANES, Shape, Shared, View, ViewMut,
-    simd::{Kernel, Simd, Tier},
+    simd::{Kernel, PAIRS, Simd, Tier},
 };
 
 /// Where channels `first..first + channels` of an activation lie in planes of `factor` times its size.
@@ -29,6 +29,7 @@ impl Map {
         let area = factor * factor;
         assert_eq!(len, shape.n * (channels / area) * area * shape.h * shape.w, "planes must be whole");
         assert!(first + channels <= shape.c, "more planes than channels");
+        assert!(first.is_multiple_of(area), "squares must be whole");
         Self { shape, first, channels, factor }
     }
 
@@ -44,18 +45,15 @@ impl Map {
     }
 
     /// Index of column `x` of the activation's row `y`, in the planes of all images.
+    #[inline(always)]
     fn value(self, n: usize, plane: usize, lane: usize, y: usize, x: usize) -> usize {
         let Self { shape, factor, .. } = self;
         let channel = plane * LANES + lane - self.first;
-        let area = factor * factor;
-        let (sy, sx) = (channel % area / factor, channel % factor);
-        let image = n * (self.channels / area) + channel / area;
+        // Shifts in place of divisions, which would take longer than what is moved.
+        let (side, area) = (factor / 2, factor * factor);
+        let (sy, sx) = ((channel & (area - 1)) >> side, channel & (factor - 1));
+        let image = n * (self.channels >> (2 * side)) + (channel >> (2 * side));
         (image * factor * shape.h + factor * y + sy) * factor * shape.w + factor * x + sx
-    }
-
-    /// Whether `lane` and the next are neighbours in a row of their plane.
-    fn paired(self, plane: usize, lane: usize, lanes: &std::ops::Range<usize>) -> bool {
-        self.factor == 2 && (plane * LANES + lane - self.first).is_multiple_of(2) && lane + 1 < lanes.end
     }
 }
 
@@ -139,7 +137,7 @@ impl Unpacked {
     }
 
     /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose channels of blocked
-    /// plane `plane` are `blocks`. What `lanes` holds is lost.
+    /// plane `plane` are what `finish` makes of `blocks`.
     ///
     /// # Safety
     /// The processor has the instructions of `S`; the pixels lie inside the row and nobody else writes them; the planes
@@ -150,39 +148,48 @@ impl Unpacked {
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
         blocks: &[Block],
-        lanes: &mut [Block; LANES],
+        finish: &impl Finish<S>,
     ) {
         let Self { map, values } = self;
-        let used = map.lanes(plane);
+        let lanes = map.lanes(plane);
         // SAFETY: the caller's promise.
         unsafe {
-            transpose::<S>(blocks, lanes);
-            let mut lane = used.start;
-            while lane < used.end {
-                let out = values.add(map.value(n, plane, lane, y, x));
-                if map.paired(plane, lane, &used) {
-                    let out = std::slice::from_raw_parts_mut(out, 2 * blocks.len());
-                    let (a, b) = (&lanes[lane].0, &lanes[lane + 1].0);
-                    let pairs: [f32; 2 * LANES] =
-                        std::array::from_fn(|i| if i % 2 == 0 { a[i / 2] } else { b[i / 2] });
-                    match <&mut [f32; 2 * LANES]>::try_from(&mut *out) {
-                        Ok(out) => *out = pairs,
-                        Err(_) => out.copy_from_slice(&pairs[..2 * blocks.len()]),
-                    }
-                    lane += 2;
-                } else {
-                    let channel = &lanes[lane].0;
-                    if map.factor == 1 && blocks.len() == LANES {
-                        out.cast::<[f32; LANES]>().write(*channel);
-                    } else {
-                        for i in 0..blocks.len() {
-                            *out.add(i * map.factor) = channel[i];
-                        }
-                    }
-                    lane += 1;
+            if map.factor == 1 {
+                let channels = S::transpose(load::<S, LANES>(blocks, finish));
+                for lane in lanes {
+                    let out = values.add(map.value(n, plane, lane, y, x));
+                    write::<S>(out, blocks.len(), channels[lane]);
+                }
+                return;
+            }
+            // Two channels are neighbours in a row of their plane.
+            for (blocks, x) in blocks.chunks(PAIRS).zip((x..).step_by(PAIRS)) {
+                let pairs = S::transpose_pairs(load::<S, PAIRS>(blocks, finish));
+                for pair in lanes.start / 2..lanes.end / 2 {
+                    let out = values.add(map.value(n, plane, 2 * pair, y, x));
+                    write::<S>(out, 2 * blocks.len(), pairs[pair]);
                 }
             }
         }
+    }
+}
+
+/// What becomes of a block's lanes before they are planes.
+pub(super) trait Finish<S: Simd> {
+    /// The lanes, changed.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`.
+    unsafe fn of(&self, lanes: S::V) -> S::V;
+}
+
+/// Lanes as they are.
+struct Unchanged;
+
+impl<S: Simd> Finish<S> for Unchanged {
+    #[inline(always)]
+    unsafe fn of(&self, lanes: S::V) -> S::V {
+        lanes
     }
 }
 
@@ -199,12 +206,11 @@ impl Kernel for Unpack<'_> {
     unsafe fn run<S: Simd>(self) {
         let Self { to, input, n, plane, rows } = self;
         let s = input.shape;
-        let mut lanes = [Block::default(); LANES];
         for y in rows {
             let row = &input.data[s.row(n, plane, y)..][..s.w];
             for (x, blocks) in (0..s.w).step_by(LANES).zip(row.chunks(LANES)) {
                 // SAFETY: vectors are the tier's; every value belongs to this task.
-                unsafe { to.put::<S>((n, plane), (y, x), blocks, &mut lanes) }
+                unsafe { to.put::<S>((n, plane), (y, x), blocks, &Unchanged) }
             }
         }
     }
@@ -227,55 +233,72 @@ impl Kernel for Pack<'_> {
         let Self { map, input, blocks, n, plane, rows, keep } = self;
         let s = map.shape;
         let lanes = map.lanes(plane);
-        let mut pixels = [Block::default(); LANES];
-        for y in rows {
-            for x in (0..s.w).step_by(LANES) {
-                let count = LANES.min(s.w - x);
-                // SAFETY: vectors are the tier's; the row's blocks belong to this task.
-                unsafe {
-                    let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y) + x), count);
-                    if keep && lanes.len() < LANES {
-                        transpose::<S>(row, &mut pixels);
-                    }
-                    let mut lane = lanes.start;
-                    while lane < lanes.end {
-                        let from = &input[map.value(n, plane, lane, y, x)..];
-                        if map.paired(plane, lane, &lanes) {
-                            if let (Some(from), LANES) = (from.first_chunk::<{ 2 * LANES }>(), count) {
-                                pixels[lane].0 = std::array::from_fn(|i| from[2 * i]);
-                                pixels[lane + 1].0 = std::array::from_fn(|i| from[2 * i + 1]);
-                            } else {
-                                for (i, pair) in from.as_chunks::<2>().0[..count].iter().enumerate() {
-                                    pixels[lane].0[i] = pair[0];
-                                    pixels[lane + 1].0[i] = pair[1];
-                                }
-                            }
-                            lane += 2;
-                        } else {
-                            for i in 0..count {
-                                pixels[lane].0[i] = from[i * map.factor];
-                            }
-                            lane += 1;
+        let keep = keep && lanes.len() < LANES;
+        // SAFETY: vectors are the tier's; the rows' blocks belong to this task.
+        unsafe {
+            let zero = S::splat(0.0);
+            for y in rows {
+                let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y)), s.w);
+                if map.factor == 1 {
+                    for (row, x) in row.chunks_mut(LANES).zip((0..).step_by(LANES)) {
+                        let mut channels = if keep { S::transpose(load::<S, LANES>(row, &Unchanged)) } else { [zero; LANES] };
+                        for lane in lanes.clone() {
+                            let from = &input[map.value(n, plane, lane, y, x)..][..row.len()];
+                            channels[lane] = S::read_some(from.as_ptr(), 0..row.len(), 0.0);
                         }
+                        store::<S, LANES>(S::transpose(channels), row);
                     }
-                    let rows = S::transpose(std::array::from_fn(|i| S::load(&pixels[i])));
-                    row.iter_mut().zip(rows).for_each(|(block, values)| S::store(block, values));
+                    continue;
+                }
+                for (row, x) in row.chunks_mut(PAIRS).zip((0..).step_by(PAIRS)) {
+                    let mut pairs =
+                        if keep { S::transpose_pairs(load::<S, PAIRS>(row, &Unchanged)) } else { [zero; PAIRS] };
+                    for pair in lanes.start / 2..lanes.end / 2 {
+                        let from = &input[map.value(n, plane, 2 * pair, y, x)..][..2 * row.len()];
+                        pairs[pair] = S::read_some(from.as_ptr(), 0..2 * row.len(), 0.0);
+                    }
+                    store::<S, PAIRS>(S::transpose_pairs(pairs), row);
                 }
             }
         }
     }
 }
 
-/// The lanes of up to 16 pixels as blocks of pixels; beyond the last pixel values are arbitrary.
+/// Up to `N` blocks, the last of them once more where there are fewer.
 ///
 /// # Safety
 /// The processor has the instructions of `S`.
 #[inline(always)]
-unsafe fn transpose<S: Simd>(pixels: &[Block], lanes: &mut [Block; LANES]) {
-    // SAFETY: the caller's promise.
+unsafe fn load<S: Simd, const N: usize>(blocks: &[Block], finish: &impl Finish<S>) -> [S::V; N] {
+    let last = blocks.len() - 1;
+    // SAFETY: the caller's promise; no block beyond the last is read.
     unsafe {
-        let last = pixels.len() - 1;
-        let rows = S::transpose(std::array::from_fn(|i| S::load(&pixels[i.min(last)])));
-        lanes.iter_mut().zip(rows).for_each(|(block, values)| S::store(block, values));
+        let mut vectors = [S::splat(0.0); N];
+        for i in 0..N {
+            vectors[i] = finish.of(S::load(blocks.as_ptr().add(i.min(last))));
+        }
+        vectors
     }
+}
+
+/// Writes as many vectors as there are blocks.
+///
+/// # Safety
+/// As for [`load`].
+#[inline(always)]
+unsafe fn store<S: Simd, const N: usize>(vectors: [S::V; N], blocks: &mut [Block]) {
+    for (block, vector) in blocks.iter_mut().zip(vectors) {
+        // SAFETY: the caller's promise.
+        unsafe { S::store(block, vector) }
+    }
+}
+
+/// Writes the first `count` values.
+///
+/// # Safety
+/// As for [`Simd::write_first`].
+#[inline(always)]
+unsafe fn write<S: Simd>(p: *mut f32, count: usize, values: S::V) {
+    // SAFETY: the caller's promise.
+    unsafe { if count == LANES { S::write(p, values) } else { S::write_first(p, count, values) } }
 }

@@ -3,8 +3,11 @@
 
 use std::{
     ops::{Deref, DerefMut},
+    slice,
     sync::{Mutex, PoisonError},
 };
+
+use rayon::prelude::*;
 
 /// Free memory for values of one type. What it holds is whatever the last user left.
 #[derive(Debug)]
@@ -28,7 +31,7 @@ impl<T: Clone> Pool<T> {
                 vec![value; len]
             }
         };
-        Pooled { len, data, pool: self }
+        Pooled { len, data, pool: Some(self) }
     }
 }
 
@@ -45,13 +48,71 @@ impl<T: Clone> Default for Pool<T> {
     }
 }
 
-/// Values in memory that goes back to its pool when they are dropped.
+/// Values in memory that goes back to its pool, if it is from one, when they are dropped.
 #[derive(Debug)]
 pub struct Pooled<T: 'static> {
     len: usize,
     /// At least `len`.
     data: Vec<T>,
-    pool: &'static Pool<T>,
+    pool: Option<&'static Pool<T>>,
+}
+
+impl<T> Default for Pooled<T> {
+    fn default() -> Self {
+        Vec::new().into()
+    }
+}
+
+/// Of no pool: what others allocate would only pile up there.
+impl<T> From<Vec<T>> for Pooled<T> {
+    fn from(data: Vec<T>) -> Self {
+        Self { len: data.len(), data, pool: None }
+    }
+}
+
+/// As from a `Vec`.
+impl<T> FromIterator<T> for Pooled<T> {
+    fn from_iter<I: IntoIterator<Item = T>>(values: I) -> Self {
+        Vec::from_iter(values).into()
+    }
+}
+
+impl<T: Clone> Clone for Pooled<T> {
+    fn clone(&self) -> Self {
+        let Some(pool) = self.pool else { return self.to_vec().into() };
+        let Some(first) = self.first() else { return Self::default() };
+        let mut copy = pool.take(self.len, first.clone());
+        copy.clone_from_slice(self);
+        copy
+    }
+}
+
+impl<T> AsRef<[T]> for Pooled<T> {
+    fn as_ref(&self) -> &[T] {
+        self
+    }
+}
+
+impl<T: PartialEq, U: AsRef<[T]> + ?Sized> PartialEq<U> for Pooled<T> {
+    fn eq(&self, other: &U) -> bool {
+        **self == *other.as_ref()
+    }
+}
+
+impl<'a, T> IntoIterator for &'a Pooled<T> {
+    type Item = &'a T;
+    type IntoIter = slice::Iter<'a, T>;
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
+    }
+}
+
+impl<'a, T: Sync> IntoParallelIterator for &'a Pooled<T> {
+    type Item = &'a T;
+    type Iter = rayon::slice::Iter<'a, T>;
+    fn into_par_iter(self) -> Self::Iter {
+        (**self).par_iter()
+    }
 }
 
 impl<T> Deref for Pooled<T> {
@@ -70,6 +131,23 @@ impl<T> DerefMut for Pooled<T> {
 impl<T> Drop for Pooled<T> {
     fn drop(&mut self) {
         let data = std::mem::take(&mut self.data);
-        self.pool.0.lock().unwrap_or_else(PoisonError::into_inner).push(data);
+        if let Some(pool) = self.pool {
+            pool.0.lock().unwrap_or_else(PoisonError::into_inner).push(data);
+        }
     }
+}
+
+/// The values of planar images.
+pub type PlaneBuffer = Pooled<f32>;
+
+static PLANES: Pool<f32> = Pool::new();
+
+/// Memory for `len` values of planar images, which are whatever the last user left.
+pub fn plane_buffer(len: usize) -> PlaneBuffer {
+    PLANES.take(len, 0.0)
+}
+
+/// Gives all free memory of planar images back to the system.
+pub fn clear() {
+    PLANES.clear();
 }

@@ -4,7 +4,7 @@
 //! AVX-512 lanes and calls the one asked for. A tier can only be had from [`Tier::detect`] or
 //! [`Tier::available`], so holding one proves that the processor has its instructions.
 
-use std::{fmt, sync::OnceLock};
+use std::{fmt, ops::Range, sync::OnceLock};
 
 use super::{Block, LANES};
 
@@ -30,11 +30,59 @@ pub trait Simd: Copy {
     /// # Safety
     /// `p` is valid for writes of a block.
     unsafe fn store(p: *mut Block, v: Self::V);
+    /// Reads 16 values that need not be aligned.
+    ///
+    /// # Safety
+    /// `p` is valid for reads of 16 values.
+    unsafe fn read(p: *const f32) -> Self::V;
+    /// Writes 16 values that need not be aligned.
+    ///
+    /// # Safety
+    /// `p` is valid for writes of 16 values.
+    unsafe fn write(p: *mut f32, v: Self::V);
+    /// As [`Simd::read`], but only some of the 16 values; the other lanes become `other`.
+    ///
+    /// # Safety
+    /// `p` is valid for reads of the values `lanes`.
+    #[inline(always)]
+    unsafe fn read_some(p: *const f32, lanes: Range<usize>, other: f32) -> Self::V {
+        let mut values = Block([other; LANES]);
+        // SAFETY: the caller's promise; the block is the function's own.
+        unsafe {
+            for lane in lanes {
+                values.0[lane] = *p.wrapping_add(lane);
+            }
+            Self::load(&values)
+        }
+    }
+    /// Writes the first `count` values.
+    ///
+    /// # Safety
+    /// `p` is valid for writes of as many values.
+    #[inline(always)]
+    unsafe fn write_first(p: *mut f32, count: usize, v: Self::V) {
+        let mut values = Block::default();
+        // SAFETY: the caller's promise; the block is the function's own.
+        unsafe {
+            Self::store(&mut values, v);
+            values.0[..count].iter().enumerate().for_each(|(lane, value)| *p.add(lane) = *value);
+        }
+    }
     /// `a * b + c`, rounded once where the processor can.
     ///
     /// # Safety
     /// See [`Simd::splat`].
     unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// `a * b`.
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    unsafe fn mul(a: Self::V, b: Self::V) -> Self::V;
+    /// `a / b`.
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    unsafe fn div(a: Self::V, b: Self::V) -> Self::V;
     /// `a + b`.
     ///
     /// # Safety
@@ -61,12 +109,79 @@ pub trait Simd: Copy {
             std::array::from_fn(|j| Self::load(&to[j]))
         }
     }
+    /// Pair `j` of neighbouring lanes of vector `i` becomes pair `i` of vector `j`.
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    #[inline(always)]
+    unsafe fn transpose_pairs(rows: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
+        let mut from = [Block::default(); PAIRS];
+        let mut to = [Block::default(); PAIRS];
+        // SAFETY: the blocks are the function's own.
+        unsafe {
+            for (row, block) in rows.iter().zip(&mut from) {
+                Self::store(block, *row);
+            }
+            for i in 0..PAIRS {
+                for j in 0..PAIRS {
+                    to[j].0[2 * i] = from[i].0[2 * j];
+                    to[j].0[2 * i + 1] = from[i].0[2 * j + 1];
+                }
+            }
+            std::array::from_fn(|j| Self::load(&to[j]))
+        }
+    }
+    /// Doubles a line of which `p` is one value before the first: each value twice, and the value on the other side of
+    /// each of the two halves of it. From `a b c d ..`: `b b c c ..` and `a c b d ..`.
+    ///
+    /// # Safety
+    /// `p` is valid for reads of 16 values; ten count.
+    #[inline(always)]
+    unsafe fn double(p: *const f32) -> [Self::V; 2] {
+        let (mut own, mut near) = (Block::default(), Block::default());
+        // SAFETY: the caller's promise; the blocks are the function's own.
+        unsafe {
+            for i in 0..PAIRS {
+                own.0[2 * i..2 * i + 2].fill(*p.add(i + 1));
+                (near.0[2 * i], near.0[2 * i + 1]) = (*p.add(i), *p.add(i + 2));
+            }
+            [Self::load(&own), Self::load(&near)]
+        }
+    }
+    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; see [`exp`](super::filter::exp).
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    #[inline(always)]
+    unsafe fn exp(x: Self::V) -> Self::V {
+        let mut values = Block::default();
+        // SAFETY: the block is the function's own.
+        unsafe {
+            Self::store(&mut values, x);
+            values.0 = values.0.map(super::filter::exp);
+            Self::load(&values)
+        }
+    }
     /// Lane-wise maximum; 0 where `a` is NaN and `b` is 0.
     ///
     /// # Safety
     /// See [`Simd::splat`].
     unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
+    /// Rounds values, none negative, to the nearest whole number that a byte holds.
+    ///
+    /// # Safety
+    /// See [`Simd::splat`].
+    #[inline(always)]
+    unsafe fn bytes(v: Self::V) -> [u8; LANES] {
+        let mut values = Block::default();
+        // SAFETY: the block is the function's own.
+        unsafe { Self::store(&mut values, v) }
+        values.0.map(|v| v.round_ties_even() as u8)
+    }
 }
+
+/// Pairs of lanes.
+pub const PAIRS: usize = LANES / 2;
 
 /// A computation to be compiled for every tier.
 pub trait Kernel {
@@ -166,8 +281,26 @@ impl Simd for Portable {
         unsafe { (*p).0 = v }
     }
     #[inline(always)]
+    unsafe fn read(p: *const f32) -> Self::V {
+        // SAFETY: the caller's promise; an array is aligned as its values are.
+        unsafe { *p.cast() }
+    }
+    #[inline(always)]
+    unsafe fn write(p: *mut f32, v: Self::V) {
+        // SAFETY: as above.
+        unsafe { *p.cast() = v }
+    }
+    #[inline(always)]
     unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
         std::array::from_fn(|i| a[i] * b[i] + c[i])
+    }
+    #[inline(always)]
+    unsafe fn mul(a: Self::V, b: Self::V) -> Self::V {
+        std::array::from_fn(|i| a[i] * b[i])
+    }
+    #[inline(always)]
+    unsafe fn div(a: Self::V, b: Self::V) -> Self::V {
+        std::array::from_fn(|i| a[i] / b[i])
     }
     #[inline(always)]
     unsafe fn add(a: Self::V, b: Self::V) -> Self::V {
@@ -184,9 +317,10 @@ pub(super) use x86::Avx512;
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use std::arch::x86_64::*;
+    use std::{arch::x86_64::*, ops::Range};
 
-    use super::{Block, Kernel, LANES, Simd};
+    use super::{Block, Kernel, LANES, PAIRS, Simd};
+    use crate::kernels::filter::{EXP, LIMIT, LN_2};
 
     /// # Safety
     /// The processor has AVX2 and FMA.
@@ -234,9 +368,32 @@ mod x86 {
             }
         }
         #[inline(always)]
+        unsafe fn read(p: *const f32) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) }
+        }
+        #[inline(always)]
+        unsafe fn write(p: *mut f32, v: Self::V) {
+            // SAFETY: the caller's promise.
+            unsafe {
+                _mm256_storeu_ps(p, v.0);
+                _mm256_storeu_ps(p.add(8), v.1);
+            }
+        }
+        #[inline(always)]
         unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
             // SAFETY: the caller's promise.
             unsafe { (_mm256_fmadd_ps(a.0, b.0, c.0), _mm256_fmadd_ps(a.1, b.1, c.1)) }
+        }
+        #[inline(always)]
+        unsafe fn mul(a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { (_mm256_mul_ps(a.0, b.0), _mm256_mul_ps(a.1, b.1)) }
+        }
+        #[inline(always)]
+        unsafe fn div(a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { (_mm256_div_ps(a.0, b.0), _mm256_div_ps(a.1, b.1)) }
         }
         #[inline(always)]
         unsafe fn add(a: Self::V, b: Self::V) -> Self::V {
@@ -275,9 +432,40 @@ mod x86 {
             unsafe { _mm512_store_ps(p.cast(), v) }
         }
         #[inline(always)]
+        unsafe fn read(p: *const f32) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_loadu_ps(p) }
+        }
+        #[inline(always)]
+        unsafe fn write(p: *mut f32, v: Self::V) {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_storeu_ps(p, v) }
+        }
+        #[inline(always)]
+        unsafe fn read_some(p: *const f32, lanes: Range<usize>, other: f32) -> Self::V {
+            let mask = first(lanes.end) & !first(lanes.start);
+            // SAFETY: the caller's promise; lanes that the mask leaves out are not read.
+            unsafe { _mm512_mask_loadu_ps(_mm512_set1_ps(other), mask, p) }
+        }
+        #[inline(always)]
+        unsafe fn write_first(p: *mut f32, count: usize, v: Self::V) {
+            // SAFETY: the caller's promise; lanes that the mask leaves out are not written.
+            unsafe { _mm512_mask_storeu_ps(p, first(count), v) }
+        }
+        #[inline(always)]
         unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
             // SAFETY: the caller's promise.
             unsafe { _mm512_fmadd_ps(a, b, c) }
+        }
+        #[inline(always)]
+        unsafe fn mul(a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_mul_ps(a, b) }
+        }
+        #[inline(always)]
+        unsafe fn div(a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_div_ps(a, b) }
         }
         #[inline(always)]
         unsafe fn add(a: Self::V, b: Self::V) -> Self::V {
@@ -286,8 +474,6 @@ mod x86 {
         }
         #[inline(always)]
         unsafe fn transpose(mut r: [Self::V; LANES]) -> [Self::V; LANES] {
-            const EVEN: i32 = 0x88;
-            const ODD: i32 = 0xdd;
             // SAFETY: the caller's promise. 2x2, then 4x4 inside 128-bit lanes, then the lanes themselves.
             unsafe {
                 let pd = |v| _mm512_castps_pd(v);
@@ -319,9 +505,177 @@ mod x86 {
             r
         }
         #[inline(always)]
+        unsafe fn transpose_pairs(mut r: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
+            // SAFETY: the caller's promise. 2x2 inside 128-bit lanes, then the lanes themselves.
+            unsafe {
+                let mut t = r;
+                for i in 0..4 {
+                    let (a, b) = (_mm512_castps_pd(r[2 * i]), _mm512_castps_pd(r[2 * i + 1]));
+                    t[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, b));
+                    t[4 + i] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, b));
+                }
+                for i in 0..4 {
+                    r[i] = _mm512_shuffle_f32x4::<EVEN>(t[2 * i], t[2 * i + 1]);
+                    r[4 + i] = _mm512_shuffle_f32x4::<ODD>(t[2 * i], t[2 * i + 1]);
+                }
+                for odd in 0..2 {
+                    let [a, b, c, d] = [r[2 * odd], r[2 * odd + 1], r[2 * odd + 4], r[2 * odd + 5]];
+                    t[odd] = _mm512_shuffle_f32x4::<EVEN>(a, b);
+                    t[odd + 2] = _mm512_shuffle_f32x4::<EVEN>(c, d);
+                    t[odd + 4] = _mm512_shuffle_f32x4::<ODD>(a, b);
+                    t[odd + 6] = _mm512_shuffle_f32x4::<ODD>(c, d);
+                }
+                t
+            }
+        }
+        #[inline(always)]
+        unsafe fn double(p: *const f32) -> [Self::V; 2] {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let line = _mm512_loadu_ps(p);
+                let own = _mm512_setr_epi32(1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7, 8, 8);
+                let near = _mm512_setr_epi32(0, 2, 1, 3, 2, 4, 3, 5, 4, 6, 5, 7, 6, 8, 7, 9);
+                [_mm512_permutexvar_ps(own, line), _mm512_permutexvar_ps(near, line)]
+            }
+        }
+        #[inline(always)]
+        unsafe fn exp(x: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let limit = _mm512_set1_ps(LIMIT);
+                let x = _mm512_max_ps(x, _mm512_sub_ps(_mm512_setzero_ps(), limit));
+                let x = _mm512_min_ps(x, limit);
+                let log2_e = _mm512_set1_ps(std::f32::consts::LOG2_E);
+                let n = _mm512_roundscale_ps::<0>(_mm512_mul_ps(x, log2_e));
+                let r = _mm512_fnmadd_ps(n, _mm512_set1_ps(LN_2[0]), x);
+                let r = _mm512_fnmadd_ps(n, _mm512_set1_ps(LN_2[1]), r);
+                let mut p = _mm512_set1_ps(EXP[0]);
+                for c in &EXP[1..] {
+                    p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(*c));
+                }
+                let p = _mm512_fmadd_ps(_mm512_mul_ps(p, r), r, r);
+                _mm512_scalef_ps(_mm512_add_ps(p, _mm512_set1_ps(1.0)), n)
+            }
+        }
+        #[inline(always)]
         unsafe fn max(a: Self::V, b: Self::V) -> Self::V {
             // SAFETY: the caller's promise.
             unsafe { _mm512_max_ps(a, b) }
+        }
+        #[inline(always)]
+        unsafe fn bytes(v: Self::V) -> [u8; LANES] {
+            // SAFETY: the caller's promise; both are 16 bytes.
+            unsafe { std::mem::transmute(_mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(v))) }
+        }
+    }
+
+    /// A mask of the first `count` lanes.
+    #[inline(always)]
+    const fn first(count: usize) -> __mmask16 {
+        ((1u32 << count) - 1) as __mmask16
+    }
+
+    /// What [`_mm512_shuffle_f32x4`] takes of each of two vectors: its first and third 128 bits, or the others.
+    const EVEN: i32 = 0x88;
+    const ODD: i32 = 0xdd;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What [`Simd`]'s functions make of 24 values.
+    struct Everything<'a> {
+        values: &'a [f32; LANES + PAIRS],
+        results: &'a mut Vec<Vec<f32>>,
+    }
+
+    impl Kernel for Everything<'_> {
+        #[inline(always)]
+        unsafe fn run<S: Simd>(self) {
+            let p = self.values.as_ptr();
+            let mut put = |v: S::V| {
+                let mut out = vec![0.0; LANES];
+                // SAFETY: there are as many values; vectors are the tier's.
+                unsafe { S::write(out.as_mut_ptr(), v) };
+                self.results.push(out);
+            };
+            // SAFETY: vectors are the tier's; values 0 to 23 are read.
+            unsafe {
+                let (a, b) = (S::read(p), S::read(p.add(PAIRS)));
+                put(S::fma(a, b, S::splat(0.5)));
+                put(S::mul(a, b));
+                put(S::div(a, b));
+                put(S::add(a, b));
+                put(S::max(a, b));
+                put(S::exp(a));
+                for (first, end) in [(0, 0), (0, LANES), (3, 11), (LANES, LANES)] {
+                    put(S::read_some(p, first..end, -7.0));
+                    let mut out = vec![9.0; LANES];
+                    S::write_first(out.as_mut_ptr(), end, a);
+                    put(S::read(out.as_ptr()));
+                }
+                put(S::read_some(p.wrapping_sub(5), 5..7, -7.0));
+                S::double(p).into_iter().for_each(&mut put);
+                let rows: [S::V; LANES] = std::array::from_fn(|i| S::add(a, S::splat(i as f32)));
+                S::transpose(rows).into_iter().for_each(&mut put);
+                let rows: [S::V; PAIRS] = std::array::from_fn(|i| rows[i]);
+                S::transpose_pairs(rows).into_iter().for_each(&mut put);
+                let bytes = S::bytes(S::mul(S::max(a, S::splat(0.0)), S::splat(100.0)));
+                self.results.push(bytes.map(f32::from).to_vec());
+            }
+        }
+    }
+
+    #[test]
+    fn every_tier_does_what_plain_arrays_do() {
+        let values: [f32; LANES + PAIRS] = std::array::from_fn(|i| ((i * 7919) as f32).sin() * 3.0);
+        let of = |tier: Tier| {
+            let mut results = Vec::new();
+            tier.run(Everything { values: &values, results: &mut results });
+            results
+        };
+        let want = of(Tier::PORTABLE);
+        for tier in Tier::available() {
+            for (i, (got, want)) in of(tier).iter().zip(&want).enumerate() {
+                let near = |(a, b): (&f32, &f32)| (a - b).abs() <= 4e-7 * b.abs();
+                assert!(got.iter().zip(want).all(near), "{tier:?}, result {i}: {got:?} for {want:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn pairs_change_places_and_lines_double() {
+        struct Moves<'a>(&'a mut [Vec<f32>; 4]);
+        impl Kernel for Moves<'_> {
+            #[inline(always)]
+            unsafe fn run<S: Simd>(self) {
+                let line: [f32; LANES] = std::array::from_fn(|i| i as f32);
+                // SAFETY: vectors are the tier's, sixteen values are read and written.
+                unsafe {
+                    let row = S::read(line.as_ptr());
+                    let rows = std::array::from_fn(|i| S::add(row, S::splat(100.0 * i as f32)));
+                    let [own, near] = S::double(line.as_ptr());
+                    let pairs = S::transpose_pairs(rows);
+                    for (out, v) in self.0.iter_mut().zip([own, near, pairs[0], pairs[5]]) {
+                        out.resize(LANES, 0.0);
+                        S::write(out.as_mut_ptr(), v);
+                    }
+                }
+            }
+        }
+        for tier in Tier::available() {
+            let mut moved: [Vec<f32>; 4] = Default::default();
+            tier.run(Moves(&mut moved));
+            let want: [fn(usize) -> usize; 4] = [
+                |i| i / 2 + 1,
+                |i| i / 2 + 2 * (i % 2),
+                |i| 100 * (i / 2) + i % 2,
+                |i| 100 * (i / 2) + 10 + i % 2,
+            ];
+            for (moved, want) in moved.iter().zip(want) {
+                assert_eq!(*moved, (0..LANES).map(|i| want(i) as f32).collect::<Vec<_>>(), "{tier:?}");
+            }
         }
     }
 }

@@ -269,7 +269,7 @@ impl Demc {
         let batch: Batch = [3, PAPER_FEATURES]
             .map(|c| {
                 let shape = crate::kernels::Shape::new(1, c, height, width);
-                (shape, vec![0.0; c * width * height])
+                (shape, vec![0.0; c * width * height].into())
             })
             .into();
         let encoded = self.encode::<NoneTape>(&batch, &mut Stats::Running);

@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, duplicate};
 use crate::{
     Result,
     features::{
@@ -75,8 +75,8 @@ impl Stream {
     /// The image (N, 3, H, W), filtered by the kernels that the network reads from `input`.
     fn filter<T: Tape<f32, Cpu> + Merge<T>>(
         &self,
-        image: &(Shape, Vec<f32>),
-        input: &(Shape, Vec<f32>),
+        image: &Stacked,
+        input: &Stacked,
     ) -> Field<T> {
         let shape = Shape { pad: TAPS / 2, ..input.0 };
         let mut x = Activation::<T>::input(shape, &input.1);
@@ -88,7 +88,7 @@ impl Stream {
     }
 }
 
-fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &(Shape, Vec<f32>)) -> Field<T> {
+fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &Stacked) -> Field<T> {
     Field::input((shape.n, shape.c, shape.h, shape.w), values)
 }
 

@@ -75,12 +75,12 @@ impl Lbf {
         let output = self.output.forward(vec![Activation::from_images(hidden)]).into_images();
         let precision = ln(exp(clamp(output, -SOFTPLUS_LIMIT, SOFTPLUS_LIMIT)) + 1.0);
         let shape = (scales.0.n, PRECISIONS, scales.0.h, scales.0.w);
-        let scales: Images = Cpu::default().tensor_from_vec(scales.1.clone(), shape);
+        let scales: Images = Cpu::default().tensor_from_vec(scales.1.to_vec(), shape);
         let guides = Guides {
             radius: RADIUS,
-            image: image.1.clone(),
-            noise: noise.1.clone(),
-            features: features.1.clone(),
+            image: image.1.to_vec(),
+            noise: noise.1.to_vec(),
+            features: features.1.to_vec(),
             groups: LBF_GROUPS.to_vec(),
         };
         cross_bilateral(guides, precision * scales) // (N, 6, H, W) -> (N, 3, H, W)

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     Result,
     features::Inputs,
-    kernels::Shape,
+    kernels::{Shape, memory::PlaneBuffer},
     nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -65,8 +65,11 @@ pub enum Architecture {
     Lbf,
 }
 
-/// Inputs of several samples of one size: each network input as one (N, C, H, W) array.
-pub type Batch = Vec<(Shape, Vec<f32>)>;
+/// A network input of several samples, (N, C, H, W).
+pub type Stacked = (Shape, PlaneBuffer);
+
+/// Inputs of several samples of one size.
+pub type Batch = Vec<Stacked>;
 
 /// Stacks samples of one size.
 ///
@@ -83,7 +86,7 @@ pub fn stack(samples: &[Inputs]) -> Batch {
                 assert_eq!((planes.width, planes.height), (first.width, first.height));
                 values.extend_from_slice(&planes.data);
             }
-            (shape, values)
+            (shape, values.into())
         })
         .collect()
 }

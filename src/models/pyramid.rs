@@ -25,7 +25,7 @@ use std::ops::Range;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Batch, Config, Network, Taped, duplicate};
+use super::network::{Batch, Config, Network, Stacked, Taped, duplicate};
 use crate::{
     Result,
     features::{
@@ -274,7 +274,7 @@ impl Pyramid {
         let [irradiance, albedo, radiance_input, guide_input, refined @ ..] = &batch[..] else {
             unreachable!("`inputs` makes four planes and, with a prefilter, two more")
         };
-        let field = |(shape, values): &(crate::kernels::Shape, Vec<f32>)| {
+        let field = |(shape, values): &Stacked| {
             Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values)
         };
         let mut skips = [(radiance_input, 0), (guide_input, 1)]

@@ -105,7 +105,7 @@ impl Arithmetic {
                 conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
                 match format {
                     Some(Format::Int8 { step }) => {
-                        Data::Narrow(Operand::quantize(engine, output.view(), step))
+                        Data::Narrow(Operand::quantize(output.view(), step))
                     }
                     _ => Data::F32(output),
                 }

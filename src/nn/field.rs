@@ -99,7 +99,6 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// # Panics
     /// If the length of `values` is not what `extent` demands.
     pub fn input(extent: Extent, values: &[f32]) -> Self {
-        assert_eq!(values.len(), extent.0 * extent.1 * extent.2 * extent.3);
         let mut data = plane_buffer(values.len());
         data.par_chunks_mut(CHUNK)
             .zip(values.par_chunks(CHUNK))
@@ -107,8 +106,12 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         Self::from_buffer(extent, data)
     }
 
-    /// An input from pooled memory.
-    pub(super) fn from_buffer(extent: Extent, data: PlaneBuffer) -> Self {
+    /// A network input of these values, with an empty tape. No gradient flows into it.
+    ///
+    /// # Panics
+    /// As [`Field::input`].
+    pub fn from_buffer(extent: Extent, data: PlaneBuffer) -> Self {
+        assert_eq!(data.len(), extent.0 * extent.1 * extent.2 * extent.3);
         let values = Values::all(extent, data);
         Self { saved: Saved { values, gradient: None }, tape: T::default() }
     }
@@ -142,6 +145,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// Channels `first..first + channels` of a layer's output as planes, each value at its own pixel for
     /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a 2x2 square.
     /// (N, K, H, W) -> (N, channels / factor^2, factor * H, factor * W)
+    ///
+    /// # Panics
+    /// If there are not as many channels, or they are not whole squares from `first` on.
     pub fn from_activation(activation: Activation<T>, first: usize, channels: usize, factor: usize) -> Self {
         let activation = activation.into_f32();
         let shape = activation.shape();

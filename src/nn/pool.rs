@@ -2,13 +2,13 @@
 
 use std::ops::{Deref, DerefMut};
 
+pub use crate::kernels::memory::{PlaneBuffer, plane_buffer};
 use crate::kernels::{
     Block, Shape, View, ViewMut,
-    memory::{Pool, Pooled},
+    memory::{self, Pool, Pooled},
 };
 
 static BLOCKS: Pool<Block> = Pool::new();
-static VALUES: Pool<f32> = Pool::new();
 
 /// The values of a blocked activation.
 #[derive(Debug)]
@@ -65,14 +65,6 @@ impl DerefMut for Buffer {
     }
 }
 
-/// The values of planar images.
-pub type PlaneBuffer = Pooled<f32>;
-
-/// Memory for `len` values of planar images, which are whatever the last user left.
-pub fn plane_buffer(len: usize) -> PlaneBuffer {
-    VALUES.take(len, 0.0)
-}
-
 /// [`plane_buffer`] of zeros.
 pub fn zeros(len: usize) -> PlaneBuffer {
     let mut buffer = plane_buffer(len);
@@ -83,7 +75,7 @@ pub fn zeros(len: usize) -> PlaneBuffer {
 /// Gives all free memory back to the system: for when frames of another size follow.
 pub fn clear() {
     BLOCKS.clear();
-    VALUES.clear();
+    memory::clear();
     crate::kernels::narrow::clear();
     crate::kernels::weight_grad::clear();
 }

@@ -168,9 +168,9 @@ def redivided(logits, image, ratio):
 
 
 def shuffled(x):
-    """Channels 3..15 of 17: each four in a row are the pixels of a 2x2 square."""
+    """Channels 8..20 of 21: each four in a row are the pixels of a 2x2 square."""
     n, _, h, w = x.shape
-    split = x[:, 3:15].reshape(n, 3, 2, 2, h, w)
+    split = x[:, 8:20].reshape(n, 3, 2, 2, h, w)
     return split.transpose(0, 1, 4, 2, 5, 3).reshape(n, 3, 2 * h, 2 * w)
 
 
@@ -184,7 +184,7 @@ def fields():
     for name, h, w in [("blend", 4, 6), ("blend_smallest", 2, 2)]:
         coarse = normal(2, 3, h // 2, w // 2)
         case(name, blended, fine=normal(2, 3, h, w), coarse=coarse, alpha=normal(2, 1, h, w))
-    case("shuffle", shuffled, x=normal(2, 17, 2, 3))
+    case("shuffle", shuffled, x=normal(2, 21, 2, 3))
     case("amplify", amplified, image=normal(2, 3, 5, 7), logits=2 * normal(2, 3, 5, 7))
     fixed = {"image": normal(2, 3, 5, 7), "ratio": normal(2, 3, 5, 7)}
     case("redivide", redivided, fixed, logits=2 * normal(2, 1, 5, 7))

@@ -11,7 +11,7 @@ use super::{CHUNK, Engine, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIG
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
-    layout::Unpacked,
+    layout::{Finish, Unpacked},
     simd::{Kernel, Simd, Tier},
 };
 
@@ -394,7 +394,7 @@ impl Kernel for Band<'_> {
                             &mut sums,
                         );
                         self.store::<S>(
-                            &mut sums,
+                            &sums,
                             (plane, outputs),
                             phase,
                             (position, end.min(position + CHUNK)),
@@ -411,13 +411,13 @@ impl Band<'_> {
     #[inline(always)]
     unsafe fn store<S: Simd>(
         &self,
-        sums: &mut Sums,
+        sums: &Sums,
         (plane, outputs): (usize, usize),
         phase: usize,
         (from, end): (usize, usize),
     ) {
         let (grid, spread) = (self.grid, spread(self.weights.geometry));
-        let Epilogue { relu, accumulate } = self.epilogue;
+        let accumulate = self.epilogue.accumulate;
         let mut position = from;
         while position < end {
             let (y, x) = (position / grid.stride() - grid.pad, position % grid.stride());
@@ -427,68 +427,113 @@ impl Band<'_> {
                 (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
             let (first, column) = (position + skip - from, x + skip - grid.pad);
             let row = y * spread + phase / spread;
-            for o in 0..outputs {
-                // SAFETY: vectors are the tier's.
-                let (scale, bias) = unsafe {
-                    let bias = if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane + o]) };
-                    (S::load(&self.scale[plane + o]), bias)
-                };
-                let finish = |sum: &Block, old: S::V| {
-                    // SAFETY: vectors are the tier's.
-                    unsafe {
-                        let value = S::fma(S::load(sum), scale, old);
-                        if relu { S::max(value, S::splat(0.0)) } else { value }
-                    }
-                };
-                match self.target {
-                    // SAFETY: the pixels lie inside the row, which is this task's.
-                    Target::F32(blocks) => unsafe {
+            // SAFETY: vectors are the tier's.
+            let finish = unsafe { [self.finish::<S>(plane), self.finish::<S>(plane + outputs - 1)] };
+            let sums: [&[Block]; 2] = std::array::from_fn(|o| &sums.0[o][first..first + run]);
+            match self.target {
+                Target::F32(blocks) => {
+                    for o in 0..outputs {
                         let row = self.out.row(self.n, plane + o, row) + phase % spread;
-                        for i in 0..run {
-                            let block = blocks.at(row + (column + i) * spread);
-                            let old = if accumulate { S::load(block) } else { bias };
-                            S::store(block, finish(&sums.0[o][first + i], old));
+                        for (i, sum) in sums[o].iter().enumerate() {
+                            // SAFETY: vectors are the tier's; the pixels lie inside the row, which is this task's.
+                            unsafe {
+                                let block = blocks.at(row + (column + i) * spread);
+                                let add = if accumulate { S::load(block) } else { finish[o].bias };
+                                S::store(block, Scaled { bias: add, ..finish[o] }.of(S::load(sum)));
+                            }
                         }
-                    },
-                    // SAFETY: a sum is a block of its own.
-                    Target::Narrow(..) | Target::Planes(_) => unsafe {
-                        for sum in &mut sums.0[o][first..first + run] {
-                            let value = finish(sum, bias);
-                            S::store(sum, value);
-                        }
-                    },
-                }
-            }
-            if let Target::Planes(planes) = self.target {
-                let mut lanes = [Block::default(); LANES];
-                for o in 0..outputs {
-                    for (i, pixels) in sums.0[o][first..first + run].chunks(LANES).enumerate() {
-                        let at = (row, column + i * LANES);
-                        // SAFETY: vectors are the tier's; the pixels lie inside the row, which is this task's.
-                        unsafe { planes.put::<S>((self.n, plane + o), at, pixels, &mut lanes) }
                     }
                 }
-            }
-            if let Target::Narrow(wides, grid, format) = self.target {
-                let [low, high] = &sums.0;
-                let (low, high) =
-                    (&low[first..first + run], (outputs == 2).then(|| &high[first..first + run]));
-                // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
-                let blocks = format.channels() / LANES;
-                let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;
-                let start = wide * grid.positions() + grid.row(row) + phase % spread;
-                // SAFETY: as above.
-                unsafe {
-                    let at = wides.0.add(start + column * spread);
-                    match format {
-                        Format::Bf16 => self.engine.narrow_spread(low, high, at, spread),
-                        Format::Int8 { .. } => {
-                            self.engine.quantize_spread(low, high, plane % blocks / 2, at, spread);
+                Target::Planes(planes) => {
+                    for o in 0..outputs {
+                        for (i, pixels) in sums[o].chunks(LANES).enumerate() {
+                            let at = (row, column + i * LANES);
+                            // SAFETY: as above.
+                            unsafe { planes.put::<S>((self.n, plane + o), at, pixels, &finish[o]) }
+                        }
+                    }
+                }
+                Target::Narrow(wides, grid, format) => {
+                    // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
+                    let blocks = format.channels() / LANES;
+                    let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;
+                    let start = wide * grid.positions() + grid.row(row) + phase % spread;
+                    // SAFETY: as above.
+                    unsafe {
+                        let at = wides.0.add(start + column * spread);
+                        match format {
+                            Format::Bf16 => self.narrow(&finish[..outputs], sums, at),
+                            Format::Int8 { .. } => {
+                                let at = at.cast::<u8>().add(plane % blocks * LANES);
+                                for i in 0..run {
+                                    let at = at.add(i * spread * size_of::<Wide>()).cast::<[u8; LANES]>();
+                                    at.write(S::bytes(finish[0].of(S::load(&sums[0][i]))));
+                                    // The upper half of a pair of planes is zero where there is none.
+                                    let upper = if outputs == 2 {
+                                        S::bytes(finish[1].of(S::load(&sums[1][i])))
+                                    } else {
+                                        [0; LANES]
+                                    };
+                                    at.add(1).write(upper);
+                                }
+                            }
                         }
                     }
                 }
             }
             position += (skip + run).max(1);
+        }
+    }
+
+    /// How the sums of an output plane become values.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`.
+    #[inline(always)]
+    unsafe fn finish<S: Simd>(&self, plane: usize) -> Scaled<S> {
+        let Epilogue { relu, accumulate } = self.epilogue;
+        // SAFETY: the caller's promise.
+        unsafe {
+            let bias = if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane]) };
+            Scaled { scale: S::load(&self.scale[plane]), bias, relu }
+        }
+    }
+
+    /// Finishes sums and rounds them to bfloat16.
+    ///
+    /// # Safety
+    /// As for [`Engine::narrow_spread`].
+    #[inline(always)]
+    unsafe fn narrow<S: Simd>(&self, finish: &[Scaled<S>], sums: [&[Block]; 2], at: *mut Wide) {
+        let mut values = [[Block::default(); CHUNK]; 2];
+        // SAFETY: the caller's promise.
+        unsafe {
+            for ((values, sums), finish) in values.iter_mut().zip(sums).zip(finish) {
+                for (value, sum) in values.iter_mut().zip(sums) {
+                    S::store(value, finish.of(S::load(sum)));
+                }
+            }
+            let [low, high] = values.each_ref().map(|values| &values[..sums[0].len()]);
+            self.engine.narrow_spread(low, (finish.len() == 2).then_some(high), at, spread(self.weights.geometry));
+        }
+    }
+}
+
+/// What makes values of a plane's sums: `relu(sum * scale + bias)`, the ReLU only where asked for.
+#[derive(Clone, Copy)]
+struct Scaled<S: Simd> {
+    scale: S::V,
+    bias: S::V,
+    relu: bool,
+}
+
+impl<S: Simd> Finish<S> for Scaled<S> {
+    #[inline(always)]
+    unsafe fn of(&self, sum: S::V) -> S::V {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let value = S::fma(sum, self.scale, self.bias);
+            if self.relu { S::max(value, S::splat(0.0)) } else { value }
         }
     }
 }

@@ -4,7 +4,7 @@ use std::{fmt, sync::OnceLock};
 
 use half::bf16;
 
-use super::{ACTIVATION_STEPS, Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide};
+use super::{Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide};
 
 /// A way to multiply narrow matrices that this processor has.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -183,31 +183,6 @@ impl Engine {
         }
     }
 
-    /// Rounds 32 channels, none negative, the upper 16 of which may be absent, to 8 bits, block by block: they
-    /// become half `half` of every `step`th value from `out` on.
-    ///
-    /// # Safety
-    /// `out` is valid for as many writes.
-    pub(super) unsafe fn quantize_spread(
-        self,
-        low: &[Block],
-        high: Option<&[Block]>,
-        half: usize,
-        out: *mut Wide,
-        step: usize,
-    ) {
-        assert!(high.is_none_or(|high| high.len() == low.len()) && half < 2);
-        // SAFETY: the caller's promise; an engine is only made after its instructions were detected.
-        unsafe {
-            let out = out.cast::<u8>().add(half * WIDE);
-            match self.0 {
-                Unit::Portable => portable::quantize_spread(low, high, out, step),
-                #[cfg(target_arch = "x86_64")]
-                _ => avx512::quantize_spread(low, high, out, step),
-            }
-        }
-    }
-
     /// Rounds pairs of blocks to bfloat16 and interleaves them: channel `c` of block `2i + j` becomes value
     /// `2c + j` of `out[i]`.
     pub(super) fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
@@ -320,17 +295,6 @@ mod portable {
         }
     }
 
-    pub unsafe fn quantize_spread(low: &[Block], high: Option<&[Block]>, out: *mut u8, step: usize) {
-        for (i, low) in low.iter().enumerate() {
-            for l in 0..WIDE {
-                let value = if l < LANES { low.0[l] } else { high.map_or(0.0, |h| h[i].0[l - LANES]) };
-                let value = value.round_ties_even().clamp(0.0, ACTIVATION_STEPS) as u8;
-                // SAFETY: the caller's promise.
-                unsafe { out.add(i * step * size_of::<Wide>() + l).write(value) };
-            }
-        }
-    }
-
     pub fn interleave(pairs: &[[Block; 2]], out: &mut [Wide]) {
         for (pair, out) in pairs.iter().zip(out) {
             for l in 0..LANES {
@@ -358,8 +322,9 @@ mod avx512 {
     use super::{Block, CHUNK, GROUP, LANES, Sums, Term, WORD, Wide, bf16};
     use crate::kernels::simd::{Avx512, Simd};
 
-    /// Positions whose sums stay in registers: 2 planes x 8 of them, beside 2 registers of weights.
-    const TILE: usize = 8;
+    /// Positions whose sums stay in registers, by output planes: 2 x 8 or 1 x 16, beside as many registers of weights.
+    /// Fewer sums would wait for each other.
+    const TILE: [usize; 3] = [0, 16, 8];
 
     /// The products of the pairs or fours of values of a vector, added up for every lane.
     trait Product {
@@ -449,9 +414,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<P, 2>(terms, position, weights, plane, sums);
+                tiles::<P, 2, { TILE[2] }>(terms, position, weights, plane, sums);
             } else {
-                tiles::<P, 1>(terms, position, weights, plane, sums);
+                tiles::<P, 1, { TILE[1] }>(terms, position, weights, plane, sums);
             }
         }
     }
@@ -459,7 +424,7 @@ mod avx512 {
     /// # Safety
     /// As [`Engine::multiply`], and the processor has the instructions of `P`.
     #[inline(always)]
-    unsafe fn tiles<P: Product, const OUT: usize>(
+    unsafe fn tiles<P: Product, const OUT: usize, const TILE: usize>(
         (terms, groups): (&[Term], &[u8]),
         position: usize,
         weights: *const Wide,
@@ -475,7 +440,7 @@ mod avx512 {
                     let mut w = weights.byte_add(term.weights);
                     for _ in 0..groups {
                         for row in 0..GROUP {
-                            add_row::<P, OUT>(
+                            add_row::<P, OUT, TILE>(
                                 &mut acc,
                                 x.add(WORD * row),
                                 size_of::<Wide>(),
@@ -486,7 +451,7 @@ mod avx512 {
                         (x, w) = (x.add(WORD * GROUP), w.add(GROUP));
                     }
                 }
-                store::<P, OUT>(&acc, sums, first);
+                store::<P, OUT, TILE>(&acc, sums, first);
             }
         }
     }
@@ -497,7 +462,7 @@ mod avx512 {
     /// # Safety
     /// All of them can be read; the processor has the instructions of `P`.
     #[inline(always)]
-    unsafe fn add_row<P: Product, const OUT: usize>(
+    unsafe fn add_row<P: Product, const OUT: usize, const TILE: usize>(
         acc: &mut [[__m512; TILE]; OUT],
         x: *const u8,
         stride: usize,
@@ -521,7 +486,7 @@ mod avx512 {
     /// # Safety
     /// The processor has the instructions of `P`.
     #[inline(always)]
-    unsafe fn store<P: Product, const OUT: usize>(
+    unsafe fn store<P: Product, const OUT: usize, const TILE: usize>(
         acc: &[[__m512; TILE]; OUT],
         sums: &mut Sums,
         first: usize,
@@ -546,16 +511,16 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                correlate_tiles::<2>(steps, channels, stride, pairs, plane, sums);
+                correlate_tiles::<2, { TILE[2] }>(steps, channels, stride, pairs, plane, sums);
             } else {
-                correlate_tiles::<1>(steps, channels, stride, pairs, plane, sums);
+                correlate_tiles::<1, { TILE[1] }>(steps, channels, stride, pairs, plane, sums);
             }
         }
     }
 
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     #[inline]
-    unsafe fn correlate_tiles<const OUT: usize>(
+    unsafe fn correlate_tiles<const OUT: usize, const TILE: usize>(
         steps: usize,
         channels: *const bf16,
         stride: usize,
@@ -571,9 +536,9 @@ mod avx512 {
                 });
                 let rows = channels.byte_add(first * stride).cast::<u8>();
                 for pair in 0..steps * CHUNK / 2 {
-                    add_row::<Bf16, OUT>(&mut acc, rows.add(WORD * pair), stride, pairs.add(pair), plane);
+                    add_row::<Bf16, OUT, TILE>(&mut acc, rows.add(WORD * pair), stride, pairs.add(pair), plane);
                 }
-                store::<Bf16, OUT>(&acc, sums, first);
+                store::<Bf16, OUT, TILE>(&acc, sums, first);
             }
         }
     }
@@ -587,24 +552,6 @@ mod avx512 {
                 let high = high.map_or(_mm512_setzero_ps(), |h| _mm512_load_ps(h[i].0.as_ptr()));
                 let both: __m512i = std::mem::transmute(_mm512_cvtne2ps_pbh(high, low));
                 _mm512_store_si512(out.add(i * step).cast(), both);
-            }
-        }
-    }
-
-    #[target_feature(enable = "avx512f")]
-    pub unsafe fn quantize_spread(low: &[Block], high: Option<&[Block]>, out: *mut u8, step: usize) {
-        // Rounds to the nearest; what is too large for a byte becomes its largest value.
-        let bytes = |block: &Block| {
-            // SAFETY: a block is 64 bytes, aligned to as many.
-            _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(unsafe { _mm512_load_ps(block.0.as_ptr()) }))
-        };
-        for (i, low) in low.iter().enumerate() {
-            let high = high.map_or(_mm_setzero_si128(), |h| bytes(&h[i]));
-            // SAFETY: the caller's promise.
-            unsafe {
-                let out = out.add(i * step * size_of::<Wide>());
-                _mm_storeu_si128(out.cast(), bytes(low));
-                _mm_storeu_si128(out.add(LANES).cast(), high);
             }
         }
     }

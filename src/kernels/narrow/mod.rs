@@ -25,6 +25,7 @@ use super::{
     conv::Geometry,
     memory::{Pool, Pooled},
     plane::Plane,
+    simd::{Kernel, Simd, Tier},
 };
 
 /// What activations and weights are rounded to.
@@ -215,24 +216,15 @@ impl Operand {
     }
 
     /// An activation without negative values, a ReLU's output, in 8 bits.
-    pub fn quantize(engine: Engine, source: View, step: f32) -> Self {
+    pub fn quantize(source: View, step: f32) -> Self {
         let shape = source.shape;
         let mut operand = Self::new(shape, Format::Int8 { step });
         let (planes, stride) = (operand.planes(), shape.plane_stride());
         operand.body_mut().par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
-            for half in 0..2 {
-                let plane = 4 * (i % planes) + 2 * half;
-                if plane >= shape.planes() {
-                    continue;
-                }
-                let (low, high) = halves(source, i / planes, plane / 2);
-                let scaled = |block: &Block| Block(block.0.map(|v| v / step));
-                for p in 0..stride {
-                    let (low, high) = ([scaled(&low[p])], high.map(|high| [scaled(&high[p])]));
-                    let high = high.as_ref().map(<[Block; 1]>::as_slice);
-                    // SAFETY: one value is written where there is one.
-                    unsafe { engine.quantize_spread(&low, high, half, &raw mut out[p], 1) };
-                }
+            let (image, first) = (i / planes, i % planes * (2 * WIDE / LANES));
+            for plane in first..shape.planes().min(first + 2 * WIDE / LANES) {
+                let blocks = &source.data[(image * shape.planes() + plane) * stride..][..stride];
+                Tier::detect().run(Quantize { blocks, step, out, lane: (plane - first) * LANES });
             }
         });
         operand
@@ -312,6 +304,25 @@ impl Format {
                 max
             }
             Format::Int8 { .. } => Wide(std::array::from_fn(|i| a.0[i].max(b.0[i]))),
+        }
+    }
+}
+
+/// Sixteen channels of a plane in as many steps, from byte `lane` of each value on.
+struct Quantize<'a> {
+    blocks: &'a [Block],
+    step: f32,
+    out: &'a mut [Wide],
+    lane: usize,
+}
+
+impl Kernel for Quantize<'_> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        for (out, block) in self.out.iter_mut().zip(self.blocks) {
+            // SAFETY: vectors are the tier's.
+            let bytes = unsafe { S::bytes(S::div(S::load(block), S::splat(self.step))) };
+            out.0[self.lane..][..LANES].copy_from_slice(&bytes);
         }
     }
 }

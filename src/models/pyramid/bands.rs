@@ -115,7 +115,7 @@ impl<'a> Feed<'a> {
         let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
         let padded = (self.padded.0, end - before);
         let refined = refined.map(|refined| refined.padded_to(padded));
-        let inputs = guides(&band.padded_to(padded), refined, self.exposure, NEEDED_BY)?;
+        let Inputs { planes, scale } = guides(&band.padded_to(padded), refined, self.exposure, NEEDED_BY)?;
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {
@@ -124,15 +124,14 @@ impl<'a> Feed<'a> {
             if rows == 0 || result.is_err() {
                 return;
             }
-            let mut part = Planes::new(3, width, rows);
-            for (c, plane) in field.values().chunks(h * w).enumerate() {
-                for (into, from) in part.channel_mut(c).chunks_mut(width).zip(plane.chunks(w)) {
-                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * inputs.scale);
-                }
-            }
+            let values = field.values();
+            let part = Planes::from_rows(3, (width, rows), |c, y, into| {
+                let from = &values[(c * h + y) * w..];
+                into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
+            });
             result = done(first, part);
         };
-        self.frame.push(&inputs);
+        self.frame.push(planes);
         self.frame.advance(&mut hand_out);
         while self.frame.is_whole() && !self.frame.is_done() {
             self.frame.advance(&mut hand_out);
@@ -228,15 +227,15 @@ impl<'a> Frame<'a> {
     }
 
     /// Adds the inputs of the next rows.
-    fn push(&mut self, inputs: &Inputs) {
-        let [irradiance, albedo, radiance, guide, refined @ ..] = &inputs.planes[..] else {
-            unreachable!("`inputs` makes four planes and, with a prefilter, two more")
-        };
-        let field = |p: &Planes| Field::input((1, p.channels, p.height, p.width), &p.data);
-        if let [ratio, shading] = refined {
+    fn push(&mut self, inputs: Vec<Planes>) {
+        let mut inputs = inputs.into_iter();
+        let mut next = || inputs.next().expect("`guides` makes four planes and, with a prefilter, two more");
+        let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
+        let [irradiance, albedo, radiance, guide] = std::array::from_fn(|_| next());
+        if self.network.prefilter.is_some() {
             self.quotient.push(field(irradiance));
-            self.ratio.push(field(ratio));
-            self.shading.push(field(shading));
+            self.ratio.push(field(next()));
+            self.shading.push(field(next()));
         } else {
             self.scales[0].image.push(field(irradiance));
         }
