@@ -251,15 +251,76 @@ impl Kernel for Pack<'_> {
                     continue;
                 }
                 for (row, x) in row.chunks_mut(PAIRS).zip((0..).step_by(PAIRS)) {
-                    let mut pairs =
+                    let held =
                         if keep { S::transpose_pairs(load::<S, PAIRS>(row, &Unchanged)) } else { [zero; PAIRS] };
-                    for pair in lanes.start / 2..lanes.end / 2 {
-                        let from = &input[map.value(n, plane, 2 * pair, y, x)..][..2 * row.len()];
-                        pairs[pair] = S::read_some(from.as_ptr(), 0..2 * row.len(), 0.0);
-                    }
-                    store::<S, PAIRS>(S::transpose_pairs(pairs), row);
+                    map.gather::<S>(input, (n, plane), (y, x), held, row);
                 }
             }
+        }
+    }
+}
+
+impl Map {
+    /// Fills up to 8 blocks, those from column `x` of the activation's row `y` on: what the planes hold of the channels, and the
+    /// other pairs of channels as they are `held`.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`.
+    #[inline(always)]
+    unsafe fn gather<S: Simd>(
+        self,
+        input: &[f32],
+        (n, plane): (usize, usize),
+        (y, x): (usize, usize),
+        mut held: [S::V; PAIRS],
+        blocks: &mut [Block],
+    ) {
+        let (lanes, count) = (self.lanes(plane), 2 * blocks.len());
+        // SAFETY: the caller's promise; as many values are read as there are.
+        unsafe {
+            for pair in lanes.start / 2..lanes.end / 2 {
+                let from = &input[self.value(n, plane, 2 * pair, y, x)..][..count];
+                held[pair] = if count == LANES {
+                    S::read(from.as_ptr())
+                } else {
+                    S::read_some(from.as_ptr(), 0..count, 0.0)
+                };
+            }
+            store::<S, PAIRS>(S::transpose_pairs(held), blocks);
+        }
+    }
+}
+
+/// Row `y` of image `n` of an activation whose channels are the pixels of 2x2 squares of planes, as [`to_blocked`] makes
+/// it: 16 pixels at a time, each as up to two blocked planes from `plane` on. `put` takes the pixels' first column and their
+/// blocks; there is no second plane where it has no channels.
+pub(super) struct HalvedRow<'a, F> {
+    pub shape: Shape,
+    pub values: &'a [f32],
+    pub at: (usize, usize, usize),
+    pub put: F,
+}
+
+impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
+    #[inline(always)]
+    unsafe fn run<S: Simd>(mut self) {
+        let (n, plane, y) = self.at;
+        let map = Map::new(self.shape, 0, 2, self.values.len());
+        let planes = map.blocks().len();
+        let mut blocks = [[Block::default(); LANES]; 2];
+        for x in (0..self.shape.w).step_by(LANES) {
+            let count = LANES.min(self.shape.w - x);
+            for (plane, blocks) in (plane..planes).zip(&mut blocks) {
+                for (part, x) in blocks[..count].chunks_mut(PAIRS).zip((x..).step_by(PAIRS)) {
+                    // SAFETY: vectors are the tier's.
+                    unsafe {
+                        let held = [S::splat(0.0); PAIRS];
+                        map.gather::<S>(self.values, (n, plane), (y, x), held, part);
+                    }
+                }
+            }
+            let [low, high] = blocks.each_ref().map(|blocks| &blocks[..count]);
+            (self.put)(x, low, (plane + 1 < planes).then_some(high));
         }
     }
 }

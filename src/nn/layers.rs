@@ -99,6 +99,20 @@ impl Conv {
         self
     }
 
+    /// [`Activation::input_halved`] for this layer alone, frozen or not: already rounded if it would do so first.
+    ///
+    /// # Panics
+    /// As that.
+    pub fn input_halved(&self, planes: Shape, values: &[f32]) -> Activation<NoneTape> {
+        match self.frozen.as_deref() {
+            Some(Packed::Narrow(_)) => {
+                let data = Data::Narrow(narrow::Operand::halved(narrow::Engine::detect(), planes, values));
+                Activation { saved: Saved { data: Arc::new(data), gradient: None }, tape: NoneTape }
+            }
+            _ => Activation::input_halved(planes, values),
+        }
+    }
+
     /// Takes over the weights of a narrower layer of the same kind so that it computes the same, and every channel
     /// counts: further channels copy the old ones in turn, and what reads a channel and its copies divides its weight
     /// among them, at random (after Chen et al. 2016, Net2Net, where shares are equal). Their gradients then differ from

@@ -23,6 +23,7 @@ use rayon::prelude::*;
 use super::{
     Block, LANES, Shape, View, ViewMut,
     conv::Geometry,
+    layout::HalvedRow,
     memory::{Pool, Pooled},
     plane::Plane,
     simd::{Kernel, Simd, Tier},
@@ -211,6 +212,30 @@ impl Operand {
                     engine.narrow(&low[range.clone()], high.map(|h| &h[range.clone()]), out);
                 });
             }
+        });
+        operand
+    }
+
+    /// Planes rounded to bfloat16, whose pixels in 2x2 squares become channels of one pixel (space to depth):
+    /// (N, C, H, W) -> (N, 4C, H/2, W/2)
+    ///
+    /// # Panics
+    /// If rows or columns are odd, or there are not as many values as `planes` demands.
+    pub fn halved(engine: Engine, planes: Shape, values: &[f32]) -> Self {
+        assert!(planes.h.is_multiple_of(2) && planes.w.is_multiple_of(2), "only even sizes halve");
+        let shape = planes.with_channels(4 * planes.c).with_size(planes.h / 2, planes.w / 2);
+        let mut operand = Self::new(shape, Format::Bf16);
+        let (grid, planes) = (operand.grid, operand.planes());
+        let lines = grid.h + 2 * grid.pad;
+        operand.body_mut().par_chunks_mut(grid.stride()).enumerate().for_each(|(i, line)| {
+            let Some(y) = (i % lines).checked_sub(grid.pad).filter(|y| *y < grid.h) else { return };
+            let plane = i / lines;
+            let line = &mut line[grid.pad..][..grid.w];
+            let put = |x: usize, low: &[Block], high: Option<&[Block]>| {
+                engine.narrow(low, high, &mut line[x..][..low.len()]);
+            };
+            let at = (plane / planes, plane % planes * (WIDE / LANES), y);
+            Tier::detect().run(HalvedRow { shape, values, at, put });
         });
         operand
     }

@@ -240,9 +240,10 @@ impl<'a> Frame<'a> {
             self.scales[0].image.push(field(irradiance));
         }
         self.albedo.push(field(albedo));
-        for (encoder, planes) in self.encoders.iter_mut().zip([radiance, guide]) {
+        let layers = self.network.encoders.iter().map(|encoder| &encoder.levels[0][0]);
+        for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip([radiance, guide]) {
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
-            encoder[0].input.push(Maps::input_halved(shape, &planes.data));
+            encoder[0].input.push(layer.input_halved(shape, &planes.data));
         }
     }
 
