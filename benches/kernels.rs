@@ -80,7 +80,7 @@ fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Fo
             Weights::pack(&weights, &[i], o, geometry, Direction::Forward, 0),
         ),
         Format::Int8 { step } => (
-            Operand::quantize(engine, View::new(shape, &x), step),
+            Operand::quantize(View::new(shape, &x), step),
             Weights::quantize(&weights, &[(i, step)], o, geometry),
         ),
     };

@@ -241,7 +241,11 @@ impl Kernel for Pack<'_> {
                 let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y)), s.w);
                 if map.factor == 1 {
                     for (row, x) in row.chunks_mut(LANES).zip((0..).step_by(LANES)) {
-                        let mut channels = if keep { S::transpose(load::<S, LANES>(row, &Unchanged)) } else { [zero; LANES] };
+                        let mut channels = if keep {
+                            S::transpose(load::<S, LANES>(row, &Unchanged))
+                        } else {
+                            [zero; LANES]
+                        };
                         for lane in lanes.clone() {
                             let from = &input[map.value(n, plane, lane, y, x)..][..row.len()];
                             channels[lane] = S::read_some(from.as_ptr(), 0..row.len(), 0.0);
@@ -251,8 +255,11 @@ impl Kernel for Pack<'_> {
                     continue;
                 }
                 for (row, x) in row.chunks_mut(PAIRS).zip((0..).step_by(PAIRS)) {
-                    let held =
-                        if keep { S::transpose_pairs(load::<S, PAIRS>(row, &Unchanged)) } else { [zero; PAIRS] };
+                    let held = if keep {
+                        S::transpose_pairs(load::<S, PAIRS>(row, &Unchanged))
+                    } else {
+                        [zero; PAIRS]
+                    };
                     map.gather::<S>(input, (n, plane), (y, x), held, row);
                 }
             }

@@ -73,11 +73,7 @@ impl Stream {
     }
 
     /// The image (N, 3, H, W), filtered by the kernels that the network reads from `input`.
-    fn filter<T: Tape<f32, Cpu> + Merge<T>>(
-        &self,
-        image: &Stacked,
-        input: &Stacked,
-    ) -> Field<T> {
+    fn filter<T: Tape<f32, Cpu> + Merge<T>>(&self, image: &Stacked, input: &Stacked) -> Field<T> {
         let shape = Shape { pad: TAPS / 2, ..input.0 };
         let mut x = Activation::<T>::input(shape, &input.1);
         for layer in &self.layers {

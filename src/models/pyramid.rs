@@ -274,9 +274,8 @@ impl Pyramid {
         let [irradiance, albedo, radiance_input, guide_input, refined @ ..] = &batch[..] else {
             unreachable!("`inputs` makes four planes and, with a prefilter, two more")
         };
-        let field = |(shape, values): &Stacked| {
-            Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values)
-        };
+        let field =
+            |(shape, values): &Stacked| Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values);
         let mut skips = [(radiance_input, 0), (guide_input, 1)]
             .map(|(input, e)| self.encoders[e].forward(Activation::<T>::input_halved(input.0, &input.1)));
 

@@ -104,9 +104,7 @@ impl Arithmetic {
                 let (tier, geometry) = (Tier::detect(), self.geometry);
                 conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
                 match format {
-                    Some(Format::Int8 { step }) => {
-                        Data::Narrow(Operand::quantize(output.view(), step))
-                    }
+                    Some(Format::Int8 { step }) => Data::Narrow(Operand::quantize(output.view(), step)),
                     _ => Data::F32(output),
                 }
             }

@@ -514,7 +514,12 @@ impl Band<'_> {
                 }
             }
             let [low, high] = values.each_ref().map(|values| &values[..sums[0].len()]);
-            self.engine.narrow_spread(low, (finish.len() == 2).then_some(high), at, spread(self.weights.geometry));
+            self.engine.narrow_spread(
+                low,
+                (finish.len() == 2).then_some(high),
+                at,
+                spread(self.weights.geometry),
+            );
         }
     }
 }

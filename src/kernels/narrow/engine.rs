@@ -536,7 +536,13 @@ mod avx512 {
                 });
                 let rows = channels.byte_add(first * stride).cast::<u8>();
                 for pair in 0..steps * CHUNK / 2 {
-                    add_row::<Bf16, OUT, TILE>(&mut acc, rows.add(WORD * pair), stride, pairs.add(pair), plane);
+                    add_row::<Bf16, OUT, TILE>(
+                        &mut acc,
+                        rows.add(WORD * pair),
+                        stride,
+                        pairs.add(pair),
+                        plane,
+                    );
                 }
                 store::<Bf16, OUT, TILE>(&acc, sums, first);
             }

@@ -225,14 +225,10 @@ impl Operand {
         assert!(planes.h.is_multiple_of(2) && planes.w.is_multiple_of(2), "only even sizes halve");
         let shape = planes.with_channels(4 * planes.c).with_size(planes.h / 2, planes.w / 2);
         let mut operand = Self::new(shape, Format::Bf16);
-        let (grid, planes) = (operand.grid, operand.planes());
-        let lines = grid.h + 2 * grid.pad;
-        operand.body_mut().par_chunks_mut(grid.stride()).enumerate().for_each(|(i, line)| {
-            let Some(y) = (i % lines).checked_sub(grid.pad).filter(|y| *y < grid.h) else { return };
-            let plane = i / lines;
-            let line = &mut line[grid.pad..][..grid.w];
+        let planes = operand.planes();
+        operand.each_row(|plane, y, row| {
             let put = |x: usize, low: &[Block], high: Option<&[Block]>| {
-                engine.narrow(low, high, &mut line[x..][..low.len()]);
+                engine.narrow(low, high, &mut row[x..][..low.len()]);
             };
             let at = (plane / planes, plane % planes * (WIDE / LANES), y);
             Tier::detect().run(HalvedRow { shape, values, at, put });
@@ -299,6 +295,18 @@ impl Operand {
         &mut self.data[..len]
     }
 
+    /// Runs `fill(plane, row's number, pixels of the row)` on the rows of all planes of all images.
+    fn each_row(&mut self, fill: impl Fn(usize, usize, &mut [Wide]) + Sync) {
+        let Plane { h, w, pad } = self.grid.plane;
+        let rows = self.body_mut().par_chunks_mut(w + 2 * pad).enumerate();
+        rows.for_each(|(i, row)| {
+            let (plane, y) = (i / (h + 2 * pad), i % (h + 2 * pad));
+            if (pad..pad + h).contains(&y) {
+                fill(plane, y - pad, &mut row[pad..pad + w]);
+            }
+        });
+    }
+
     /// Its extent.
     pub fn shape(&self) -> Shape {
         self.shape
@@ -317,6 +325,7 @@ impl Operand {
 
 impl Format {
     /// The larger of each two values, none negative.
+    #[inline]
     fn max(self, a: &Wide, b: &Wide) -> Wide {
         match self {
             // The bits of non-negative values are ordered as the values are.
@@ -363,16 +372,14 @@ pub fn max_pool(input: &Operand) -> Operand {
     let s = input.shape;
     assert!(s.h.is_multiple_of(2) && s.w.is_multiple_of(2), "only even sizes halve");
     let mut output = Operand::new(s.with_size(s.h / 2, s.w / 2), input.format);
-    let (from, to, format) = (input.grid, output.grid, input.format);
-    output.body_mut().par_chunks_mut(to.positions()).enumerate().for_each(|(i, out)| {
-        let plane = &input.data[i * from.positions()..][..from.positions()];
-        for y in 0..to.h {
-            let top = &plane[from.row(2 * y)..][..from.w];
-            let bottom = &plane[from.row(2 * y + 1)..][..from.w];
-            let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
-            for (out, (top, bottom)) in out[to.row(y)..].iter_mut().zip(squares) {
-                *out = format.max(&format.max(&top[0], &top[1]), &format.max(&bottom[0], &bottom[1]));
-            }
+    let (from, format) = (input.grid, input.format);
+    output.each_row(|plane, y, row| {
+        let plane = &input.data[plane * from.positions()..][..from.positions()];
+        let top = &plane[from.row(2 * y)..][..from.w];
+        let bottom = &plane[from.row(2 * y + 1)..][..from.w];
+        let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+        for (out, (top, bottom)) in row.iter_mut().zip(squares) {
+            *out = format.max(&format.max(&top[0], &top[1]), &format.max(&bottom[0], &bottom[1]));
         }
     });
     output
