@@ -1,6 +1,6 @@
 //! Activations in the blocked layout, with a dfdx tape and a place for their gradient.
 
-use std::{cell::RefCell, rc::Rc, sync::Arc};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 
@@ -11,8 +11,36 @@ use crate::kernels::{
     narrow::Operand,
 };
 
-/// The gradient of one activation while the tape runs backward; `None` until something flows in.
-pub(super) type Gradient = Rc<RefCell<Option<Buffer>>>;
+/// The gradient of one activation or field while the tape runs backward; `None` until something flows in. Nobody waits for the
+/// lock: it lets what has no tape go to another thread.
+#[derive(Debug)]
+pub(super) struct Gradient<B>(Arc<Mutex<Option<B>>>);
+
+impl<B> Clone for Gradient<B> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<B> Default for Gradient<B> {
+    fn default() -> Self {
+        Self(Arc::default())
+    }
+}
+
+impl<B> Gradient<B> {
+    /// What has flowed in, if anything.
+    pub fn take(&self) -> Option<B> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    /// Lets `write` add to it, or to what `fresh` makes, and tells it which.
+    pub fn accumulate(&self, fresh: impl FnOnce() -> B, write: impl FnOnce(&mut B, bool)) {
+        let mut slot = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_fresh = slot.is_none();
+        write(slot.get_or_insert_with(fresh), is_fresh);
+    }
+}
 
 /// The values of an activation. On a tape they are always f32; without one, layers that compute in
 /// narrower formats leave them so.
@@ -48,7 +76,7 @@ impl Data {
 pub(super) struct Saved {
     pub data: Arc<Data>,
     /// `None` for network inputs, whose gradient nobody asks for.
-    pub gradient: Option<Gradient>,
+    pub gradient: Option<Gradient<Buffer>>,
 }
 
 /// The output of a layer: shared values in the kernels' blocked layout and the tape that made them.
@@ -91,7 +119,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         let shape = Shape::new(n, c, h, w);
         let mut data = Buffer::new(shape);
         to_blocked(&images.as_vec(), 1, data.view_mut());
-        let gradient = Gradient::default();
+        let gradient = Gradient::<Buffer>::default();
         if T::OWNS_TAPE {
             let gradient = gradient.clone();
             tape.add_backward_op(move |gradients| {
@@ -173,15 +201,13 @@ impl Saved {
     /// Hands the gradient buffer to `write`, saying whether it is fresh (arbitrary interior) or holds
     /// a sum to add to. Does nothing for an input without gradient.
     pub fn accumulate(&self, write: impl FnOnce(&mut Buffer, bool)) {
-        if let Some(slot) = &self.gradient {
-            let mut slot = slot.borrow_mut();
-            let fresh = slot.is_none();
-            write(slot.get_or_insert_with(|| Buffer::new(self.data.shape())), fresh);
+        if let Some(gradient) = &self.gradient {
+            gradient.accumulate(|| Buffer::new(self.data.shape()), write);
         }
     }
 
     /// Takes the gradient that has flowed in, if any.
     pub fn take_gradient(&self) -> Option<Buffer> {
-        self.gradient.as_ref().and_then(|g| g.take())
+        self.gradient.as_ref().and_then(Gradient::take)
     }
 }

@@ -1,12 +1,13 @@
 //! Planar images on the tape: where predicted kernels meet the radiance they filter.
 
-use std::{cell::RefCell, rc::Rc, sync::Arc};
+use std::sync::Arc;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, PutTape, Tape, TensorFromVec};
 use rayon::prelude::*;
 
 use super::{
     Activation, Images,
+    activation::Gradient,
     pool::{PlaneBuffer, plane_buffer, zeros},
 };
 use crate::kernels::{
@@ -57,21 +58,20 @@ impl Values {
 struct Saved {
     values: Values,
     /// `None` for inputs, whose gradient nobody asks for.
-    gradient: Option<Rc<RefCell<Option<PlaneBuffer>>>>,
+    gradient: Option<Gradient<PlaneBuffer>>,
 }
 
 impl Saved {
     /// The gradient that has flowed in, if any.
     fn take(&self) -> Option<PlaneBuffer> {
-        self.gradient.as_ref().and_then(|g| g.take())
+        self.gradient.as_ref().and_then(Gradient::take)
     }
 
     /// Lets `add` add to the gradient, zeros at first; hands it nothing for an input.
     fn accumulate(&self, add: impl FnOnce(Option<&mut [f32]>)) {
         match &self.gradient {
-            Some(slot) => {
-                let mut slot = slot.borrow_mut();
-                add(Some(slot.get_or_insert_with(|| zeros(self.values.as_slice().len()))));
+            Some(gradient) => {
+                gradient.accumulate(|| zeros(self.values.as_slice().len()), |sum, _| add(Some(sum)));
             }
             None => add(None),
         }
@@ -128,7 +128,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     }
 
     fn output(extent: Extent, data: PlaneBuffer, tape: T) -> (Self, Saved) {
-        let saved = Saved { values: Values::all(extent, data), gradient: Some(Rc::default()) };
+        let saved = Saved { values: Values::all(extent, data), gradient: Some(Gradient::default()) };
         (Self { saved: saved.clone(), tape }, saved)
     }
 

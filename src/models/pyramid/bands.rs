@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
@@ -270,22 +270,11 @@ impl<'a> Frame<'a> {
         self.forget();
     }
 
+    /// Both encoders side by side: their layers need not wait for each other.
     fn encode(&mut self) {
-        for (encoder, levels) in self.network.encoders.iter().zip(&mut self.encoders) {
-            for (level, [first, second]) in encoder.levels.iter().enumerate() {
-                let (above, rest) = levels.split_at_mut(level);
-                let Encoded { input, middle, output } = &mut rest[0];
-                if let Some(above) = above.last() {
-                    let (from, to) = (input.end(), above.output.end() / 2);
-                    if from < to {
-                        input.push(MaxPool.forward(above.output.rows(2 * from..2 * to)));
-                    }
-                }
-                let most = self.band >> (level + 1);
-                convolve(first, input, middle, most);
-                convolve(second, middle, output, most);
-            }
-        }
+        let ([radiance, guide], band) = (&mut self.encoders, self.band);
+        let [of_radiance, of_guide] = &self.network.encoders;
+        rayon::join(|| encode(of_radiance, radiance, band), || encode(of_guide, guide, band));
     }
 
     fn decode(&mut self) {
@@ -432,6 +421,23 @@ impl Scale {
         self.confidence.push(Field::input(confidence.extent(), confidence.values()));
         self.masks.push_back((rows.clone(), mask, corners));
         self.kernels.push_back((rows, kernel));
+    }
+}
+
+/// Takes the levels of an encoder as far as they can go, by at most `band` rows of the frame.
+fn encode(encoder: &Encoder, levels: &mut [Encoded], band: usize) {
+    for (level, [first, second]) in encoder.levels.iter().enumerate() {
+        let (above, rest) = levels.split_at_mut(level);
+        let Encoded { input, middle, output } = &mut rest[0];
+        if let Some(above) = above.last() {
+            let (from, to) = (input.end(), above.output.end() / 2);
+            if from < to {
+                input.push(MaxPool.forward(above.output.rows(2 * from..2 * to)));
+            }
+        }
+        let most = band >> (level + 1);
+        convolve(first, input, middle, most);
+        convolve(second, middle, output, most);
     }
 }
 
