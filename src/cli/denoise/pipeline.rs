@@ -132,7 +132,9 @@ fn denoise_all(
 ) {
     for (index, loaded) in frames {
         let input = &batch.jobs[index].input;
-        let denoised = attempt(input, || frame_job::denoise(loaded, &*batch.model, &batch.options));
+        // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up first.
+        let denoise = || frame_job::denoise(loaded, &*batch.model, &batch.options);
+        let denoised = attempt(input, || rayon::scope(|_| denoise()));
         if !pass_on(index, denoised, next, events) {
             return;
         }
