@@ -150,27 +150,69 @@ impl Unpacked {
         blocks: &[Block],
         finish: &impl Finish<S>,
     ) {
-        let Self { map, values } = self;
-        let lanes = map.lanes(plane);
         // SAFETY: the caller's promise.
         unsafe {
-            if map.factor == 1 {
-                let channels = S::transpose(load::<S, LANES>(blocks, finish));
-                for lane in lanes {
-                    let out = values.add(map.value(n, plane, lane, y, x));
-                    write::<S>(out, blocks.len(), channels[lane]);
-                }
-                return;
+            match self.map.factor {
+                1 => self.put_groups::<S, LANES>((n, plane), (y, x), blocks, finish),
+                _ => self.put_groups::<S, PAIRS>((n, plane), (y, x), blocks, finish),
             }
-            // Two channels are neighbours in a row of their plane.
-            for (blocks, x) in blocks.chunks(PAIRS).zip((x..).step_by(PAIRS)) {
-                let pairs = S::transpose_pairs(load::<S, PAIRS>(blocks, finish));
-                for pair in lanes.start / 2..lanes.end / 2 {
-                    let out = values.add(map.value(n, plane, 2 * pair, y, x));
-                    write::<S>(out, 2 * blocks.len(), pairs[pair]);
+        }
+    }
+
+    /// [`Unpacked::put`], where each of the `N` groups of channels of a blocked plane is a run of values in its row.
+    ///
+    /// # Safety
+    /// As that.
+    #[inline(always)]
+    unsafe fn put_groups<S: Simd, const N: usize>(
+        self,
+        (n, plane): (usize, usize),
+        (y, x): (usize, usize),
+        blocks: &[Block],
+        finish: &impl Finish<S>,
+    ) where
+        Channels: Groups<S, N>,
+    {
+        let Self { map, values } = self;
+        let lanes = map.lanes(plane);
+        for (blocks, x) in blocks.chunks(N).zip((x..).step_by(N)) {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let groups = Channels::transpose(load::<S, N>(blocks, finish));
+                for group in lanes.start / map.factor..lanes.end / map.factor {
+                    let out = values.add(map.value(n, plane, group * map.factor, y, x));
+                    S::write_first(out, blocks.len() * map.factor, groups[group]);
                 }
             }
         }
+    }
+}
+
+/// How vectors of pixels become vectors of `N` groups of neighbouring channels, and back.
+trait Groups<S: Simd, const N: usize> {
+    /// Group `j` of vector `i` becomes group `i` of vector `j`.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`.
+    unsafe fn transpose(vectors: [S::V; N]) -> [S::V; N];
+}
+
+/// The channels of a blocked plane: each for itself where it is a plane, two by two where those are neighbours in a row.
+struct Channels;
+
+impl<S: Simd> Groups<S, LANES> for Channels {
+    #[inline(always)]
+    unsafe fn transpose(vectors: [S::V; LANES]) -> [S::V; LANES] {
+        // SAFETY: the caller's promise.
+        unsafe { S::transpose(vectors) }
+    }
+}
+
+impl<S: Simd> Groups<S, PAIRS> for Channels {
+    #[inline(always)]
+    unsafe fn transpose(vectors: [S::V; PAIRS]) -> [S::V; PAIRS] {
+        // SAFETY: the caller's promise.
+        unsafe { S::transpose_pairs(vectors) }
     }
 }
 
@@ -232,35 +274,13 @@ impl Kernel for Pack<'_> {
     unsafe fn run<S: Simd>(self) {
         let Self { map, input, blocks, n, plane, rows, keep } = self;
         let s = map.shape;
-        let lanes = map.lanes(plane);
-        let keep = keep && lanes.len() < LANES;
-        // SAFETY: vectors are the tier's; the rows' blocks belong to this task.
-        unsafe {
-            let zero = S::splat(0.0);
-            for y in rows {
+        for y in rows {
+            // SAFETY: vectors are the tier's; the row's blocks belong to this task.
+            unsafe {
                 let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y)), s.w);
-                if map.factor == 1 {
-                    for (row, x) in row.chunks_mut(LANES).zip((0..).step_by(LANES)) {
-                        let mut channels = if keep {
-                            S::transpose(load::<S, LANES>(row, &Unchanged))
-                        } else {
-                            [zero; LANES]
-                        };
-                        for lane in lanes.clone() {
-                            let from = &input[map.value(n, plane, lane, y, x)..][..row.len()];
-                            channels[lane] = S::read_some(from.as_ptr(), 0..row.len(), 0.0);
-                        }
-                        store::<S, LANES>(S::transpose(channels), row);
-                    }
-                    continue;
-                }
-                for (row, x) in row.chunks_mut(PAIRS).zip((0..).step_by(PAIRS)) {
-                    let held = if keep {
-                        S::transpose_pairs(load::<S, PAIRS>(row, &Unchanged))
-                    } else {
-                        [zero; PAIRS]
-                    };
-                    map.gather::<S>(input, (n, plane), (y, x), held, row);
+                match map.factor {
+                    1 => map.gather::<S, LANES>(input, (n, plane), (y, 0), keep, row),
+                    _ => map.gather::<S, PAIRS>(input, (n, plane), (y, 0), keep, row),
                 }
             }
         }
@@ -268,32 +288,41 @@ impl Kernel for Pack<'_> {
 }
 
 impl Map {
-    /// Fills up to 8 blocks, those from column `x` of the activation's row `y` on: what the planes hold of the channels, and the
-    /// other pairs of channels as they are `held`.
+    /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the planes hold of its
+    /// channels; `keep` the lanes of other channels as they are, or else they become zero. Each of the `N` groups of
+    /// channels of a blocked plane is a run of values in its row.
     ///
     /// # Safety
     /// The processor has the instructions of `S`.
     #[inline(always)]
-    unsafe fn gather<S: Simd>(
+    unsafe fn gather<S: Simd, const N: usize>(
         self,
         input: &[f32],
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
-        mut held: [S::V; PAIRS],
+        keep: bool,
         blocks: &mut [Block],
-    ) {
-        let (lanes, count) = (self.lanes(plane), 2 * blocks.len());
-        // SAFETY: the caller's promise; as many values are read as there are.
-        unsafe {
-            for pair in lanes.start / 2..lanes.end / 2 {
-                let from = &input[self.value(n, plane, 2 * pair, y, x)..][..count];
-                held[pair] = if count == LANES {
-                    S::read(from.as_ptr())
-                } else {
-                    S::read_some(from.as_ptr(), 0..count, 0.0)
-                };
+    ) where
+        Channels: Groups<S, N>,
+    {
+        let lanes = self.lanes(plane);
+        let keep = keep && lanes.len() < LANES;
+        for (blocks, x) in blocks.chunks_mut(N).zip((x..).step_by(N)) {
+            let count = blocks.len() * self.factor;
+            // SAFETY: the caller's promise; as many values are read as there are.
+            unsafe {
+                let mut groups = [S::splat(0.0); N];
+                if keep {
+                    groups = Channels::transpose(load::<S, N>(blocks, &Unchanged));
+                }
+                for group in lanes.start / self.factor..lanes.end / self.factor {
+                    let from = &input[self.value(n, plane, group * self.factor, y, x)..][..count];
+                    groups[group] = S::read_some(from.as_ptr(), 0..count, 0.0);
+                }
+                for (block, vector) in blocks.iter_mut().zip(Channels::transpose(groups)) {
+                    S::store(block, vector);
+                }
             }
-            store::<S, PAIRS>(S::transpose_pairs(held), blocks);
         }
     }
 }
@@ -318,12 +347,9 @@ impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
         for x in (0..self.shape.w).step_by(LANES) {
             let count = LANES.min(self.shape.w - x);
             for (plane, blocks) in (plane..planes).zip(&mut blocks) {
-                for (part, x) in blocks[..count].chunks_mut(PAIRS).zip((x..).step_by(PAIRS)) {
-                    // SAFETY: vectors are the tier's.
-                    unsafe {
-                        let held = [S::splat(0.0); PAIRS];
-                        map.gather::<S>(self.values, (n, plane), (y, x), held, part);
-                    }
+                // SAFETY: vectors are the tier's.
+                unsafe {
+                    map.gather::<S, PAIRS>(self.values, (n, plane), (y, x), false, &mut blocks[..count]);
                 }
             }
             let [low, high] = blocks.each_ref().map(|blocks| &blocks[..count]);
@@ -347,26 +373,4 @@ unsafe fn load<S: Simd, const N: usize>(blocks: &[Block], finish: &impl Finish<S
         }
         vectors
     }
-}
-
-/// Writes as many vectors as there are blocks.
-///
-/// # Safety
-/// As for [`load`].
-#[inline(always)]
-unsafe fn store<S: Simd, const N: usize>(vectors: [S::V; N], blocks: &mut [Block]) {
-    for (block, vector) in blocks.iter_mut().zip(vectors) {
-        // SAFETY: the caller's promise.
-        unsafe { S::store(block, vector) }
-    }
-}
-
-/// Writes the first `count` values.
-///
-/// # Safety
-/// As for [`Simd::write_first`].
-#[inline(always)]
-unsafe fn write<S: Simd>(p: *mut f32, count: usize, values: S::V) {
-    // SAFETY: the caller's promise.
-    unsafe { if count == LANES { S::write(p, values) } else { S::write_first(p, count, values) } }
 }

@@ -70,6 +70,15 @@ impl Shape {
         Self { h, w, ..self }
     }
 
+    /// The extent of an activation whose channels are the pixels of this one's 2x2 squares (space to depth).
+    ///
+    /// # Panics
+    /// If rows or columns are odd.
+    pub fn squares(self) -> Self {
+        assert!(self.h.is_multiple_of(2) && self.w.is_multiple_of(2), "only even sizes halve");
+        self.with_channels(4 * self.c).with_size(self.h / 2, self.w / 2)
+    }
+
     /// Planes of one image.
     pub fn planes(self) -> usize {
         self.c.div_ceil(LANES)

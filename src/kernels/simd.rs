@@ -49,6 +49,9 @@ pub trait Simd: Copy {
         let mut values = Block([other; LANES]);
         // SAFETY: the caller's promise; the block is the function's own.
         unsafe {
+            if lanes == (0..LANES) {
+                return Self::read(p);
+            }
             for lane in lanes {
                 values.0[lane] = *p.wrapping_add(lane);
             }
@@ -64,6 +67,9 @@ pub trait Simd: Copy {
         let mut values = Block::default();
         // SAFETY: the caller's promise; the block is the function's own.
         unsafe {
+            if count == LANES {
+                return Self::write(p, v);
+            }
             Self::store(&mut values, v);
             values.0[..count].iter().enumerate().for_each(|(lane, value)| *p.add(lane) = *value);
         }
@@ -94,20 +100,8 @@ pub trait Simd: Copy {
     /// See [`Simd::splat`].
     #[inline(always)]
     unsafe fn transpose(rows: [Self::V; LANES]) -> [Self::V; LANES] {
-        let mut from = [Block::default(); LANES];
-        let mut to = [Block::default(); LANES];
-        // SAFETY: the blocks are the function's own.
-        unsafe {
-            for (row, block) in rows.iter().zip(&mut from) {
-                Self::store(block, *row);
-            }
-            for i in 0..LANES {
-                for j in 0..LANES {
-                    to[j].0[i] = from[i].0[j];
-                }
-            }
-            std::array::from_fn(|j| Self::load(&to[j]))
-        }
+        // SAFETY: the caller's promise.
+        unsafe { exchange::<Self, LANES>(rows) }
     }
     /// Pair `j` of neighbouring lanes of vector `i` becomes pair `i` of vector `j`.
     ///
@@ -115,21 +109,8 @@ pub trait Simd: Copy {
     /// See [`Simd::splat`].
     #[inline(always)]
     unsafe fn transpose_pairs(rows: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
-        let mut from = [Block::default(); PAIRS];
-        let mut to = [Block::default(); PAIRS];
-        // SAFETY: the blocks are the function's own.
-        unsafe {
-            for (row, block) in rows.iter().zip(&mut from) {
-                Self::store(block, *row);
-            }
-            for i in 0..PAIRS {
-                for j in 0..PAIRS {
-                    to[j].0[2 * i] = from[i].0[2 * j];
-                    to[j].0[2 * i + 1] = from[i].0[2 * j + 1];
-                }
-            }
-            std::array::from_fn(|j| Self::load(&to[j]))
-        }
+        // SAFETY: the caller's promise.
+        unsafe { exchange::<Self, PAIRS>(rows) }
     }
     /// Doubles a line of which `p` is one value before the first: each value twice, and the value on the other side of
     /// each of the two halves of it. From `a b c d ..`: `b b c c ..` and `a c b d ..`.
@@ -182,6 +163,30 @@ pub trait Simd: Copy {
 
 /// Pairs of lanes.
 pub const PAIRS: usize = LANES / 2;
+
+/// Of `N` groups of neighbouring lanes, group `j` of vector `i` becomes group `i` of vector `j`.
+///
+/// # Safety
+/// The processor has the instructions of `S`.
+#[inline(always)]
+unsafe fn exchange<S: Simd, const N: usize>(rows: [S::V; N]) -> [S::V; N] {
+    let group = LANES / N;
+    let (mut from, mut to) = ([Block::default(); N], [Block::default(); N]);
+    // SAFETY: the blocks are the function's own.
+    unsafe {
+        for (row, block) in rows.iter().zip(&mut from) {
+            S::store(block, *row);
+        }
+        for i in 0..N {
+            for j in 0..N {
+                for lane in 0..group {
+                    to[j].0[group * i + lane] = from[i].0[group * j + lane];
+                }
+            }
+        }
+        std::array::from_fn(|j| S::load(&to[j]))
+    }
+}
 
 /// A computation to be compiled for every tier.
 pub trait Kernel {
@@ -450,7 +455,12 @@ mod x86 {
         #[inline(always)]
         unsafe fn write_first(p: *mut f32, count: usize, v: Self::V) {
             // SAFETY: the caller's promise; lanes that the mask leaves out are not written.
-            unsafe { _mm512_mask_storeu_ps(p, first(count), v) }
+            unsafe {
+                if count == LANES {
+                    return Self::write(p, v);
+                }
+                _mm512_mask_storeu_ps(p, first(count), v);
+            }
         }
         #[inline(always)]
         unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V {

@@ -97,7 +97,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     pub fn input(shape: Shape, values: &[f32]) -> Self {
         let mut data = Buffer::new(shape);
         to_blocked(values, 1, data.view_mut());
-        Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
+        Self::constant(Data::F32(data))
     }
 
     /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each 2x2 square
@@ -106,10 +106,14 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     /// # Panics
     /// If rows or columns are odd, or the length of `values` is not what `shape` demands.
     pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
-        assert!(shape.h.is_multiple_of(2) && shape.w.is_multiple_of(2), "only even sizes halve");
-        let mut data = Buffer::new(shape.with_channels(4 * shape.c).with_size(shape.h / 2, shape.w / 2));
+        let mut data = Buffer::new(shape.squares());
         to_blocked(values, 2, data.view_mut());
-        Self { saved: Saved { data: Arc::new(Data::F32(data)), gradient: None }, tape: T::default() }
+        Self::constant(Data::F32(data))
+    }
+
+    /// Values with an empty tape, into which no gradient flows.
+    pub(super) fn constant(data: Data) -> Self {
+        Self { saved: Saved { data: Arc::new(data), gradient: None }, tape: T::default() }
     }
 
     /// A network input from a dfdx tensor, whose gradient is written to the tensor's.

@@ -106,8 +106,8 @@ impl Conv {
     pub fn input_halved(&self, planes: Shape, values: &[f32]) -> Activation<NoneTape> {
         match self.frozen.as_deref() {
             Some(Packed::Narrow(_)) => {
-                let data = Data::Narrow(narrow::Operand::halved(narrow::Engine::detect(), planes, values));
-                Activation { saved: Saved { data: Arc::new(data), gradient: None }, tape: NoneTape }
+                let operand = narrow::Operand::halved(narrow::Engine::detect(), planes, values);
+                Activation::constant(Data::Narrow(operand))
             }
             _ => Activation::input_halved(planes, values),
         }

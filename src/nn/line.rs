@@ -7,7 +7,7 @@ use dfdx::tensor::NoneTape;
 
 use super::{
     Activation, Field,
-    activation::{Data, Saved},
+    activation::Data,
     pool::{Buffer, plane_buffer},
 };
 use crate::kernels::narrow::Operand;
@@ -59,7 +59,7 @@ impl Rows for Activation<NoneTape> {
             }
             to += signed(rows.len());
         }
-        Self { saved: Saved { data: data.into(), gradient: None }, tape: NoneTape }
+        Self::constant(data)
     }
 }
 

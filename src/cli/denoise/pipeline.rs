@@ -133,8 +133,8 @@ fn denoise_all(
     for (index, loaded) in frames {
         let input = &batch.jobs[index].input;
         // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up first.
-        let denoise = || frame_job::denoise(loaded, &*batch.model, &batch.options);
-        let denoised = attempt(input, || rayon::scope(|_| denoise()));
+        let denoise = || rayon::scope(|_| frame_job::denoise(loaded, &*batch.model, &batch.options));
+        let denoised = attempt(input, denoise);
         if !pass_on(index, denoised, next, events) {
             return;
         }

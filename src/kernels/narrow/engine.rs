@@ -322,9 +322,9 @@ mod avx512 {
     use super::{Block, CHUNK, GROUP, LANES, Sums, Term, WORD, Wide, bf16};
     use crate::kernels::simd::{Avx512, Simd};
 
-    /// Positions whose sums stay in registers, by output planes: 2 x 8 or 1 x 16, beside as many registers of weights.
-    /// Fewer sums would wait for each other.
-    const TILE: [usize; 3] = [0, 16, 8];
+    /// Sums that stay in registers, of the positions of a tile for one output plane or two, beside as many registers of weights.
+    /// Fewer would wait for each other.
+    const SUMS: usize = 16;
 
     /// The products of the pairs or fours of values of a vector, added up for every lane.
     trait Product {
@@ -414,9 +414,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                tiles::<P, 2, { TILE[2] }>(terms, position, weights, plane, sums);
+                tiles::<P, 2, { SUMS / 2 }>(terms, position, weights, plane, sums);
             } else {
-                tiles::<P, 1, { TILE[1] }>(terms, position, weights, plane, sums);
+                tiles::<P, 1, SUMS>(terms, position, weights, plane, sums);
             }
         }
     }
@@ -511,9 +511,9 @@ mod avx512 {
         // SAFETY: the caller's promise.
         unsafe {
             if outputs == 2 {
-                correlate_tiles::<2, { TILE[2] }>(steps, channels, stride, pairs, plane, sums);
+                correlate_tiles::<2, { SUMS / 2 }>(steps, channels, stride, pairs, plane, sums);
             } else {
-                correlate_tiles::<1, { TILE[1] }>(steps, channels, stride, pairs, plane, sums);
+                correlate_tiles::<1, SUMS>(steps, channels, stride, pairs, plane, sums);
             }
         }
     }

@@ -222,8 +222,7 @@ impl Operand {
     /// # Panics
     /// If rows or columns are odd, or there are not as many values as `planes` demands.
     pub fn halved(engine: Engine, planes: Shape, values: &[f32]) -> Self {
-        assert!(planes.h.is_multiple_of(2) && planes.w.is_multiple_of(2), "only even sizes halve");
-        let shape = planes.with_channels(4 * planes.c).with_size(planes.h / 2, planes.w / 2);
+        let shape = planes.squares();
         let mut operand = Self::new(shape, Format::Bf16);
         let planes = operand.planes();
         operand.each_row(|plane, y, row| {
@@ -298,7 +297,8 @@ impl Operand {
     /// Runs `fill(plane, row's number, pixels of the row)` on the rows of all planes of all images.
     fn each_row(&mut self, fill: impl Fn(usize, usize, &mut [Wide]) + Sync) {
         let Plane { h, w, pad } = self.grid.plane;
-        let rows = self.body_mut().par_chunks_mut(w + 2 * pad).enumerate();
+        let stride = self.grid.stride();
+        let rows = self.body_mut().par_chunks_mut(stride).enumerate();
         rows.for_each(|(i, row)| {
             let (plane, y) = (i / (h + 2 * pad), i % (h + 2 * pad));
             if (pad..pad + h).contains(&y) {
