@@ -17,12 +17,12 @@ use crate::{
 
 const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
 
-/// The built-in model that looks at a frame twice, the second time upside down, and answers with the mean: what a
-/// network gets wrong depends on how its squares and levels happen to lie on the picture, and half of that averages out
-/// (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
+/// The built-in model that looks at a frame twice, the second time upside down and with its 2x2 squares one pixel further
+/// on, and answers with the mean: what a network gets wrong depends on how its squares and levels happen to lie on the
+/// picture, and half of that averages out (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
 
-/// What [`TURNED`] does to a frame.
+/// What [`TURNED`] does to a frame of odd width and height.
 const HALF_TURN: Augment = Augment { turns: 2, ..Augment::IDENTITY };
 
 /// The built-in weights, name and file: ours, fastest first, then the paper's networks and its rivals.
@@ -91,6 +91,18 @@ impl Learned {
         &mut *self.network
     }
 
+    /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a square as before, so
+    /// a column or row is added at what becomes the beginning.
+    fn second_look(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        let size = (passes.width, passes.height);
+        let turned = {
+            let read = passes.rows(self.network.passes(), 0..size.1);
+            HALF_TURN.passes(&read.padded_to((size.0 | 1, size.1 | 1)))
+        };
+        let image = self.network.infer(&turned, tile)?.turned();
+        Ok(image.window((0, 0), size))
+    }
+
     /// Multiply-accumulates for one pixel of the frame.
     pub fn macs_per_pixel(&self) -> f64 {
         self.network.macs_per_pixel() * if self.turned { 2.0 } else { 1.0 }
@@ -121,8 +133,7 @@ impl Denoiser for Learned {
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         let mut image = self.network.infer(passes, tile)?;
         if self.turned {
-            let read = passes.rows(self.network.passes(), 0..passes.height);
-            let second = self.network.infer(&HALF_TURN.passes(&read), tile)?.turned();
+            let second = self.second_look(passes, tile)?;
             let values = image.data.iter_mut().zip(&second.data);
             values.for_each(|(first, second)| *first = 0.5 * (*first + second));
         }
