@@ -16,13 +16,18 @@ pub use kpcn::{
 pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
 pub use shading::Shading;
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::{
     Result,
-    kernels::logarithm::{log_ratio, log_transfer},
+    kernels::{
+        logarithm::{LogTransfer, ln},
+        vectorised::{self, CHUNK, Vectorised},
+    },
     passes::{Pass, PassSet},
-    planes::Planes,
+    planes::{Planes, mirror_beyond, mirrored},
 };
 
 /// The exponent of the paper's Eq. 4.
@@ -105,7 +110,7 @@ pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
 const ALBEDO_FLOOR: f32 = 0.05;
 
-/// The built-in models' [`log_transfer`]: exposed radiance below the inverse is nearly linear, white is 1. Nothing is ever
+/// Of the built-in models' [`LogTransfer`]: exposed radiance below the inverse is nearly linear, white is 1. Nothing is ever
 /// transferred back, because kernels act on radiance itself.
 const STEEPNESS: f32 = 16.0;
 
@@ -116,20 +121,21 @@ const MIDDLE_GREY: f64 = 0.18;
 /// the noise of single pixels does not bias the exposure.
 const EXPOSURE_SQUARE: usize = 16;
 
-/// Rows of a frame, its fireflies [tamed](tame_fireflies) at the `exposure` of the whole: nothing darker than middle grey
-/// is one.
+/// Rows of a frame, grown to (width, height) as [`Planes::padded_to`] does, its fireflies [tamed](tame_fireflies) at the
+/// `exposure` of the whole: nothing darker than middle grey is one.
 ///
 /// # Errors
 /// The Combined pass is missing.
 pub fn guide_rows(
     passes: &PassSet,
-    rows: std::ops::Range<usize>,
+    rows: Range<usize>,
+    size: (usize, usize),
     exposure: f32,
     needed_by: &str,
 ) -> Result<PassSet> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
-    let tamed = tame_fireflies(radiance, rows.clone(), MIDDLE_GREY as f32 / exposure);
-    let mut part = passes.rows(&[Pass::DenoisingNormal, Pass::DenoisingAlbedo], rows);
+    let tamed = tame_fireflies(radiance, rows.clone(), size, MIDDLE_GREY as f32 / exposure);
+    let mut part = passes.padded_rows(&[Pass::DenoisingNormal, Pass::DenoisingAlbedo], rows, size);
     part.insert(Pass::Combined, tamed);
     Ok(part)
 }
@@ -168,26 +174,74 @@ pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_
     let mut guide = unwritten(if refined.is_some() { 7 } else { 6 });
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
     let (directions, mean) = rest.split_at_mut(noisy.data.len());
-    map(&refined.as_ref().map_or(noisy, |refined| &refined.albedo).data, colours, texture);
+    let [mut albedo, mut irradiance, mut encoded] = [(); 3].map(|()| unwritten(3));
+    let clean = refined.as_ref().map_or(noisy, |refined| &refined.albedo);
+    let read = clean.data.par_chunks(CHUNK).zip(radiance.data.par_chunks(CHUNK));
+    let written = colours.par_chunks_mut(CHUNK).zip(albedo.data.par_chunks_mut(CHUNK));
+    let lit = irradiance.data.par_chunks_mut(CHUNK).zip(encoded.data.par_chunks_mut(CHUNK));
+    read.zip(written).zip(lit).for_each(|(((clean, radiance), (colours, albedo)), (irradiance, encoded))| {
+        vectorised::run(Divide { clean, radiance, exposure, colours, albedo, irradiance, encoded });
+    });
     map(&normal.data, directions, unit);
-    let mut albedo = unwritten(3);
-    map(colours, &mut albedo.data, |a| a + ALBEDO_FLOOR);
-    let further = refined.map(|Refined { albedo: mut other, shading }| {
-        map(&noisy.data, &mut other.data, |a| texture(a) + ALBEDO_FLOOR);
-        let mut ratio = unwritten(3);
-        log_ratio(&albedo.data, &other.data, &mut ratio.data);
+    let further = refined.map(|Refined { albedo: mut ratio, shading }| {
+        let divisors = albedo.data.par_chunks(CHUNK).zip(noisy.data.par_chunks(CHUNK));
+        ratio.data.par_chunks_mut(CHUNK).zip(divisors).for_each(|(ratio, (clean, noisy))| {
+            vectorised::run(Compare { clean, noisy, ratio });
+        });
         let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
         mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
         [ratio, shading]
     });
-    let mut irradiance = unwritten(3);
-    let quotients = irradiance.data.par_iter_mut().zip(&radiance.data).zip(&albedo.data);
-    quotients.for_each(|((out, v), a)| *out = v.max(0.0) * exposure / a);
-    let mut encoded = unwritten(3);
-    log_transfer(&irradiance.data, STEEPNESS, &mut encoded.data);
     let planes =
         [irradiance, albedo, encoded, guide].into_iter().chain(further.into_iter().flatten()).collect();
     Ok(Inputs { planes, scale: exposure.recip() })
+}
+
+/// Divides radiance by albedo.
+struct Divide<'a> {
+    clean: &'a [f32],
+    radiance: &'a [f32],
+    exposure: f32,
+    /// Written: the albedo as a guide, and as what radiance is divided by.
+    colours: &'a mut [f32],
+    albedo: &'a mut [f32],
+    /// Written: the exposed quotient, and its logarithm.
+    irradiance: &'a mut [f32],
+    encoded: &'a mut [f32],
+}
+
+impl Vectorised for Divide<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { clean, radiance, exposure, colours, albedo, irradiance, encoded } = self;
+        let transfer = LogTransfer::new(STEEPNESS);
+        for ((colour, albedo), clean) in colours.iter_mut().zip(&mut *albedo).zip(clean) {
+            *colour = texture(*clean);
+            *albedo = *colour + ALBEDO_FLOOR;
+        }
+        let read = radiance.iter().zip(albedo);
+        for ((light, encoded), (v, albedo)) in irradiance.iter_mut().zip(encoded).zip(read) {
+            *light = v.max(0.0) * exposure / *albedo;
+            *encoded = transfer.of(*light);
+        }
+    }
+}
+
+/// The logarithm of what radiance is divided by over what the noisy albedo would make of that.
+struct Compare<'a> {
+    clean: &'a [f32],
+    noisy: &'a [f32],
+    ratio: &'a mut [f32],
+}
+
+impl Vectorised for Compare<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { clean, noisy, ratio } = self;
+        for (ratio, (clean, noisy)) in ratio.iter_mut().zip(clean.iter().zip(noisy)) {
+            *ratio = ln(clean / (texture(*noisy) + ALBEDO_FLOOR));
+        }
+    }
 }
 
 /// Writes `of` each value.
@@ -205,31 +259,38 @@ fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item 
 }
 
 /// An axis of a normal, which is no longer than 1.
+#[inline(always)]
 fn unit(axis: f32) -> f32 {
     axis.clamp(-1.0, 1.0)
 }
 
 /// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says
 /// nothing.
+#[inline(always)]
 fn texture(albedo: f32) -> f32 {
     albedo.clamp(0.0, 1.0)
 }
 
-/// Rows of a frame whose albedo stands in the place of radiance, as bright as radiance is later divided by, lit evenly
-/// (its own albedo is 1): what a prefilter denoises.
+/// Rows of a frame, grown to (width, height) as [`Planes::padded_to`] does, whose albedo stands in the place of radiance, as
+/// bright as radiance is later divided by, lit evenly (its own albedo is 1): what a prefilter denoises.
 ///
 /// # Errors
 /// A pass is missing.
 pub fn albedo_as_radiance(
     passes: &PassSet,
-    rows: std::ops::Range<usize>,
+    rows: Range<usize>,
+    size: (usize, usize),
     needed_by: &str,
 ) -> Result<PassSet> {
     let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let mut lit = albedo.window((0, rows.start), (passes.width, rows.len()));
-    lit.data.par_iter_mut().for_each(|a| *a = texture(*a) + ALBEDO_FLOOR);
-    let white = Planes::from_rows(3, (lit.width, lit.height), |_, _, row| row.fill(1.0));
-    let mut frame = passes.rows(&[Pass::DenoisingNormal], rows);
+    let lit = Planes::from_rows(3, size, |c, y, row| {
+        let y = rows.start + mirrored(y, rows.len());
+        let albedo = &albedo.channel(c)[y * passes.width..][..passes.width];
+        row.iter_mut().zip(albedo).for_each(|(lit, a)| *lit = texture(*a) + ALBEDO_FLOOR);
+        mirror_beyond(row, passes.width);
+    });
+    let white = Planes::from_rows(3, size, |_, _, row| row.fill(1.0));
+    let mut frame = passes.padded_rows(&[Pass::DenoisingNormal], rows, size);
     frame.insert(Pass::Combined, lit);
     frame.insert(Pass::DenoisingAlbedo, white);
     Ok(frame)
@@ -260,12 +321,15 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
         let (mut sum, mut count) = (0.0, 0usize);
         for x0 in (0..w).step_by(EXPOSURE_SQUARE) {
             let (height, width) = (EXPOSURE_SQUARE.min(h - y0), EXPOSURE_SQUARE.min(w - x0));
-            let mut luminance = 0.0f64;
+            // A sum for each column, so that additions need not wait for each other.
+            let mut columns = [0.0f64; EXPOSURE_SQUARE];
             for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
                 for row in planes.channel(c).chunks(w).skip(y0).take(height) {
-                    luminance += weight * row[x0..][..width].iter().map(|v| f64::from(of(*v))).sum::<f64>();
+                    let values = row[x0..][..width].iter().map(|v| f64::from(of(*v)));
+                    columns.iter_mut().zip(values).for_each(|(sum, v)| *sum += weight * v);
                 }
             }
+            let luminance: f64 = columns.iter().sum();
             // A black square has no logarithm and says nothing about exposure.
             if luminance > 0.0 {
                 sum += (luminance / (height * width) as f64).ln();

@@ -1,5 +1,7 @@
 //! Planar f32 images: what passes, features, models and metrics hand to one another.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::kernels::memory::{PlaneBuffer, plane_buffer};
@@ -94,12 +96,19 @@ impl Planes {
         if (width, height) == (self.width, self.height) {
             return self;
         }
-        assert!(self.width <= width && self.height <= height, "padding only adds");
+        self.padded_rows(0..self.height, (width, height))
+    }
+
+    /// Some rows, grown as [`Planes::padded_to`] does.
+    ///
+    /// # Panics
+    /// If they are empty, larger, or not there.
+    pub fn padded_rows(&self, rows: Range<usize>, (width, height): (usize, usize)) -> Self {
+        assert!(self.width <= width && rows.len() <= height, "padding only adds");
         Self::from_rows(self.channels, (width, height), |c, y, out| {
-            let from = &self.channel(c)[mirrored(y, self.height) * self.width..][..self.width];
-            let (inside, beyond) = out.split_at_mut(self.width);
-            inside.copy_from_slice(from);
-            beyond.iter_mut().zip(self.width..).for_each(|(out, x)| *out = from[mirrored(x, self.width)]);
+            let y = rows.start + mirrored(y, rows.len());
+            out[..self.width].copy_from_slice(&self.channel(c)[y * self.width..][..self.width]);
+            mirror_beyond(out, self.width);
         })
     }
 
@@ -121,8 +130,14 @@ impl Planes {
     }
 }
 
+/// Fills a row, whose first `width` values are there, with their mirror image.
+pub fn mirror_beyond(row: &mut [f32], width: usize) {
+    let (inside, beyond) = row.split_at_mut(width);
+    beyond.iter_mut().zip(width..).for_each(|(out, x)| *out = inside[mirrored(x, width)]);
+}
+
 /// The one of `n` that lies where `i` does, to and fro between the first and the last.
-fn mirrored(i: usize, n: usize) -> usize {
+pub fn mirrored(i: usize, n: usize) -> usize {
     let period = (2 * n).saturating_sub(2).max(1);
     (i % period).min(period - i % period)
 }

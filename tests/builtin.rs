@@ -271,7 +271,8 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let frame = window(50, 37);
     let image = twice.denoise(&frame).unwrap();
     // In 51 columns, the first of the turned frame is the one that was added, and what shared a square is apart.
-    let second = once.denoise(&upside_down(&frame.clone().padded_to((51, 37)))).unwrap().turned();
+    let second =
+        once.denoise(&upside_down(&frame.padded_rows(&GUIDE_PASSES, 0..37, (51, 37)))).unwrap().turned();
     let looks = [once.denoise(&frame).unwrap(), second.window((0, 0), (50, 37))];
     assert!(looks[0] != looks[1], "a network sees which way up a picture is");
     for (got, (a, b)) in image.data.iter().zip(looks[0].data.iter().zip(&looks[1].data)) {

@@ -168,7 +168,9 @@ fn a_prefilter_does_what_its_network_does_alone() {
     assert!(network.params().iter().all(|p| p.trainable != p.name.starts_with("prefilter.")));
 
     let passes = random_passes(50, 90, 4);
-    let lit = features::albedo_as_radiance(&passes, 0..passes.height, "the test").unwrap();
+    let lit =
+        features::albedo_as_radiance(&passes, 0..passes.height, (passes.width, passes.height), "the test")
+            .unwrap();
     let clean = features::radiance_as_albedo(alone.infer(&lit, None).unwrap());
     assert_ne!(Some(&clean), passes.get(Pass::DenoisingAlbedo));
     assert!(clean.data.iter().all(|a| (0.0..=1.0).contains(a)));

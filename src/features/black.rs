@@ -16,6 +16,11 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
         let (radiance_of, albedo_of) = (radiance.channel(c), albedo.channel(c));
         let is_black = |x: usize, y: usize| radiance_of[y * w + x] <= 0.0 && albedo_of[y * w + x] <= 0.0;
         plane.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
+            // Most rows have no black at all, which is seen without a branch for each pixel.
+            let pixels = radiance_of[y * w..][..w].iter().zip(&albedo_of[y * w..][..w]);
+            if !pixels.fold(false, |any, (v, a)| any | ((*v <= 0.0) & (*a <= 0.0))) {
+                return;
+            }
             for (x, value) in row.iter_mut().enumerate() {
                 if is_black(x, y) && square((x, y), (w, h)).all(|(x, y)| is_black(x, y)) {
                     *value = 0.0;

@@ -5,41 +5,61 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::square;
-use crate::planes::Planes;
+use crate::planes::{Planes, mirror_beyond, mirrored};
+
+/// Pixels of a row that are looked at together.
+const RUN: usize = 32;
 
 /// A pixel may be this many times as bright as the brightest other one of the 5x5 around it.
 pub const FIREFLY: f32 = 32.0;
 
-/// Rows `rows` of radiance, (3, H, W) -> (3, R, W), in which a pixel's brightest channel is at most [`FIREFLY`] times that
+/// Rows `rows` of radiance, grown to (width, height) as [`Planes::padded_to`] does, in which a pixel's brightest channel is at most [`FIREFLY`] times that
 /// of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is more; what is brighter is
 /// scaled down to that and keeps its hue.
 ///
 /// Of 1000 times the mean, what a network lets through of a pixel that it hardly trusts still shows.
-pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, floor: f32) -> Planes {
+pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize), floor: f32) -> Planes {
     let w = radiance.width;
     if radiance.pixels() == 1 {
-        return radiance.clone(); // nothing to compare with
+        return radiance.padded_rows(rows, size); // nothing to compare with
     }
     let brightest = |x: usize, y: usize| (0..3).map(|c| radiance.channel(c)[y * w + x]).fold(0.0, f32::max);
-    let mut tamed = radiance.window((0, rows.start), (w, rows.len()));
+    let mut tamed = Planes::unwritten(3, size.0, size.1);
     let n = tamed.pixels();
     let (red, rest) = tamed.data.split_at_mut(n);
     let (green, blue) = rest.split_at_mut(n);
-    let channels = red.par_chunks_mut(w).zip(green.par_chunks_mut(w)).zip(blue.par_chunks_mut(w));
-    rows.into_par_iter().zip(channels).for_each(|(y, ((red, green), blue))| {
-        for x in 0..w {
-            let own = brightest(x, y);
-            let others = || {
-                let square = square((x, y), (w, radiance.height));
-                square.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
-            };
-            // Nearly every pixel has company among the first that are looked at.
-            if own <= floor || others().any(|other| own <= FIREFLY * other) {
+    let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(size.0));
+    red.zip(green).zip(blue).enumerate().for_each_init(Vec::new, |row, (y, ((red, green), blue))| {
+        let y = rows.start + mirrored(y, rows.len());
+        let mut colours = [red, green, blue];
+        for (c, colour) in colours.iter_mut().enumerate() {
+            colour[..w].copy_from_slice(&radiance.channel(c)[y * w..][..w]);
+        }
+        row.clear();
+        row.extend((0..w).map(|x| brightest(x, y)));
+        for first in (0..w).step_by(RUN) {
+            let run = first..(first + RUN).min(w);
+            // Nearly every pixel has company beside it, which is seen without a branch for each.
+            let near = &row[first.saturating_sub(1)..(run.end + 1).min(w)];
+            let alone = |near: &[f32]| (near[1] > floor) & (near[1] > FIREFLY * near[0].max(near[2]));
+            let at_border = first == 0 || run.end == w;
+            if !at_border && !near.windows(3).fold(false, |any, near| any | alone(near)) {
                 continue;
             }
-            let limit = (FIREFLY * others().fold(0.0, f32::max)).max(floor);
-            [&mut *red, &mut *green, &mut *blue].into_iter().for_each(|c| c[x] *= limit / own);
+            for x in run {
+                let own = row[x];
+                let others = || {
+                    let square = square((x, y), (w, radiance.height));
+                    square.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
+                };
+                if own <= floor || others().any(|other| own <= FIREFLY * other) {
+                    continue;
+                }
+                let limit = (FIREFLY * others().fold(0.0, f32::max)).max(floor);
+                colours.iter_mut().for_each(|colour| colour[x] *= limit / own);
+            }
         }
+        colours.into_iter().for_each(|colour| mirror_beyond(colour, w));
     });
     tamed
 }
@@ -66,7 +86,7 @@ mod tests {
     #[test]
     fn a_lone_bright_pixel_is_taken_down_and_keeps_its_hue() {
         let bright = frame(&[(7, 9, 1000.0), (0, 0, 900.0)]);
-        let tamed = tame_fireflies(&bright, 0..17, 0.0);
+        let tamed = tame_fireflies(&bright, 0..17, (23, 17), 0.0);
         for (x, y) in [(7usize, 9usize), (0, 0)] {
             let at = y * 23 + x;
             let around = (0..17 * 23)
@@ -85,18 +105,18 @@ mod tests {
     #[test]
     fn what_has_bright_company_or_is_below_the_floor_stays() {
         let company = frame(&[(7, 9, 1000.0), (8, 11, 400.0), (18, 4, 700.0), (20, 4, 600.0)]);
-        assert_eq!(tame_fireflies(&company, 0..17, 0.0).data, company.data);
+        assert_eq!(tame_fireflies(&company, 0..17, (23, 17), 0.0).data, company.data);
         let lone = frame(&[(7, 9, 1000.0)]);
-        assert_eq!(tame_fireflies(&lone, 0..17, 1000.0).data, lone.data);
+        assert_eq!(tame_fireflies(&lone, 0..17, (23, 17), 1000.0).data, lone.data);
     }
 
     #[test]
     fn rows_are_those_of_the_whole_frame() {
         let bright = frame(&[(7, 9, 1000.0), (3, 10, 500.0), (20, 16, 800.0)]);
-        let whole = tame_fireflies(&bright, 0..17, 0.1);
+        let whole = tame_fireflies(&bright, 0..17, (23, 17), 0.1);
         for (from, to) in [(0, 9), (9, 10), (10, 17), (1, 17)] {
-            let rows = tame_fireflies(&bright, from..to, 0.1);
-            assert_eq!(rows.data, whole.window((0, from), (23, to - from)).data);
+            let rows = tame_fireflies(&bright, from..to, (32, to - from + 3), 0.1);
+            assert_eq!(rows, whole.padded_rows(from..to, (32, to - from + 3)));
         }
     }
 }

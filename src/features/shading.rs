@@ -13,7 +13,10 @@ use super::{ALBEDO_FLOOR, STEEPNESS, texture, unit};
 use crate::{
     Result,
     filters::solve::{LANES, Lanes, Symmetric},
-    kernels::logarithm::log_transfer,
+    kernels::{
+        logarithm::LogTransfer,
+        vectorised::{self, Vectorised},
+    },
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -75,20 +78,11 @@ impl Shading {
         moments.par_chunks_mut(MOMENTS * squares).enumerate().for_each(|(row, moments)| {
             let mut of_columns = vec![0.0; MOMENTS * width];
             let mut lines = vec![1.0; LINES * width];
-            let mut irradiance = vec![0.0; width];
             for y in SQUARE * row..(SQUARE * (row + 1)).min(passes.height) {
-                irradiance.fill(0.0);
-                let (known, light) = lines.split_at_mut(UNKNOWNS * width);
-                for (c, axis) in known[width..].chunks_mut(width).enumerate() {
-                    let [v, a, n] = [radiance, albedo, normal].map(|p| &p.channel(c)[y * width..][..width]);
-                    for (sum, (v, a)) in irradiance.iter_mut().zip(v.iter().zip(a)) {
-                        *sum += v.max(0.0) * exposure / (3.0 * (texture(*a) + ALBEDO_FLOOR));
-                    }
-                    axis.iter_mut().zip(n).for_each(|(axis, n)| *axis = unit(*n));
-                }
-                log_transfer(&irradiance, STEEPNESS, light);
-                light.iter_mut().for_each(|light| *light = light.min(BRIGHTEST));
-                gather(&lines, width, &mut of_columns);
+                let [radiance, albedo, normal] = [radiance, albedo, normal]
+                    .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+                let (lines, sums) = (&mut *lines, &mut *of_columns);
+                vectorised::run(Gather { radiance, albedo, normal, exposure, lines, sums });
             }
             for (moment, of_columns) in moments.chunks_mut(squares).zip(of_columns.chunks(width)) {
                 let of_squares = of_columns.chunks(SQUARE).map(|part| part.iter().sum());
@@ -151,12 +145,48 @@ fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
-/// Adds the products of every two lines of `width` pixels to the sums over each column.
-fn gather(lines: &[f32], width: usize, sums: &mut [f32]) {
-    let line = |k: usize| &lines[k * width..][..width];
-    let pairs = (0..LINES).flat_map(|i| (0..=i).map(move |j| (i, j)));
-    for ((i, j), sums) in pairs.zip(sums.chunks_mut(width)) {
-        sums.iter_mut().zip(line(i).iter().zip(line(j))).for_each(|(sum, (a, b))| *sum += a * b);
+/// What a row of pixels adds to the moments.
+struct Gather<'a> {
+    /// The row's colours and axes.
+    radiance: [&'a [f32]; 3],
+    albedo: [&'a [f32]; 3],
+    normal: [&'a [f32]; 3],
+    exposure: f32,
+    /// Memory for [`LINES`] rows, the first of ones.
+    lines: &'a mut [f32],
+    /// The sums over each column, [`MOMENTS`] rows.
+    sums: &'a mut [f32],
+}
+
+impl Vectorised for Gather<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { radiance, albedo, normal, exposure, lines, sums } = self;
+        let width = radiance[0].len();
+        let (known, light) = lines.split_at_mut(UNKNOWNS * width);
+        light.fill(0.0);
+        for (c, axis) in known[width..].chunks_exact_mut(width).enumerate() {
+            for (sum, (v, a)) in light.iter_mut().zip(radiance[c].iter().zip(albedo[c])) {
+                *sum += v.max(0.0) * exposure / (3.0 * (texture(*a) + ALBEDO_FLOOR));
+            }
+            for (axis, n) in axis.iter_mut().zip(normal[c]) {
+                *axis = unit(*n);
+            }
+        }
+        let transfer = LogTransfer::new(STEEPNESS);
+        for light in light {
+            *light = transfer.of(*light).min(BRIGHTEST);
+        }
+        let mut sums = sums.chunks_exact_mut(width);
+        for i in 0..LINES {
+            for j in 0..=i {
+                let [a, b] = [i, j].map(|line| &lines[line * width..][..width]);
+                for (sum, (a, b)) in sums.next().expect("a row for each pair").iter_mut().zip(a.iter().zip(b))
+                {
+                    *sum += a * b;
+                }
+            }
+        }
     }
 }
 

@@ -95,10 +95,9 @@ impl Learned {
     /// a column or row is added at what becomes the beginning.
     fn second_look(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         let size = (passes.width, passes.height);
-        let turned = {
-            let read = passes.rows(self.network.passes(), 0..size.1);
-            HALF_TURN.passes(&read.padded_to((size.0 | 1, size.1 | 1)))
-        };
+        let odd = passes.padded_rows(self.network.passes(), 0..size.1, (size.0 | 1, size.1 | 1));
+        let turned = HALF_TURN.passes(&odd);
+        drop(odd);
         let image = self.network.infer(&turned, tile)?.turned();
         Ok(image.window((0, 0), size))
     }

@@ -257,17 +257,24 @@ impl Pyramid {
     /// The denoised albedo of a frame, (3, H, W), where there is a prefilter.
     fn prefiltered(&self, passes: &PassSet) -> Result<Option<Planes>> {
         let Some(prefilter) = &self.prefilter else { return Ok(None) };
-        let albedo =
-            bands::infer(prefilter, &albedo_as_radiance(passes, 0..passes.height, NEEDED_BY)?, None)?;
+        let size = (passes.width, passes.height);
+        let lit = albedo_as_radiance(passes, 0..size.1, size, NEEDED_BY)?;
+        let albedo = bands::infer(prefilter, &lit, None)?;
         Ok(Some(radiance_as_albedo(albedo)))
     }
 
-    /// Rows of a frame as the network reads them. There are no fireflies in an albedo.
-    fn rows(&self, passes: &PassSet, rows: Range<usize>, exposure: f32) -> Result<PassSet> {
+    /// Rows of a frame as the network reads them, grown to (width, height). There are no fireflies in an albedo.
+    fn rows(
+        &self,
+        passes: &PassSet,
+        rows: Range<usize>,
+        size: (usize, usize),
+        exposure: f32,
+    ) -> Result<PassSet> {
         if self.full.name().starts_with(PREFILTER) {
-            return Ok(passes.rows(self.passes(), rows));
+            return Ok(passes.padded_rows(self.passes(), rows, size));
         }
-        guide_rows(passes, rows, exposure, NEEDED_BY)
+        guide_rows(passes, rows, size, exposure, NEEDED_BY)
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
@@ -365,7 +372,7 @@ impl Network for Pyramid {
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
-        let rows = 0..passes.height;
+        let (rows, size) = (0..passes.height, (passes.width, passes.height));
         let refined = match self.prefiltered(passes)? {
             Some(albedo) => {
                 let shading =
@@ -374,7 +381,7 @@ impl Network for Pyramid {
             }
             None => None,
         };
-        guides(&self.rows(passes, rows, exposure)?, refined, exposure, NEEDED_BY)
+        guides(&self.rows(passes, rows, size, exposure)?, refined, exposure, NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {

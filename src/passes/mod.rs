@@ -11,6 +11,7 @@ mod sanitize;
 use std::{
     collections::BTreeMap,
     fmt,
+    ops::Range,
     path::{Path, PathBuf},
 };
 
@@ -172,21 +173,21 @@ impl PassSet {
     ///
     /// # Panics
     /// If there are no such rows.
-    pub fn rows(&self, passes: &[Pass], rows: std::ops::Range<usize>) -> Self {
-        let mut part = Self::new(&self.path, &self.view_layer, self.width, rows.len());
-        for (&pass, planes) in self.planes.iter().filter(|(pass, _)| passes.contains(pass)) {
-            part.insert(pass, planes.window((0, rows.start), (self.width, rows.len())));
-        }
-        part
+    pub fn rows(&self, passes: &[Pass], rows: Range<usize>) -> Self {
+        let size = (self.width, rows.len());
+        self.padded_rows(passes, rows, size)
     }
 
-    /// Every pass grown to a width and height, as [`Planes::padded_to`] does.
+    /// Some rows of those of `passes` that it holds, grown to a width and height as [`Planes::padded_to`] does.
     ///
     /// # Panics
-    /// As that.
-    pub fn padded_to(self, (width, height): (usize, usize)) -> Self {
-        let planes = self.planes.into_iter().map(|(pass, planes)| (pass, planes.padded_to((width, height))));
-        Self { width, height, planes: planes.collect(), ..self }
+    /// As [`Planes::padded_rows`].
+    pub fn padded_rows(&self, passes: &[Pass], rows: Range<usize>, (width, height): (usize, usize)) -> Self {
+        let mut part = Self::new(&self.path, &self.view_layer, width, height);
+        for (&pass, planes) in self.planes.iter().filter(|(pass, _)| passes.contains(pass)) {
+            part.insert(pass, planes.padded_rows(rows.clone(), (width, height)));
+        }
+        part
     }
 
     /// What `change` makes of every pass, of one new size.

@@ -37,14 +37,23 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
     let exposure = exposure(radiance);
     let multiple = network.multiple();
-    let width = passes.width.next_multiple_of(multiple);
+    let (width, height) = (passes.width.next_multiple_of(multiple), passes.height.next_multiple_of(multiple));
     let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
     // The last rows are mirrored below themselves, so as many come at once as that may take.
     let is_last = |end: usize| passes.height < end + multiple;
+    let padded =
+        |rows: &Range<usize>| (width, if rows.end == passes.height { height } else { rows.end } - rows.start);
     let starts = (0..passes.height).step_by(rows).filter(|&y| y == 0 || !is_last(y));
     let bands = starts.map(|y| y..if is_last(y + rows) { passes.height } else { y + rows });
-    let mut image = Planes::new(3, passes.width, passes.height);
+    let mut image = Planes::default();
     let mut write = |first: usize, part: Planes| {
+        if part.height == passes.height {
+            image = part;
+            return Ok(());
+        }
+        if image.height == 0 {
+            image = Planes::unwritten(3, passes.width, passes.height);
+        }
         for c in 0..3 {
             image.channel_mut(c)[first * part.width..][..part.pixels()].copy_from_slice(part.channel(c));
         }
@@ -56,7 +65,8 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         let mut held: Option<Planes> = None;
         for band in bands {
-            let band = albedo_as_radiance(passes, band, NEEDED_BY)?;
+            let size = padded(&band);
+            let band = albedo_as_radiance(passes, band, size, NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
             prefiltered.push(band, None, &mut |first, clean| {
                 let end = first + clean.height;
@@ -70,13 +80,15 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
                 }
                 let rows = end - clean.height..end;
                 let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
-                let refined = Refined { albedo: radiance_as_albedo(clean), shading };
-                beauty.push(network.rows(passes, rows, exposure)?, Some(refined), &mut write)
+                let size = padded(&rows);
+                let refined = Refined { albedo: radiance_as_albedo(clean), shading }.padded_to(size);
+                beauty.push(network.rows(passes, rows, size, exposure)?, Some(refined), &mut write)
             })?;
         }
     } else {
         for band in bands {
-            beauty.push(network.rows(passes, band, exposure)?, None, &mut write)?;
+            let size = padded(&band);
+            beauty.push(network.rows(passes, band, size, exposure)?, None, &mut write)?;
         }
     }
     keep_black(&mut image, radiance, albedo);
@@ -87,22 +99,18 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
 struct Feed<'a> {
     frame: Frame<'a>,
     exposure: f32,
-    /// Columns and rows of the frame, and with padding.
+    /// Columns and rows of the frame.
     size: (usize, usize),
-    padded: (usize, usize),
-    /// Rows that have come.
-    rows: usize,
 }
 
 impl<'a> Feed<'a> {
     fn new(network: &'a Pyramid, passes: &PassSet, exposure: f32, band: usize) -> Self {
         let size = (passes.width, passes.height);
-        let padded =
-            (size.0.next_multiple_of(network.multiple()), size.1.next_multiple_of(network.multiple()));
-        Self { frame: Frame::new(network, padded.1, band), exposure, size, padded, rows: 0 }
+        let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band);
+        Self { frame, exposure, size }
     }
 
-    /// Takes in the next rows, an even number unless they are the last, and what is refined of them where the network has a
+    /// Takes in the next rows, grown to what the network can halve, and what is refined of them where it has a
     /// prefilter, and hands out what is denoised with it: its first row, and radiance.
     fn push(
         &mut self,
@@ -110,12 +118,7 @@ impl<'a> Feed<'a> {
         refined: Option<Refined>,
         done: &mut dyn FnMut(usize, Planes) -> Result<()>,
     ) -> Result<()> {
-        let before = self.rows;
-        self.rows += band.height;
-        let end = if self.rows == self.size.1 { self.padded.1 } else { self.rows };
-        let padded = (self.padded.0, end - before);
-        let refined = refined.map(|refined| refined.padded_to(padded));
-        let Inputs { planes, scale } = guides(&band.padded_to(padded), refined, self.exposure, NEEDED_BY)?;
+        let Inputs { planes, scale } = guides(&band, refined, self.exposure, NEEDED_BY)?;
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {
