@@ -27,6 +27,7 @@ use super::{
     memory::{Pool, Pooled},
     plane::Plane,
     simd::{Kernel, Simd, Tier},
+    vectorised::{self, Vectorised},
 };
 
 /// What activations and weights are rounded to.
@@ -325,7 +326,7 @@ impl Operand {
 
 impl Format {
     /// The larger of each two values, none negative.
-    #[inline]
+    #[inline(always)]
     fn max(self, a: &Wide, b: &Wide) -> Wide {
         match self {
             // The bits of non-negative values are ordered as the values are.
@@ -377,12 +378,28 @@ pub fn max_pool(input: &Operand) -> Operand {
         let plane = &input.data[plane * from.positions()..][..from.positions()];
         let top = &plane[from.row(2 * y)..][..from.w];
         let bottom = &plane[from.row(2 * y + 1)..][..from.w];
+        vectorised::run(PoolRow { format, top, bottom, row });
+    });
+    output
+}
+
+/// The maxima of the 2x2 squares of two rows.
+struct PoolRow<'a> {
+    format: Format,
+    top: &'a [Wide],
+    bottom: &'a [Wide],
+    row: &'a mut [Wide],
+}
+
+impl Vectorised for PoolRow<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { format, top, bottom, row } = self;
         let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
         for (out, (top, bottom)) in row.iter_mut().zip(squares) {
             *out = format.max(&format.max(&top[0], &top[1]), &format.max(&bottom[0], &bottom[1]));
         }
-    });
-    output
+    }
 }
 
 /// The two planes of 16 channels that make up 32 channels of a source; the second may be absent.
