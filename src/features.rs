@@ -318,21 +318,15 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
     let (w, h) = (planes.width, planes.height);
     // Of every row of squares the sum of logarithms, and their number.
     let row = |y0: usize| {
+        let rows = y0..(y0 + EXPOSURE_SQUARE).min(h);
+        let mut columns = vec![0.0; w];
+        vectorised::run(Luminance { planes, rows: rows.clone(), of: &of, columns: &mut columns });
         let (mut sum, mut count) = (0.0, 0usize);
-        for x0 in (0..w).step_by(EXPOSURE_SQUARE) {
-            let (height, width) = (EXPOSURE_SQUARE.min(h - y0), EXPOSURE_SQUARE.min(w - x0));
-            // A sum for each column, so that additions need not wait for each other.
-            let mut columns = [0.0f64; EXPOSURE_SQUARE];
-            for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
-                for row in planes.channel(c).chunks(w).skip(y0).take(height) {
-                    let values = row[x0..][..width].iter().map(|v| f64::from(of(*v)));
-                    columns.iter_mut().zip(values).for_each(|(sum, v)| *sum += weight * v);
-                }
-            }
-            let luminance: f64 = columns.iter().sum();
+        for square in columns.chunks(EXPOSURE_SQUARE) {
+            let luminance: f64 = square.iter().sum();
             // A black square has no logarithm and says nothing about exposure.
             if luminance > 0.0 {
-                sum += (luminance / (height * width) as f64).ln();
+                sum += (luminance / (rows.len() * square.len()) as f64).ln();
                 count += 1;
             }
         }
@@ -343,6 +337,29 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
         (0..h.div_ceil(EXPOSURE_SQUARE)).into_par_iter().map(|y| row(y * EXPOSURE_SQUARE)).collect();
     let (sum, count) = rows.into_iter().fold((0.0, 0), |(s, n), (sum, count)| (s + sum, n + count));
     if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
+}
+
+/// Adds up the luminance that `of` makes of some rows, column by column.
+struct Luminance<'a, F> {
+    planes: &'a Planes,
+    rows: Range<usize>,
+    of: &'a F,
+    columns: &'a mut [f64],
+}
+
+impl<F: Fn(f32) -> f32> Vectorised for Luminance<'_, F> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { planes, rows, of, columns } = self;
+        for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
+            for y in rows.clone() {
+                let row = &planes.channel(c)[y * planes.width..][..planes.width];
+                for (sum, v) in columns.iter_mut().zip(row) {
+                    *sum += weight * f64::from(of(*v));
+                }
+            }
+        }
+    }
 }
 
 /// Distance as a feature between 0 (near, and where nothing is hit) and 1, one half at the median.

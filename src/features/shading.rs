@@ -115,25 +115,17 @@ impl Shading {
     /// A pass is missing.
     pub fn rows(&self, passes: &PassSet, rows: Range<usize>, needed_by: &str) -> Result<Planes> {
         let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
-        let height = self.lines.len() / (KEPT * self.squares);
-        let columns: Vec<_> = (0..passes.width).map(|x| between(x, self.squares)).collect();
-        let mut shading = Planes::new(1, passes.width, rows.len());
-        shading.data.par_chunks_mut(passes.width).zip(rows).for_each(|(output, y)| {
+        let (width, squares) = (passes.width, self.squares);
+        let height = self.lines.len() / (KEPT * squares);
+        let mut shading = Planes::unwritten(1, width, rows.len());
+        shading.data.par_chunks_mut(width).zip(rows).for_each(|(output, y)| {
             let (above, share) = between(y, height);
-            let line =
-                |row: usize| &self.lines[row.min(height - 1) * KEPT * self.squares..][..KEPT * self.squares];
+            let line = |row: usize| &self.lines[row.min(height - 1) * KEPT * squares..][..KEPT * squares];
             let near = line(above).iter().zip(line(above + 1));
             let line: Vec<f32> = near.map(|(a, b)| a + (b - a) * share).collect();
-            let normal = [0, 1, 2].map(|c| &normal.channel(c)[y * passes.width..][..passes.width]);
-            for (x, (output, (left, share))) in output.iter_mut().zip(&columns).enumerate() {
-                let at = |k: usize| {
-                    let line = &line[k * self.squares..][..self.squares];
-                    let (a, b) = (line[*left], line[(left + 1).min(self.squares - 1)]);
-                    a + (b - a) * share
-                };
-                let light = (0..3).map(|k| at(k) * unit(normal[k][x])).sum::<f32>() - at(3);
-                *output = light.clamp(-LARGEST, LARGEST);
-            }
+            let slopes = std::array::from_fn(|k| &line[k * squares..][..squares]);
+            let normal = [0, 1, 2].map(|c| &normal.channel(c)[y * width..][..width]);
+            vectorised::run(Shade { slopes, normal, output });
         });
         Ok(shading)
     }
@@ -143,6 +135,51 @@ impl Shading {
 fn between(at: usize, squares: usize) -> (usize, f32) {
     let place = ((at as f32 + 0.5) / SQUARE as f32 - 0.5).clamp(0.0, (squares - 1) as f32);
     (place as usize, place.fract())
+}
+
+/// The shading of a row of pixels.
+struct Shade<'a> {
+    /// What is kept of the squares, a line each, as it is at that row.
+    slopes: [&'a [f32]; KEPT],
+    normal: [&'a [f32]; 3],
+    output: &'a mut [f32],
+}
+
+impl Shade<'_> {
+    /// That of pixel `x`, which is `share` of the way from one square on to the next.
+    #[inline(always)]
+    fn of(slopes: &[&[f32]; KEPT], left: usize, share: f32, normal: &[&[f32]; 3], x: usize) -> f32 {
+        let right = (left + 1).min(slopes[0].len() - 1);
+        let mut light = [0.0; KEPT];
+        for (light, line) in light.iter_mut().zip(slopes) {
+            *light = line[left] + (line[right] - line[left]) * share;
+        }
+        let [along_x, along_y, along_z, mean] = light;
+        let [nx, ny, nz] = [unit(normal[0][x]), unit(normal[1][x]), unit(normal[2][x])];
+        (along_x * nx + along_y * ny + along_z * nz - mean).clamp(-LARGEST, LARGEST)
+    }
+}
+
+impl Vectorised for Shade<'_> {
+    #[inline(always)]
+    fn run(self) {
+        const HALF: usize = SQUARE / 2;
+        let Self { slopes, normal, output } = self;
+        let (width, squares) = (output.len(), slopes[0].len());
+        // From the middle of one square to that of the next, all pixels lie between the same two.
+        let runs = output.get_mut(HALF..).unwrap_or_default().as_chunks_mut::<SQUARE>().0;
+        let inside = HALF..HALF + SQUARE * runs.len().min(squares - 1);
+        for (left, run) in runs.iter_mut().enumerate().take(squares - 1) {
+            for (i, output) in run.iter_mut().enumerate() {
+                let share = (i as f32 + 0.5) / SQUARE as f32;
+                *output = Self::of(&slopes, left, share, &normal, inside.start + SQUARE * left + i);
+            }
+        }
+        for x in (0..inside.start.min(width)).chain(inside.end..width) {
+            let (left, share) = between(x, squares);
+            output[x] = Self::of(&slopes, left, share, &normal, x);
+        }
+    }
 }
 
 /// What a row of pixels adds to the moments.
