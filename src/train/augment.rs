@@ -68,9 +68,10 @@ impl Augment {
         match pass {
             Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes),
             Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Vector => {}
-            _ => planes = self.permuted(&planes),
+            _ if self.rgb != Self::IDENTITY.rgb => planes = self.permuted(&planes),
+            _ => {}
         }
-        if pass.carries_radiance() {
+        if pass.carries_radiance() && self.exposure != 1.0 {
             planes.data.iter_mut().for_each(|v| *v *= self.exposure);
         }
         planes
@@ -79,6 +80,9 @@ impl Augment {
     /// Moves pixels: flip, then turns.
     fn moved(&self, planes: &Planes) -> Planes {
         let (w, h) = (planes.width, planes.height);
+        if (self.flip, self.turns) == (false, 2) {
+            return planes.turned();
+        }
         assert!(self.turns.is_multiple_of(2) || w == h, "only squares turn by a quarter");
         Planes::from_rows(planes.channels, (w, h), |c, y, row| {
             let from = planes.channel(c);

@@ -26,7 +26,7 @@ type Maps = Activation<NoneTape>;
 type Field = crate::nn::Field<NoneTape>;
 
 /// Pixels of a band: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
-const BAND_PIXELS: usize = 1 << 17;
+const BAND_PIXELS: usize = 9 << 14;
 
 /// Denoised radiance of a frame, (3, H, W). `rows` are those of a band, if the user has an opinion.
 ///
