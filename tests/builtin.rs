@@ -285,6 +285,27 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
 }
 
 #[test]
+fn a_firefly_near_the_border_is_no_company_for_its_mirror_image() {
+    const WIDTH: usize = 50;
+    let clean = window(WIDTH, 37);
+    let mut lit = clean.clone();
+    // The second look adds a column beyond the last, in which this pixel, the last but one, comes again.
+    edit(&mut lit, Pass::Combined, |v| {
+        v.chunks_mut(WIDTH * 37).for_each(|c| c[18 * WIDTH + WIDTH - 2] = 1e5)
+    });
+    // What the second look lets through of it, beside what the first does.
+    let deviation = |model: &str| {
+        let model = models::open(model).unwrap();
+        let [lit, clean] = [&lit, &clean].map(|frame| model.denoise(frame).unwrap());
+        let relative =
+            lit.data.iter().zip(&clean.data).map(|(lit, clean)| ((lit - clean) / (clean + 0.01)).abs());
+        relative.fold(0.0, f32::max)
+    };
+    let [once, twice] = ["demc-m", "demc-l"].map(deviation);
+    assert!(twice < 1.5 * once, "{twice}, {once} with one look");
+}
+
+#[test]
 fn frames_of_a_few_pixels() {
     for (width, height) in [(1, 1), (2, 3), (17, 5)] {
         let small = window(width, height);

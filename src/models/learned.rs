@@ -9,6 +9,7 @@ use super::{
 };
 use crate::{
     Error, Result,
+    features::{exposure, guide_rows},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -92,10 +93,12 @@ impl Learned {
     }
 
     /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a square as before, so
-    /// a column or row is added at what becomes the beginning.
+    /// a column or row is added at what becomes the beginning; fireflies are tamed before it mirrors them, since two would be
+    /// company for each other.
     fn second_look(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         let size = (passes.width, passes.height);
-        let odd = passes.padded_rows(self.network.passes(), 0..size.1, (size.0 | 1, size.1 | 1));
+        let exposure = exposure(passes.require(Pass::Combined, TURNED)?);
+        let odd = guide_rows(passes, 0..size.1, (size.0 | 1, size.1 | 1), exposure, TURNED)?;
         let turned = HALF_TURN.passes(&odd);
         drop(odd);
         let image = self.network.infer(&turned, tile)?.turned();
