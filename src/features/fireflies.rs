@@ -13,9 +13,9 @@ const RUN: usize = 32;
 /// A pixel may be this many times as bright as the brightest other one of the 5x5 around it.
 pub const FIREFLY: f32 = 32.0;
 
-/// Rows `rows` of radiance, grown to (width, height) as [`Planes::padded_to`] does, in which a pixel's brightest channel is at most [`FIREFLY`] times that
-/// of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is more; what is brighter is
-/// scaled down to that and keeps its hue.
+/// Rows `rows` of radiance, grown to (width, height) as [`Planes::padded_to`] does, in which a pixel's brightest channel is
+/// at most [`FIREFLY`] times that of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is
+/// more; what is brighter is scaled down to that and keeps its hue.
 ///
 /// Of 1000 times the mean, what a network lets through of a pixel that it hardly trusts still shows.
 pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize), floor: f32) -> Planes {
@@ -68,9 +68,13 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
 mod tests {
     use super::*;
 
+    /// Runs of pixels with others on both sides, and those at the borders.
+    const W: usize = 3 * RUN + 7;
+    const H: usize = 17;
+
     /// Grey noise between 0.5 and 1.5 with some pixels brighter.
     fn frame(bright: &[(usize, usize, f32)]) -> Planes {
-        let (w, h) = (23, 17);
+        let (w, h) = (W, H);
         let mut rng = crate::nn::Rng::new(5, 0);
         let mut planes = Planes::new(3, w, h);
         for at in 0..w * h {
@@ -85,12 +89,14 @@ mod tests {
 
     #[test]
     fn a_lone_bright_pixel_is_taken_down_and_keeps_its_hue() {
-        let bright = frame(&[(7, 9, 1000.0), (0, 0, 900.0)]);
-        let tamed = tame_fireflies(&bright, 0..17, (23, 17), 0.0);
-        for (x, y) in [(7usize, 9usize), (0, 0)] {
-            let at = y * 23 + x;
-            let around = (0..17 * 23)
-                .filter(|i: &usize| (i % 23).abs_diff(x) <= 2 && (i / 23).abs_diff(y) <= 2 && *i != at)
+        // At a corner, within a run, and at the ends of two.
+        const LONE: [(usize, usize); 5] = [(0, 0), (7, 9), (RUN + 9, 3), (2 * RUN - 1, 8), (2 * RUN, 13)];
+        let bright = frame(&LONE.map(|(x, y)| (x, y, 1000.0)));
+        let tamed = tame_fireflies(&bright, 0..H, (W, H), 0.0);
+        for (x, y) in LONE {
+            let at = y * W + x;
+            let around = (0..H * W)
+                .filter(|i: &usize| (i % W).abs_diff(x) <= 2 && (i / W).abs_diff(y) <= 2 && *i != at)
                 .map(|i| bright.channel(0)[i])
                 .fold(0.0, f32::max);
             let red = tamed.channel(0)[at];
@@ -99,24 +105,24 @@ mod tests {
             assert!((hue(&tamed) / hue(&bright) - 1.0).abs() < 1e-5);
         }
         let changed = tamed.data.iter().zip(&bright.data).filter(|(a, b)| a != b).count();
-        assert_eq!(changed, 6, "and nothing else is");
+        assert_eq!(changed, 3 * LONE.len(), "and nothing else is");
     }
 
     #[test]
     fn what_has_bright_company_or_is_below_the_floor_stays() {
         let company = frame(&[(7, 9, 1000.0), (8, 11, 400.0), (18, 4, 700.0), (20, 4, 600.0)]);
-        assert_eq!(tame_fireflies(&company, 0..17, (23, 17), 0.0).data, company.data);
+        assert_eq!(tame_fireflies(&company, 0..H, (W, H), 0.0).data, company.data);
         let lone = frame(&[(7, 9, 1000.0)]);
-        assert_eq!(tame_fireflies(&lone, 0..17, (23, 17), 1000.0).data, lone.data);
+        assert_eq!(tame_fireflies(&lone, 0..H, (W, H), 1000.0).data, lone.data);
     }
 
     #[test]
     fn rows_are_those_of_the_whole_frame() {
         let bright = frame(&[(7, 9, 1000.0), (3, 10, 500.0), (20, 16, 800.0)]);
-        let whole = tame_fireflies(&bright, 0..17, (23, 17), 0.1);
+        let whole = tame_fireflies(&bright, 0..H, (W, H), 0.1);
         for (from, to) in [(0, 9), (9, 10), (10, 17), (1, 17)] {
-            let rows = tame_fireflies(&bright, from..to, (32, to - from + 3), 0.1);
-            assert_eq!(rows, whole.padded_rows(from..to, (32, to - from + 3)));
+            let rows = tame_fireflies(&bright, from..to, (W + 9, to - from + 3), 0.1);
+            assert_eq!(rows, whole.padded_rows(from..to, (W + 9, to - from + 3)));
         }
     }
 }
