@@ -239,7 +239,7 @@ impl Vectorised for Compare<'_> {
     fn run(self) {
         let Self { clean, noisy, ratio } = self;
         for (ratio, (clean, noisy)) in ratio.iter_mut().zip(clean.iter().zip(noisy)) {
-            *ratio = ln(clean / (texture(*noisy) + ALBEDO_FLOOR));
+            *ratio = ln(clean / divisor(*noisy));
         }
     }
 }
@@ -271,6 +271,12 @@ fn texture(albedo: f32) -> f32 {
     albedo.clamp(0.0, 1.0)
 }
 
+/// What radiance is divided by.
+#[inline(always)]
+fn divisor(albedo: f32) -> f32 {
+    texture(albedo) + ALBEDO_FLOOR
+}
+
 /// Rows of a frame, grown to (width, height) as [`Planes::padded_to`] does, whose albedo stands in the place of radiance, as
 /// bright as radiance is later divided by, lit evenly (its own albedo is 1): what a prefilter denoises.
 ///
@@ -286,7 +292,7 @@ pub fn albedo_as_radiance(
     let lit = Planes::from_rows(3, size, |c, y, row| {
         let y = rows.start + mirrored(y, rows.len());
         let albedo = &albedo.channel(c)[y * passes.width..][..passes.width];
-        row.iter_mut().zip(albedo).for_each(|(lit, a)| *lit = texture(*a) + ALBEDO_FLOOR);
+        row.iter_mut().zip(albedo).for_each(|(lit, a)| *lit = divisor(*a));
         mirror_beyond(row, passes.width);
     });
     let white = Planes::from_rows(3, size, |_, _, row| row.fill(1.0));
@@ -310,7 +316,7 @@ pub fn exposure(radiance: &Planes) -> f32 {
 
 /// [`exposure`] of the radiance in [`albedo_as_radiance`].
 pub fn albedo_exposure(albedo: &Planes) -> f32 {
-    log_average_exposure(albedo, |v| texture(v) + ALBEDO_FLOOR)
+    log_average_exposure(albedo, divisor)
 }
 
 /// [`exposure`] of the radiance that `of` makes of each value.

@@ -14,11 +14,12 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
     let (w, h, n) = (image.width, image.height, image.pixels());
     image.data.par_chunks_mut(n).enumerate().for_each(|(c, plane)| {
         let (radiance_of, albedo_of) = (radiance.channel(c), albedo.channel(c));
-        let is_black = |x: usize, y: usize| radiance_of[y * w + x] <= 0.0 && albedo_of[y * w + x] <= 0.0;
+        let nothing = |radiance: f32, albedo: f32| (radiance <= 0.0) & (albedo <= 0.0);
+        let is_black = |x: usize, y: usize| nothing(radiance_of[y * w + x], albedo_of[y * w + x]);
         plane.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
             // Most rows have no black at all, which is seen without a branch for each pixel.
             let pixels = radiance_of[y * w..][..w].iter().zip(&albedo_of[y * w..][..w]);
-            if !pixels.fold(false, |any, (v, a)| any | ((*v <= 0.0) & (*a <= 0.0))) {
+            if !pixels.fold(false, |any, (v, a)| any | nothing(*v, *a)) {
                 return;
             }
             for (x, value) in row.iter_mut().enumerate() {

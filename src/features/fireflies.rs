@@ -74,15 +74,14 @@ mod tests {
 
     /// Grey noise between 0.5 and 1.5 with some pixels brighter.
     fn frame(bright: &[(usize, usize, f32)]) -> Planes {
-        let (w, h) = (W, H);
         let mut rng = crate::nn::Rng::new(5, 0);
-        let mut planes = Planes::new(3, w, h);
-        for at in 0..w * h {
+        let mut planes = Planes::new(3, W, H);
+        for at in 0..W * H {
             let v = 0.5 + rng.uniform();
             (0..3).for_each(|c| planes.channel_mut(c)[at] = v);
         }
         for &(x, y, v) in bright {
-            planes.channel_mut(0)[y * w + x] = v;
+            planes.channel_mut(0)[y * W + x] = v;
         }
         planes
     }

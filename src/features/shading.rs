@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{ALBEDO_FLOOR, STEEPNESS, texture, unit};
+use super::{STEEPNESS, divisor, unit};
 use crate::{
     Result,
     filters::solve::{LANES, Lanes, Symmetric},
@@ -204,7 +204,7 @@ impl Vectorised for Gather<'_> {
         light.fill(0.0);
         for (c, axis) in known[width..].chunks_exact_mut(width).enumerate() {
             for (sum, (v, a)) in light.iter_mut().zip(radiance[c].iter().zip(albedo[c])) {
-                *sum += v.max(0.0) * exposure / (3.0 * (texture(*a) + ALBEDO_FLOOR));
+                *sum += v.max(0.0) * exposure / (3.0 * divisor(*a));
             }
             for (axis, n) in axis.iter_mut().zip(normal[c]) {
                 *axis = unit(*n);
@@ -272,6 +272,7 @@ fn fit(moments: [Lanes; MOMENTS]) -> [Lanes; KEPT] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::features::ALBEDO_FLOOR;
     use crate::nn::Rng;
 
     const SIZE: (usize, usize) = (70, 53);
