@@ -184,7 +184,8 @@ fn overlap(options: &Options) {
             (frame, set)
         });
         set.sanitize();
-        let (image, denoise) = timed(|| model.denoise(&set).expect("the passes are there"));
+        // On one of rayon's threads, as in the batch.
+        let (image, denoise) = timed(|| rayon::scope(|_| model.denoise(&set).expect("the passes are there")));
         let ((), write) = timed(|| store(frame, &image, &folder.path().join("alone.exr")));
         if round > 0 {
             reads.push(read);

@@ -352,9 +352,11 @@ fn decoding_returns_stored_values() {
         assert_eq!((part.data_window.x, part.data_window.y), (-3, 5));
         assert_eq!(frame.display_window().width, 100);
         let wanted: Vec<usize> = (0..part.channels.len()).rev().collect();
-        let planes = frame.decode(0, &wanted).unwrap();
+        let images = frame.decode(0, &[&wanted[..1], &wanted[1..]]).unwrap();
+        let planes: Vec<&[f32]> = images.iter().flat_map(|image| image.chunks(WIDTH * HEIGHT)).collect();
+        assert_eq!(planes.len(), wanted.len());
         let stored = read(&path);
-        for (&c, plane) in wanted.iter().zip(&planes) {
+        for (&c, plane) in wanted.iter().zip(planes) {
             let expected = channel(&stored, &part.channels[c].name).unwrap();
             let expected: Vec<u32> = expected.values_as_f32().map(f32::to_bits).collect();
             assert_eq!(plane.iter().map(|v| v.to_bits()).collect::<Vec<_>>(), expected);

@@ -112,7 +112,7 @@ fn layer_rgb(frame: &Frame, view_layer: Option<&str>, layer: &str) -> Result<Opt
         };
         let (Some(r), Some(g), Some(b)) = (find("R"), find("G"), find("B")) else { continue };
         let window = part.data_window;
-        let data = frame.decode(p, &[r, g, b])?.concat();
+        let data = frame.decode(p, &[&[r, g, b]])?.remove(0);
         return Ok(Some(Planes::from_vec(3, window.width, window.height, data)));
     }
     Ok(None)

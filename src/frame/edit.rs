@@ -16,11 +16,14 @@ use exr::{
         header::{Header, LayerAttributes},
     },
 };
-use half::f16;
+use half::{f16, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
 use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text, zip};
 use crate::Result;
+
+/// Largest finite half.
+const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
 /// A channel to store: values of the whole data window, row-major.
 #[derive(Clone, Copy, Debug)]
@@ -366,12 +369,21 @@ impl<'a> Encoder<'a> {
 /// Appends values in native byte order, as `exr` wants uncompressed blocks.
 fn push_values(data: &mut Vec<u8>, values: &[f32], kind: SampleType) {
     match kind {
-        // A finite value beyond the range of half must not become infinite.
-        SampleType::F16 => data.extend(values.iter().flat_map(|&v| {
-            let clamped = if v.is_finite() { v.clamp(f16::MIN.to_f32(), f16::MAX.to_f32()) } else { v };
-            f16::from_f32(clamped).to_ne_bytes()
-        })),
-        SampleType::F32 => data.extend(values.iter().flat_map(|v| v.to_ne_bytes())),
-        SampleType::U32 => data.extend(values.iter().flat_map(|v| (v.round() as u32).to_ne_bytes())),
+        SampleType::F16 => {
+            // A finite value beyond the range of half must not become infinite.
+            let bounded = |v: &f32| if v.is_finite() { v.clamp(-HALF_MAX, HALF_MAX) } else { *v };
+            let halves = Vec::<f16>::from_f32_slice(&values.iter().map(bounded).collect::<Vec<f32>>());
+            push_bytes(data, halves.into_iter().map(f16::to_ne_bytes));
+        }
+        SampleType::F32 => push_bytes(data, values.iter().map(|v| v.to_ne_bytes())),
+        SampleType::U32 => push_bytes(data, values.iter().map(|v| (v.round() as u32).to_ne_bytes())),
     }
+}
+
+/// Appends values of `N` bytes; into memory that is there, or each byte would ask whether there is room for it.
+fn push_bytes<const N: usize>(data: &mut Vec<u8>, values: impl ExactSizeIterator<Item = [u8; N]>) {
+    let start = data.len();
+    data.resize(start + N * values.len(), 0);
+    let places = data[start..].as_chunks_mut::<N>().0;
+    places.iter_mut().zip(values).for_each(|(place, value)| *place = value);
 }

@@ -45,12 +45,14 @@ pub fn compress(block: UncompressedBlock, headers: &[Header]) -> exr::error::Res
 
 /// Compressed bytes; none where they are not fewer: such a block is stored as it is.
 fn deflate(raw: &[u8]) -> Option<Vec<u8>> {
-    let even = raw.iter().step_by(2);
-    let odd = raw.iter().skip(1).step_by(2);
-    let parted: Vec<u8> = even.chain(odd).copied().collect();
+    let (pairs, last) = raw.as_chunks::<2>();
+    let mut parted: Vec<u8> = pairs.iter().map(|pair| pair[0]).collect();
+    parted.extend(last);
+    parted.extend(pairs.iter().map(|pair| pair[1]));
     let mut differences = parted.clone();
-    for (difference, pair) in differences[1..].iter_mut().zip(parted.windows(2)) {
-        *difference = pair[1].wrapping_sub(pair[0]).wrapping_add(128);
+    let neighbours = parted.iter().zip(parted.iter().skip(1));
+    for (difference, (before, byte)) in differences.iter_mut().skip(1).zip(neighbours) {
+        *difference = byte.wrapping_sub(*before).wrapping_add(128);
     }
     let mut compressed = Vec::with_capacity(raw.len());
     let status = Compress::new(flate2::Compression::new(LEVEL), true)

@@ -182,36 +182,28 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
 
     // One decoding run for each part: in single-part files all passes share their blocks.
-    let mut by_part: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    for (_, at) in held() {
-        by_part.entry(at.part).or_default().extend(&at.channels);
-    }
-    let mut planes: BTreeMap<(usize, usize), Vec<f32>> = BTreeMap::new();
-    for (part, mut channels) in by_part {
-        channels.sort_unstable();
-        channels.dedup();
-        let decoded = frame.decode(part, &channels)?;
-        let stored = frame.parts()[part].data_window;
-        for (channel, plane) in channels.into_iter().zip(decoded) {
-            planes.insert((part, channel), crop(plane, stored, window));
-        }
-    }
+    let mut by_part: BTreeMap<usize, Vec<(Pass, &[usize])>> = BTreeMap::new();
     for (&pass, at) in held() {
-        let mut data = Vec::with_capacity(at.channels.len() * window.width * window.height);
-        for &channel in &at.channels {
-            data.extend_from_slice(&planes[&(at.part, channel)]);
+        by_part.entry(at.part).or_default().push((pass, &at.channels));
+    }
+    for (part, passes) in by_part {
+        let channels: Vec<&[usize]> = passes.iter().map(|(_, channels)| *channels).collect();
+        let stored = frame.parts()[part].data_window;
+        for ((pass, channels), image) in passes.iter().zip(frame.decode(part, &channels)?) {
+            let image = crop(image, stored, window);
+            set.insert(*pass, Planes::from_vec(channels.len(), window.width, window.height, image));
         }
-        set.insert(pass, Planes::from_vec(at.channels.len(), window.width, window.height, data));
     }
     Ok(set)
 }
 
-/// The values of `plane`, stored in `from`, at the pixels of `to`.
-fn crop(plane: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
+/// The values of `image`, (C, H, W) and stored in `from`, at the pixels of `to`.
+fn crop(image: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
     if from == to {
-        return plane;
+        return image;
     }
-    let mut out = vec![0.0; to.width * to.height];
+    let (stored, wanted) = (from.width * from.height, to.width * to.height);
+    let mut out = vec![0.0; image.len() / stored * wanted];
     // Overlap in absolute coordinates, as i64: windows may lie anywhere in i32.
     let span = |a: i32, n: usize, b: i32, m: usize| {
         let start = i64::from(a).max(i64::from(b));
@@ -223,10 +215,13 @@ fn crop(plane: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
     if columns == 0 {
         return out;
     }
-    for row in 0..rows as i64 {
-        let source = (y + row - i64::from(from.y)) as usize * from.width + (x - i64::from(from.x)) as usize;
-        let target = (y + row - i64::from(to.y)) as usize * to.width + (x - i64::from(to.x)) as usize;
-        out[target..][..columns].copy_from_slice(&plane[source..][..columns]);
+    for (plane, out) in image.chunks(stored).zip(out.chunks_mut(wanted)) {
+        for row in 0..rows as i64 {
+            let source =
+                (y + row - i64::from(from.y)) as usize * from.width + (x - i64::from(from.x)) as usize;
+            let target = (y + row - i64::from(to.y)) as usize * to.width + (x - i64::from(to.x)) as usize;
+            out[target..][..columns].copy_from_slice(&plane[source..][..columns]);
+        }
     }
     out
 }
@@ -242,6 +237,9 @@ mod tests {
         // Stored: y 0: [10 11 12] at x -1..2; wanted: y -1..1, x 0..3.
         let plane = vec![10.0, 11.0, 12.0, 20.0, 21.0, 22.0];
         assert_eq!(crop(plane.clone(), from, to), [0.0, 0.0, 0.0, 11.0, 12.0, 0.0]);
+        let two = [plane.clone(), plane.iter().map(|v| v + 0.5).collect()].concat();
+        let moved = [0.0, 0.0, 0.0, 11.0, 12.0, 0.0, 0.0, 0.0, 0.0, 11.5, 12.5, 0.0];
+        assert_eq!(crop(two, from, to), moved);
         let away = Window { x: 100, y: 100, ..to };
         assert_eq!(crop(plane, from, away), [0.0; 6]);
     }
