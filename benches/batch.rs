@@ -35,6 +35,8 @@ struct Options {
 }
 
 fn main() {
+    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those up first.
+    rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut options = Options {
         only: None,
         frames: 32,
@@ -184,8 +186,7 @@ fn overlap(options: &Options) {
             (frame, set)
         });
         set.sanitize();
-        // On one of rayon's threads, as in the batch.
-        let (image, denoise) = timed(|| rayon::scope(|_| model.denoise(&set).expect("the passes are there")));
+        let (image, denoise) = timed(|| model.denoise(&set).expect("the passes are there"));
         let ((), write) = timed(|| store(frame, &image, &folder.path().join("alone.exr")));
         if round > 0 {
             reads.push(read);
