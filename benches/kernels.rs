@@ -15,6 +15,8 @@ use demc::kernels::{
 use divan::{Bencher, counter::ItemsCount};
 
 fn main() {
+    // As `demc` does: from a thread that is not one of rayon's, each kernel has to wake those up first.
+    rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     divan::main();
 }
 
