@@ -164,7 +164,7 @@ fn train_step(precision: Precision, (n, size): (usize, usize)) -> Box<dyn FnMut(
     let batch = batch(n, size, size);
     let reference = vec![0.5; n * 3 * size * size];
     let scales = vec![1.0; n];
-    let mut optimizer = Optimizer::new(Rule::Adam);
+    let mut optimizer = Optimizer::new(Rule::Adam, 0.0);
     let mut step = 0;
     Box::new(move || {
         step += 1;

@@ -357,6 +357,7 @@ fn facts() -> Facts {
         lr: (1.0, 1.0),
         loss: "both".into(),
         optimizer: "adam".into(),
+        weight_decay: 0.0,
         seed: 5,
         init: None,
         seconds: 0.0,

@@ -49,7 +49,7 @@ pub struct Args {
     /// Rows and columns of a crop, a multiple of 32; of a step's crops fewer, if the frame drawn first has not as many
     #[arg(long, default_value_t = 128)]
     patch: usize,
-    /// Learning rate of the first and last step
+    /// Largest learning rate, and that of the last step, to which it falls along a line
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
     /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, geomean, the
@@ -63,6 +63,9 @@ pub struct Args {
     /// How gradients become updates: adam, or muon, which needs fewer steps
     #[arg(long, default_value = "adam", value_parser = parse_rule)]
     optimizer: Rule,
+    /// Share of the hidden convolutions' weights that a step takes away, times the learning rate
+    #[arg(long, default_value_t = 0.0)]
+    weight_decay: f64,
     /// What convolutions round their factors to: f32 (nothing) or bf16; without it, the faster one here
     #[arg(long, value_parser = parse_precision)]
     precision: Option<Precision>,
@@ -201,6 +204,9 @@ impl Args {
                 return Err(usage(format!("{name} must be at least 1")));
             }
         }
+        if !(0.0..f64::INFINITY).contains(&self.weight_decay) {
+            return Err(usage("--weight-decay must be a number, at least 0"));
+        }
         if !(0.0..1.0).contains(&self.average) {
             return Err(usage("--average must be at least 0 and less than 1"));
         }
@@ -240,6 +246,7 @@ impl Args {
             raw_references: self.raw_references,
             optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest_trained),
+            weight_decay: self.weight_decay,
             average: self.average,
             every: self.every,
             seed: self.seed,

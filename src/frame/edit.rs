@@ -23,7 +23,7 @@ use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text, zip};
 use crate::Result;
 
 /// Largest finite half.
-const HALF_MAX: f32 = f16::MAX.to_f32_const();
+pub(crate) const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
 /// A channel to store: values of the whole data window, row-major.
 #[derive(Clone, Copy, Debug)]

@@ -24,6 +24,7 @@ use exr::{
     },
 };
 
+pub(crate) use edit::HALF_MAX;
 pub use edit::{NewChannel, Recoded};
 pub use write::atomically;
 

@@ -27,13 +27,16 @@ pub struct Facts {
     pub batch: usize,
     /// Rows and columns of a crop.
     pub patch: usize,
-    /// First and last learning rate.
+    /// Largest and last learning rate.
     pub lr: (f64, f64),
     /// What was minimised.
     pub loss: String,
     /// How gradients became updates; files from before there was a choice do not say.
     #[serde(default = "adam")]
     pub optimizer: String,
+    /// Share of the hidden convolutions' weights that a step took away at a learning rate of 1.
+    #[serde(default)]
+    pub weight_decay: f64,
     /// The seed of weights, crops and augmentation.
     pub seed: u64,
     /// The weights file it began with, if any.

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::Augment;
 use crate::{
     Error, Result,
-    frame::Frame,
+    frame::{Frame, HALF_MAX},
     nn::Rng,
     passes::{self, Pass, PassSet},
     planes::Planes,
@@ -48,9 +48,7 @@ pub struct Sample {
     pub raw_reference: Option<Planes>,
 }
 
-/// Largest finite half: brighter values are clipped in the training copy.
-const HALF_MAX: f32 = 65504.0;
-
+/// Halves of the training copy: brighter values are clipped to the largest.
 fn to_half(values: &[f32]) -> Vec<f16> {
     let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
     Vec::from_f32_slice(&clipped)

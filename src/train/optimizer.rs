@@ -3,7 +3,7 @@
 use dfdx::{
     shapes::Axes2,
     tensor::{Cpu, Gradients, Tensor, TensorFromVec},
-    tensor_ops::{AdamConfig, PermuteTo, TryMatMul},
+    tensor_ops::{AdamConfig, PermuteTo, TryMatMul, WeightDecay},
 };
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -41,6 +41,7 @@ impl std::fmt::Display for Rule {
 /// A rule and its moments.
 pub struct Optimizer {
     rule: Rule,
+    weight_decay: f64,
     first: Gradients<f32, Cpu>,
     /// Stays zero where Muon needs none.
     second: Gradients<f32, Cpu>,
@@ -59,9 +60,11 @@ const UPDATE_SIZE: f32 = 0.2;
 const CPU: &str = "the CPU allocates or aborts";
 
 impl Optimizer {
-    /// One that has seen nothing.
-    pub fn new(rule: Rule) -> Self {
-        Self { rule, first: Gradients::leaky(), second: Gradients::leaky() }
+    /// One that has seen nothing. Each step takes `weight_decay` times the learning rate of the hidden
+    /// convolutions' weights away (Loshchilov and Hutter 2019): Muon's updates are as long where a gradient is
+    /// all noise, and what they add up to there would never go.
+    pub fn new(rule: Rule, weight_decay: f64) -> Self {
+        Self { rule, weight_decay, first: Gradients::leaky(), second: Gradients::leaky() }
     }
 
     /// One update; `step` counts from 1. Returns the norm of the gradient before clipping.
@@ -86,7 +89,6 @@ impl Optimizer {
             return norm;
         }
         let scale = (CLIP / norm.max(CLIP)) as f32;
-        let config = AdamConfig { lr, ..AdamConfig::default() };
         let mut matrices: Vec<(&mut Param, Vec<f32>)> = Vec::new();
         for param in params.into_iter().filter(|p| p.trainable) {
             let gradient = gradients.get_or_alloc_mut(&param.tensor).expect(CPU);
@@ -98,18 +100,26 @@ impl Optimizer {
                     MOMENTUM * *m + g
                 });
                 let direction = nesterov.collect();
-                matrices.push((param, direction));
+                // Where nothing is learned, as when all that a layer feeds is cut off by ReLUs, momentum fades but
+                // keeps its direction, in which steps of full length would lead ever on.
+                if gradient.iter().any(|g| *g != 0.0) {
+                    matrices.push((param, direction));
+                }
                 continue;
             }
             let second = self.second.get_or_alloc_mut(&param.tensor).expect(CPU);
             let t = i32::try_from(step).expect("fewer than two billion steps");
+            let weight_decay = param.hidden.then_some(WeightDecay::Decoupled(self.weight_decay));
+            let config = AdamConfig { lr, weight_decay, ..AdamConfig::default() };
             config.try_update(t, &mut param.tensor, first, second, gradient).expect(CPU);
         }
+        let kept = 1.0 - (lr * self.weight_decay) as f32;
         matrices.into_par_iter().for_each(|(param, direction)| {
             let (rows, columns) = (param.shape[0], param.shape[1..].iter().product::<usize>());
             let rate = lr as f32 * UPDATE_SIZE * (rows.max(columns) as f32).sqrt();
             let update = orthogonal(direction, rows, columns);
-            let values: Vec<f32> = param.values().iter().zip(&update).map(|(v, u)| v - rate * u).collect();
+            let values: Vec<f32> =
+                param.values().iter().zip(&update).map(|(v, u)| kept * v - rate * u).collect();
             param.set(&values);
         });
         norm
@@ -189,6 +199,44 @@ mod tests {
             assert!(rest.iter().all(|v| v.abs() < 1e-3), "nothing else appears");
             let scaled = orthogonal(matrix.iter().map(|v| 1e-4 * v).collect(), rows, columns);
             assert!(scaled.iter().zip(&out).all(|(a, b)| (a - b).abs() < 1e-3));
+        }
+    }
+
+    #[test]
+    fn momentum_alone_moves_nothing() {
+        let values: Vec<f32> = (1..=12).map(|v| v as f32).collect();
+        let mut param = Param::new(&Cpu::default(), "layer".into(), &[3, 4], values.clone());
+        param.hidden = true;
+        let mut optimizer = Optimizer::new(Rule::Muon, 0.0);
+        let mut step = |step, gradient: f32| {
+            let mut gradients = Gradients::leaky();
+            gradients.get_or_alloc_mut(&param.tensor).unwrap()[0] = gradient;
+            optimizer.update(step, 0.1, vec![&mut param], &mut gradients);
+            param.values()
+        };
+        let moved = step(1, 1.0);
+        assert_ne!(moved, values);
+        assert_eq!(step(2, 0.0), moved);
+        assert_ne!(step(3, 1.0), moved);
+    }
+
+    #[test]
+    fn decay_takes_a_share_of_hidden_weights_alone() {
+        let before: Vec<f32> = (1..=12).map(|v| v as f32).collect();
+        let after = |rule, hidden, decay| {
+            let param = Param::new(&Cpu::default(), "layer".into(), &[3, 4], before.clone());
+            let mut param = Param { hidden, ..param };
+            let mut gradients = Gradients::leaky();
+            gradients.get_or_alloc_mut(&param.tensor).unwrap()[0] = 1.0;
+            Optimizer::new(rule, decay).update(1, 0.1, vec![&mut param], &mut gradients);
+            param.values()
+        };
+        for rule in Rule::ALL {
+            let kept = after(rule, true, 0.0);
+            let shrunk = after(rule, true, 0.5);
+            let mut shares = before.iter().zip(kept.iter().zip(&shrunk)).map(|(b, (k, s))| (k - s) / b);
+            assert!(shares.all(|share| (share - 0.05).abs() < 1e-5), "{rule}: {shrunk:?}");
+            assert_eq!(after(rule, false, 0.5), after(rule, false, 0.0), "{rule}");
         }
     }
 

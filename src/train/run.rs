@@ -44,7 +44,7 @@ pub struct Options {
     pub batch: usize,
     /// Rows and columns of a crop, unless the frame that is drawn first for its step is smaller.
     pub patch: usize,
-    /// Learning rate of the first and of the last step; it falls geometrically.
+    /// Largest learning rate, and that of the last step, to which it falls along a line.
     pub lr: (f64, f64),
     /// What is minimised.
     pub loss: Loss,
@@ -54,6 +54,9 @@ pub struct Options {
     /// How gradients become updates.
     #[serde(default)]
     pub optimizer: Rule,
+    /// Share of the convolutions' weights that a step takes away at a learning rate of 1.
+    #[serde(default)]
+    pub weight_decay: f64,
     /// What convolutions round their factors to.
     pub precision: Precision,
     /// Weight of the past in the running average of the weights, which is what is validated and kept.
@@ -107,7 +110,7 @@ pub fn run(
     set_prefilter(&mut *network, options)?;
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
-    let mut optimizer = Optimizer::new(options.optimizer);
+    let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
     let mut progress = Progress::default();
     if resume && checkpoint_path.exists() {
         progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut optimizer)?;
@@ -123,7 +126,7 @@ pub fn run(
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
         let samples = draw(&training, options, network.multiple(), progress.step);
-        let lr = learning_rate(options, progress.step);
+        let lr = learning_rate(options.lr, options.steps, progress.step);
         let (loss, finite) = step(&mut *network, &mut optimizer, options, lr, progress.step + 1, &samples)?;
         progress.step += 1;
         if finite {
@@ -203,10 +206,14 @@ fn draw(dataset: &Dataset, options: &Options, multiple: usize, step: usize) -> V
     (0..count as u64).into_par_iter().map(|crop| dataset.draw(side, &mut Rng::new(seed, crop))).collect()
 }
 
-/// Falls geometrically from the first step to the last.
-fn learning_rate(options: &Options, step: usize) -> f64 {
-    let (first, last) = options.lr;
-    first * (last / first).powf(step as f64 / (options.steps.max(2) - 1) as f64)
+/// Steps in which the learning rate grows to its largest, a tenth of all at most: moments are young then.
+const WARM_UP: usize = 100;
+
+/// Falls along a line from the first step to the last (Defazio et al. 2023), but for the first few.
+fn learning_rate((largest, last): (f64, f64), steps: usize, step: usize) -> f64 {
+    let done = step as f64 / (steps.max(2) - 1) as f64;
+    let warmed = (step + 1) as f64 / WARM_UP.min(steps / 10).max(1) as f64;
+    warmed.min(1.0) * (largest + (last - largest) * done)
 }
 
 /// One optimiser step. Returns the loss and whether its gradient was finite.
@@ -290,11 +297,34 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         lr: options.lr,
         loss: options.loss.to_string(),
         optimizer: options.optimizer.to_string(),
+        weight_decay: options.weight_decay,
         seed: options.seed,
         init: options.init.as_ref().map(|p| p.display().to_string()),
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,
         validation_ssim: row.val_ssim,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rate_rises_briefly_and_falls_along_a_line() {
+        let rate = |step| learning_rate((2e-3, 1e-5), 1001, step);
+        assert!((rate(0) - 2e-5).abs() < 1e-12);
+        assert!((rate(500) - 1.005e-3).abs() < 1e-12);
+        assert!((rate(1000) - 1e-5).abs() < 1e-12);
+        assert!((0..99).all(|step| rate(step) < rate(step + 1)));
+        assert!((99..1000).all(|step| rate(step) > rate(step + 1)));
+    }
+
+    #[test]
+    fn runs_of_few_steps_have_rates_too() {
+        for (steps, step, expected) in [(1, 0, 2e-3), (2, 0, 2e-3), (2, 1, 1e-5)] {
+            assert!((learning_rate((2e-3, 1e-5), steps, step) - expected).abs() < 1e-12, "{step} of {steps}");
+        }
     }
 }
