@@ -70,6 +70,9 @@ def parse(arguments):
     parser.add_argument("--denoise-references", action="store_true",
                         help="clean the references' last noise with Blender's own denoiser, guides denoised first: "
                              "64 to 128 samples then serve as well as many more")
+    parser.add_argument("--guides-only", action="store_true",
+                        help="trace no light beyond the surface that guides are of, in two thirds of the time: pairs for a "
+                             "prefilter (their Combined is of no use), whose references keep albedo and normal")
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--stop-file", metavar="PATH", help="stop before the next scene once this file exists")
     options = parser.parse_args(arguments)
@@ -77,6 +80,8 @@ def parse(arguments):
         for folder in folders:
             if not os.path.isdir(folder):
                 parser.error(f"{folder}: no such folder (--{name})")
+    if options.guides_only and options.denoise_references:
+        parser.error("--guides-only keeps no light that --denoise-references could clean")
     options.blends = find_blends(options.blend) if options.blend else {}
     known = set(KINDS) | set(options.blends)
     options.kinds = options.kinds.split(",") if options.kinds else sorted(known)
@@ -203,13 +208,15 @@ def build(options, library, seed, kind):
 
 
 def render_crop(options, scene, region, crop, seed, partial):
-    """Renders a crop: noisy images with all passes, then the reference: Combined, and where it is denoised also
-    what it was denoised from (Noisy Image and the guides)."""
+    """Renders a crop: noisy images with all passes, then the reference: Combined, where it is denoised also
+    what it was denoised from (Noisy Image and the guides), and the guides where they are all that is wanted."""
     layers = [layer for layer in scene.view_layers if layer.use][:1]
     with Edits() as edits:
         rendering.set_region(edits, scene, region)
         for layer in scene.view_layers:
             edits.set(layer, "use", layer == layers[0])
+        if options.guides_only:
+            rendering.stop_at_guides(edits, scene)
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             rendering.enable_passes(passes, layers)
@@ -223,6 +230,7 @@ def render_crop(options, scene, region, crop, seed, partial):
                                    options.ref_noise, _LEAST_SAMPLES if options.denoise_references else 0)
             if options.denoise_references:
                 rendering.denoise(passes, scene, layers)
+            if options.denoise_references or options.guides_only:
                 for layer in layers:
                     passes.set(layer.cycles, "denoising_store_passes", True)
             render_compact(scene, os.path.join(options.out, names.reference_name(crop)), partial)

@@ -306,3 +306,25 @@ fn an_unwritable_output_is_one_line() {
         predicate::str::contains("cannot create").and(predicate::function(|t: &str| t.lines().count() == 1)),
     );
 }
+
+#[test]
+fn a_reference_of_another_scene_is_scored_and_said_to_be_one() {
+    let out = tempfile::tempdir().unwrap();
+    let manifest = out.path().join("set.csv");
+    let row = |scene: &str, reference: &str| {
+        let [noisy, reference] =
+            ["s0010_outdoor_0004spp.exr", reference].map(|name| data(name).display().to_string());
+        format!("{scene},{noisy},{reference},4\n")
+    };
+    let rows = row("good", "s0010_outdoor_ref.exr") + &row("swapped", "s0000_room_ref.exr");
+    fs::write(&manifest, format!("scene,noisy,reference,spp\n{rows}")).unwrap();
+    let said = "do not show the same scene";
+    eval(&manifest, out.path(), &["--models", "noisy", "--no-sheets"])
+        .success()
+        .stderr(predicate::str::contains("note: swapped_0004spp: ").and(predicate::str::contains(said)))
+        .stderr(predicate::str::contains("good_0004spp: ").not());
+    assert!(table(&out.path().join("scores.csv")).iter().all(|row| !row["relmse"].is_empty()));
+    for file in ["run.json", "report.html"] {
+        assert_eq!(fs::read_to_string(out.path().join(file)).unwrap().matches(said).count(), 1, "{file}");
+    }
+}

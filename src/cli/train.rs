@@ -299,6 +299,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {per_sec} eta {eta} loss {msg}");
     bar.set_style(style.expect("the template is well formed"));
     let mut on = |event| match event {
+        Event::Warning(warning) => bar.suspend(|| eprintln!("warning: {warning}")),
         Event::Step { step, loss } => {
             bar.set_position(step as u64);
             bar.set_message(format!("{loss:.4}"));

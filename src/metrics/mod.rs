@@ -1,7 +1,8 @@
 //! How far an image is from its reference: pure functions on linear radiance, (3, H, W).
 //!
 //! One file a family, each with its formula, constants and source: [`error`] (RelMSE, RMSE, maximum
-//! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices.
+//! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices; and [`pairing`], which
+//! tells whether the two belong together.
 //! [`score`] computes them all. Sums run in f64 row by row in a fixed order: the number of threads
 //! does not change a digit.
 
@@ -15,6 +16,7 @@ use crate::planes::Planes;
 pub mod display;
 pub mod error;
 pub mod flip;
+pub mod pairing;
 pub mod ssim;
 
 /// Every metric of one image, named like the columns of the report.

@@ -31,7 +31,7 @@ pub enum Precision {
 impl Precision {
     /// The fastest one on this processor in which networks can be trained.
     pub fn fastest_trained() -> Self {
-        if Engine::detect().has_bf16() { Self::Bf16 } else { Self::F32 }
+        if Engine::detect().prefers_bf16() { Self::Bf16 } else { Self::F32 }
     }
 
     /// The fastest one on this processor for inference; 8 bits only where the ranges are known.

@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    metrics::{self, Incomparable},
+    metrics::{self, Incomparable, pairing},
     passes::{self, Pass, PassSet},
     planes::Planes,
     testset::Pair,
@@ -250,8 +250,13 @@ fn run_pair(
             row.set_time(times, width * height);
         }
     }
+    let mut notes: Vec<(String, String)> =
+        open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect();
+    if let Some(share) = pairing::mismatch(&loaded.noisy, &loaded.reference) {
+        notes.push((NOISY.into(), format!("{}: {}", pair.id(), pairing::say(share))));
+    }
     Done {
-        notes: open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect(),
+        notes,
         rows: rows.into_iter().flatten().collect(),
         scene: shown.then_some(Scene { reference: loaded.reference, images }),
     }

@@ -27,7 +27,7 @@ pub struct Settings {
     methods: BTreeMap<String, String>,
     /// Stamp of each pair, by its noisy and reference files.
     pairs: BTreeMap<String, String>,
-    /// What each method, by name, said of its treatment of the pairs.
+    /// What each method, by name, said of its treatment of the pairs; what is said of a pair itself is under `noisy`.
     #[serde(default)]
     pub notes: BTreeMap<String, BTreeSet<String>>,
 }

@@ -9,6 +9,7 @@ use super::Augment;
 use crate::{
     Error, Result,
     frame::{Frame, HALF_MAX},
+    metrics::pairing,
     nn::Rng,
     passes::{self, Pass, PassSet},
     planes::Planes,
@@ -34,6 +35,8 @@ struct Stored {
     reference: Vec<f16>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
     raw_reference: Option<Vec<f16>>,
+    /// See [`pairing::mismatch`].
+    mismatch: Option<f64>,
 }
 
 /// A crop: noisy passes and the reference radiance.
@@ -91,6 +94,14 @@ impl Dataset {
     /// Whether it holds no frame.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
+    }
+
+    /// What the user should know of pairs that do not belong together, whose file each line names.
+    pub fn warnings(&self) -> impl Iterator<Item = String> {
+        self.frames.iter().filter_map(|stored| {
+            let said = pairing::say(stored.mismatch?);
+            Some(format!("{}: {said}", stored.pair.noisy.display()))
+        })
     }
 
     /// The whole of frame `index`, and its name.
@@ -215,6 +226,7 @@ impl Stored {
             passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
             reference: to_half(&target.data),
             raw_reference,
+            mismatch: pairing::mismatch(noisy.require(Pass::Combined, "training")?, target),
         })
     }
 
@@ -282,6 +294,7 @@ mod tests {
             passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
             reference: plane(3),
             raw_reference: None,
+            mismatch: None,
         }
     }
 

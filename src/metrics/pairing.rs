@@ -1,0 +1,110 @@
+//! Whether a render and its reference show the same scene: textures that Blender gave to other materials, or an object
+//! that moved between the two, are charged to every method, and teach a network to blur.
+//!
+//! In squares of 16x16 pixels the mean luminance of a render differs from its reference's by noise alone. Noise with few
+//! bright samples leaves many squares too dark and few too bright; another texture or place makes some brighter
+//! and others darker. So the smaller share of the two tells (this project's own test; on 300 pairs that belong together
+//! it is at most 0.5%).
+
+use super::display::LUMINANCE;
+use crate::planes::Planes;
+
+/// Rows and columns of a square.
+const SQUARE: usize = 16;
+
+/// A square differs when its mean is off by more than as many standard errors, and by more than this share of the
+/// reference's, with an offset that keeps black squares out.
+const STANDARD_ERRORS: f64 = 6.0;
+const LEAST_CHANGE: f64 = 0.04;
+const OFFSET: f64 = 1e-4;
+
+/// From this share of the squares on, a render and its reference are said to differ.
+const MISMATCHED: f64 = 0.02;
+
+/// The smaller of two shares of the squares of an image, those too bright and those too dark for `reference`, where it is so
+/// large that the two do not show the same scene. Both are radiance, (3, H, W).
+///
+/// # Panics
+/// If sizes differ, or are not those of RGB.
+pub fn mismatch(image: &Planes, reference: &Planes) -> Option<f64> {
+    let size = |p: &Planes| (p.channels, p.width, p.height);
+    assert!(image.channels == 3 && size(image) == size(reference), "both are RGB of one size");
+    let luminance = |planes: &Planes, at: usize| {
+        LUMINANCE.iter().zip(0..3).map(|(weight, c)| weight * f64::from(planes.channel(c)[at])).sum::<f64>()
+    };
+    let (columns, rows) = (image.width / SQUARE, image.height / SQUARE);
+    let (mut brighter, mut darker) = (0usize, 0usize);
+    for square in 0..columns * rows {
+        let (x0, y0) = (square % columns * SQUARE, square / columns * SQUARE);
+        let (mut sum, mut squares, mut light) = (0.0, 0.0, 0.0);
+        for y in y0..y0 + SQUARE {
+            for at in y * image.width + x0..y * image.width + x0 + SQUARE {
+                let expected = luminance(reference, at);
+                let difference = luminance(image, at) - expected;
+                sum += difference;
+                squares += difference * difference;
+                light += expected;
+            }
+        }
+        let n = (SQUARE * SQUARE) as f64;
+        let (mean, light) = (sum / n, light / n);
+        let error = ((squares / n - mean * mean).max(0.0) / n).sqrt();
+        if mean.abs() > STANDARD_ERRORS * error && mean.abs() > LEAST_CHANGE * (light + OFFSET) {
+            *if mean > 0.0 { &mut brighter } else { &mut darker } += 1;
+        }
+    }
+    let share = brighter.min(darker) as f64 / (columns * rows).max(1) as f64;
+    (share > MISMATCHED).then_some(share)
+}
+
+/// What a [`mismatch`] means, for a message that names the pair.
+pub fn say(share: f64) -> String {
+    format!(
+        "the frame and its reference do not show the same scene: {:.0}% of the picture is brighter and at least as much \
+         darker than noise explains; render both again, or leave the pair out",
+        100.0 * share
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::Rng;
+
+    /// A checkerboard of squares of `side` pixels, 96x96, whose pixels are `noise(value)`.
+    fn checkers(side: usize, mut noise: impl FnMut(f32) -> f32) -> Planes {
+        let mut planes = Planes::new(3, 96, 96);
+        for y in 0..96 {
+            for x in 0..96 {
+                let value = noise(if (x / side + y / side).is_multiple_of(2) { 0.6 } else { 0.4 });
+                (0..3).for_each(|c| planes.channel_mut(c)[y * 96 + x] = value);
+            }
+        }
+        planes
+    }
+
+    #[test]
+    fn noise_is_no_mismatch_however_skewed_and_another_pattern_is_one() {
+        let reference = checkers(32, |v| v);
+        let mut rng = Rng::new(5, 0);
+        // One sample in ten finds a lamp: nine tenths of the pixels are black.
+        let starved = checkers(32, |v| if rng.below(10) == 0 { 10.0 * v } else { 0.0 });
+        assert_eq!(mismatch(&starved, &reference), None);
+        assert_eq!(mismatch(&reference, &reference), None);
+        // Brighter all over is another exposure, not another scene.
+        assert_eq!(mismatch(&checkers(32, |v| 1.5 * v), &reference), None);
+
+        let mut noisy = |v: f32| v * (0.5 + rng.below(1000) as f32 / 1000.0);
+        assert_eq!(mismatch(&checkers(32, &mut noisy), &reference), None);
+        let other =
+            mismatch(&checkers(48, &mut noisy), &reference).expect("other checkers are another scene");
+        assert!((0.2..0.5).contains(&other), "{other}");
+        assert!(say(other).contains("do not show the same scene"));
+    }
+
+    #[test]
+    fn pictures_smaller_than_a_square_say_nothing() {
+        let small = Planes::new(3, 15, 40);
+        assert_eq!(mismatch(&small, &small), None);
+    }
+}
