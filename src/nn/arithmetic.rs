@@ -7,7 +7,7 @@ use super::{
     pool::{Buffer, PlaneBuffer, plane_buffer},
 };
 use crate::kernels::{
-    Block, Shape, View, ViewMut,
+    Block, LANES, Shape, View, ViewMut,
     conv::{self, Direction, Epilogue, Geometry},
     layout::from_blocked_shuffled,
     narrow::{self, Engine, Format, Operand},
@@ -24,7 +24,7 @@ pub enum Precision {
     /// To bfloat16 (8 bits of mantissa), as matrix units want them.
     Bf16,
     /// To 8 bits, in steps that fit the ranges a trained network's activations have; for inference only. A
-    /// network's inputs stay as [`Precision::fastest_trained`] has them.
+    /// network's inputs, which have signs, stay as [`Precision::of_inputs`] has them.
     Int8,
 }
 
@@ -32,6 +32,13 @@ impl Precision {
     /// The fastest one on this processor in which networks can be trained.
     pub fn fastest_trained() -> Self {
         if Engine::detect().prefers_bf16() { Self::Bf16 } else { Self::F32 }
+    }
+
+    /// The fastest one on this processor for a first layer of so many outputs, the rest being computed in 8 bits. What
+    /// few outputs take is the time of reading, which bfloat16 halves even where it multiplies no faster.
+    fn of_inputs(outputs: usize) -> Self {
+        let is_bound_by_memory = outputs <= LANES;
+        if is_bound_by_memory && Engine::detect().has_bf16() { Self::Bf16 } else { Self::fastest_trained() }
     }
 
     /// The fastest one on this processor for inference; 8 bits only where the ranges are known.
@@ -67,7 +74,7 @@ impl Arithmetic {
         let Self { inputs, outputs, geometry, .. } = self;
         match self.precision {
             Precision::Int8 if steps.is_empty() => {
-                Self { precision: Precision::fastest_trained(), ..self.clone() }.pack(weights, steps)
+                Self { precision: Precision::of_inputs(*outputs), ..self.clone() }.pack(weights, steps)
             }
             Precision::Int8 => {
                 assert_eq!(steps.len(), inputs.len(), "one step a source");

@@ -77,7 +77,7 @@ impl Engine {
     }
 
     /// Whether it has instructions for bfloat16.
-    fn has_bf16(self) -> bool {
+    pub fn has_bf16(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         return !matches!(self.0, Unit::Portable | Unit::Vnni);
         #[cfg(not(target_arch = "x86_64"))]
