@@ -257,6 +257,29 @@ fn generates_the_same_pixels_for_the_same_seed() {
 }
 
 #[test]
+fn guides_alone_are_the_guides_of_whole_renders() {
+    let folder = tempfile::tempdir().unwrap();
+    let load = |kind: &str, more: &str| {
+        let out = folder.path().join(format!("{kind}{more}"));
+        let arguments = format!("--seeds 7:8 --kinds {kind} --size 40 --ref-spp 8 --ref-noise 0 {more}");
+        generate(&out, &arguments);
+        let [pair] = testset::pairs(out.to_str().unwrap()).unwrap().try_into().expect("one crop is one pair");
+        [&pair.noisy, &pair.reference].map(|path| passes::load(path, None).unwrap())
+    };
+    for kind in ["glass", "materials"] {
+        let ([noisy, _], [alone, reference]) = (load(kind, ""), load(kind, "--guides-only"));
+        assert_ne!(noisy.get(Pass::Combined), alone.get(Pass::Combined), "{kind}: light ends early");
+        for pass in [Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+            let [whole, alone] = [&noisy, &alone].map(|frame| frame.require(pass, "the test").unwrap());
+            // A sample that is split between a mirror and something rough may go on as either.
+            let differing = whole.data.iter().zip(&alone.data).filter(|(a, b)| a != b).count();
+            assert!(differing * 100 < whole.data.len(), "{kind}: {differing} values of {pass} differ");
+            assert!(reference.get(pass).is_some(), "{kind}: the reference keeps its guides");
+        }
+    }
+}
+
+#[test]
 fn builds_every_kind_of_scene_without_assets() {
     let said = run(blender().arg(snippet("every_kind.py")).arg(script("")));
     let kinds: Vec<_> = said.lines().filter_map(|line| line.strip_prefix("KIND ")).collect();

