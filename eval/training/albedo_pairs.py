@@ -18,19 +18,24 @@ ALBEDO_FLOOR = 0.05  # src/features.rs
 KEPT = ("Combined", "Denoising Normal", "Denoising Albedo")
 
 
-def convert(source, target):
-    """Writes one frame or reference; returns whether it holds an albedo."""
-    channels = exr.read(source)
-    try:
-        albedo, albedo_names = planes(channels, "Denoising Albedo", "RGB")
-        _, radiance_names = planes(channels, "Combined", "RGB")
-    except ValueError:
-        return False
+def lit(channels):
+    """Those channels of a frame or reference that a prefilter is trained on; ValueError if it holds no albedo."""
+    albedo, albedo_names = planes(channels, "Denoising Albedo", "RGB")
+    _, radiance_names = planes(channels, "Combined", "RGB")
     kept = {name: values for name, values in channels.items() if name.rsplit(".", 1)[0].endswith(KEPT)}
     for c, name in enumerate(radiance_names):
         kept[name] = np.clip(albedo[..., c], 0, 1) + ALBEDO_FLOOR
     kept.update({name: np.ones_like(albedo[..., 0]) for name in albedo_names})
-    exr.write_half(target, kept)
+    return kept
+
+
+def convert(source, target):
+    """Writes one frame or reference; returns whether it holds an albedo."""
+    try:
+        channels = lit(exr.read(source))
+    except ValueError:
+        return False
+    exr.write_half(target, channels)
     return True
 
 

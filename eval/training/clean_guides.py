@@ -3,7 +3,8 @@
     python clean_guides.py '../shared/data/val/*_0004spp.exr' OUT --oidn PATH/oidnDenoise --guides albedo
 
 The noisy frames keep their Combined pass; the passes named by --guides are replaced by what Open Image Denoise,
-quality high, makes of them. References are copied. With --keep-quotient, Combined is scaled by clean over noisy
+quality high, makes of them; with --spp N by those of a render with as many samples, where <scene>_<N>spp.exr lies beside the
+frame, and other frames are left out. References are copied. With --keep-quotient, Combined is scaled by clean over noisy
 albedo, so that a model that divides by the albedo it is given divides by the noisy one in effect.
 """
 
@@ -28,6 +29,7 @@ def main():
     parser.add_argument("out", help="folder for the frames with clean guides")
     parser.add_argument("--guides", default="albedo,normal", help="albedo, normal or both (default)")
     parser.add_argument("--keep-quotient", action="store_true", help="leave radiance over albedo as it is")
+    parser.add_argument("--spp", type=int, metavar="N", help="take guides from a render with N samples, not from the denoiser")
     parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
@@ -35,11 +37,17 @@ def main():
         for source in sorted(glob.glob(options.frames)):
             scene = os.path.basename(source).rsplit("_", 1)[0]
             reference = os.path.join(os.path.dirname(source), scene + "_ref.exr")
+            more = os.path.join(os.path.dirname(source), f"{scene}_{options.spp:04}spp.exr") if options.spp else None
+            if more and not os.path.exists(more):
+                continue
             channels = exr.read(source)
             for guide in options.guides.split(","):
                 ending, letters, option = GUIDES[guide]
                 noisy, names = planes(channels, ending, letters)
-                clean = denoise(options.oidn, folder, "clean", **{option: noisy})
+                if more:
+                    clean, _ = planes(exr.read(more), ending, letters)
+                else:
+                    clean = denoise(options.oidn, folder, "clean", **{option: noisy})
                 channels.update({name: clean[..., c] for c, name in enumerate(names)})
                 if guide == "albedo" and options.keep_quotient:
                     floored = lambda albedo: np.clip(albedo, 0.0, 1.0) + ALBEDO_FLOOR

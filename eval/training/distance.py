@@ -19,9 +19,8 @@ from clean_references import exr, planes
 from methods import add_options, both
 
 
-def errors(ours, theirs, reference):
-    """RelMSE of both against the denoised reference, and the difference of both against the noisy one."""
-    denoised, raw = (planes(reference, name, "RGB")[0] for name in ("Combined", "Noisy Image"))
+def errors(ours, theirs, denoised, raw):
+    """RelMSE of both against a denoised reference, and the difference of both against a noisy one."""
     weight = 1 / (denoised**2 + 1e-3)
     relmse = [float(((image - denoised) ** 2 * weight).mean()) for image in (ours, theirs)]
     return *relmse, float(((ours - theirs) * (ours + theirs - 2 * raw) * weight).mean())
@@ -52,7 +51,8 @@ def main():
             if not any("Noisy Image." in name for name in reference):
                 continue
             ours, theirs = both(options, pair["noisy"], folder)
-            rows.append(errors(ours, theirs, reference))
+            references = (planes(reference, name, "RGB")[0] for name in ("Combined", "Noisy Image"))
+            rows.append(errors(ours, theirs, *references))
     rows.sort(key=lambda row: row[1])
     tell("all", rows)
     for k, name in enumerate(("lowest", "middle", "highest")):

@@ -16,9 +16,9 @@ import os
 import numpy as np
 from PIL import Image
 
+from albedo_pairs import lit
 from clean_references import exr
 
-ALBEDO_FLOOR = 0.05  # src/features.rs
 FILTER_WIDTH = 1.5
 SAMPLES, REFERENCE_SAMPLES = 4, 48
 
@@ -170,10 +170,10 @@ class Picture:
         albedo, normal = (total / samples for total in sums)
         channels = {}
         for c in range(3):
-            channels[f"ViewLayer.Combined.{'RGB'[c]}"] = np.clip(albedo[..., c], 0, 1) + ALBEDO_FLOOR
-            channels[f"ViewLayer.Denoising Albedo.{'RGB'[c]}"] = np.ones_like(albedo[..., c])
+            for name in ("Combined", "Denoising Albedo"):
+                channels[f"ViewLayer.{name}.{'RGB'[c]}"] = albedo[..., c]
             channels[f"ViewLayer.Denoising Normal.{'XYZ'[c]}"] = normal[..., c]
-        return {name: values.astype(np.float32) for name, values in channels.items()}
+        return lit({name: values.astype(np.float32) for name, values in channels.items()})
 
 
 def main():

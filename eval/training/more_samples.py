@@ -11,6 +11,7 @@ import argparse
 import tempfile
 
 from clean_references import exr, planes
+from distance import errors
 from methods import add_options, both
 
 
@@ -26,10 +27,8 @@ def main():
         ours, theirs = both(options, options.frame, folder)
         target = sum(both(options, more, folder)) / 2
     raw, _ = planes(exr.read(more), "Combined", "RGB")
-    weight = 1 / (target**2 + 1e-3)
-    for name, image in (("ours", ours), ("theirs", theirs)):
-        print(f"{name:6} {((image - target) ** 2 * weight).mean():.5f}")
-    print(f"ours - theirs, unbiased {((ours - theirs) * (ours + theirs - 2 * raw) * weight).mean():+.5f}")
+    relmse, their_relmse, difference = errors(ours, theirs, target, raw)
+    print(f"ours   {relmse:.5f}\ntheirs {their_relmse:.5f}\nours - theirs, unbiased {difference:+.5f}")
 
 
 if __name__ == "__main__":

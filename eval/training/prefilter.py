@@ -6,8 +6,7 @@
 import sys
 
 import weights
-
-PREFILTER = "prefilter."  # src/models/pyramid.rs
+from narrow import PREFILTER
 
 
 def main():

@@ -22,17 +22,22 @@ const GAMMA: f64 = 2.2;
 /// If `reference` is not (3, H, W) with at least one pixel.
 pub fn exposure(reference: &Planes) -> Option<f64> {
     assert!(reference.channels == 3 && reference.pixels() > 0, "exposure is defined on RGB");
-    let [r, g, b] = [0, 1, 2].map(|c| reference.channel(c));
-    let mut luminance: Vec<f64> = (0..reference.pixels())
-        .into_par_iter()
-        .map(|i| {
-            LUMINANCE[0] * f64::from(r[i]) + LUMINANCE[1] * f64::from(g[i]) + LUMINANCE[2] * f64::from(b[i])
-        })
-        .collect();
+    let mut luminance = luminance(reference);
     luminance.par_sort_unstable_by(f64::total_cmp);
     let cap = percentile(&luminance, CAP_PERCENTILE);
     let mean = luminance.iter().map(|y| y.min(cap)).sum::<f64>() / luminance.len() as f64;
     (mean > 0.0).then(|| TARGET / mean)
+}
+
+/// Rec. 709 luminance of every pixel of an image, (3, H, W).
+pub fn luminance(image: &Planes) -> Vec<f64> {
+    let [r, g, b] = [0, 1, 2].map(|c| image.channel(c));
+    (0..image.pixels())
+        .into_par_iter()
+        .map(|i| {
+            LUMINANCE[0] * f64::from(r[i]) + LUMINANCE[1] * f64::from(g[i]) + LUMINANCE[2] * f64::from(b[i])
+        })
+        .collect()
 }
 
 /// The percentile of sorted values, as `numpy.percentile` interpolates by default.

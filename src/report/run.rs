@@ -252,9 +252,8 @@ fn run_pair(
     }
     let mut notes: Vec<(String, String)> =
         open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect();
-    if let Some(share) = pairing::mismatch(&loaded.noisy, &loaded.reference) {
-        notes.push((NOISY.into(), format!("{}: {}", pair.id(), pairing::say(share))));
-    }
+    let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
+    notes.extend(warning.map(|warning| (NOISY.into(), warning)));
     Done {
         notes,
         rows: rows.into_iter().flatten().collect(),

@@ -35,8 +35,8 @@ struct Stored {
     reference: Vec<f16>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
     raw_reference: Option<Vec<f16>>,
-    /// See [`pairing::mismatch`].
-    mismatch: Option<f64>,
+    /// See [`pairing::warning`].
+    warning: Option<String>,
 }
 
 /// A crop: noisy passes and the reference radiance.
@@ -97,11 +97,8 @@ impl Dataset {
     }
 
     /// What the user should know of pairs that do not belong together, whose file each line names.
-    pub fn warnings(&self) -> impl Iterator<Item = String> {
-        self.frames.iter().filter_map(|stored| {
-            let said = pairing::say(stored.mismatch?);
-            Some(format!("{}: {said}", stored.pair.noisy.display()))
-        })
+    pub fn warnings(&self) -> impl Iterator<Item = &String> {
+        self.frames.iter().filter_map(|stored| stored.warning.as_ref())
     }
 
     /// The whole of frame `index`, and its name.
@@ -226,7 +223,11 @@ impl Stored {
             passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
             reference: to_half(&target.data),
             raw_reference,
-            mismatch: pairing::mismatch(noisy.require(Pass::Combined, "training")?, target),
+            warning: pairing::warning(
+                pair.noisy.display(),
+                noisy.require(Pass::Combined, "training")?,
+                target,
+            ),
         })
     }
 
@@ -294,7 +295,7 @@ mod tests {
             passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
             reference: plane(3),
             raw_reference: None,
-            mismatch: None,
+            warning: None,
         }
     }
 

@@ -125,7 +125,7 @@ pub fn run(
     let least = network.multiple().max(options.loss.least_side());
     let training = Dataset::load(&options.train, wanted, options.raw_references, least)?;
     let validation = Dataset::load(&options.validation, wanted, false, 1)?;
-    training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning)));
+    training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
         let samples = draw(&training, options, network.multiple(), progress.step);
