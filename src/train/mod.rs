@@ -10,6 +10,7 @@ mod dataset;
 mod log;
 mod loss;
 mod optimizer;
+mod relight;
 mod run;
 
 pub use augment::Augment;
