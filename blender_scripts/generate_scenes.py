@@ -70,10 +70,6 @@ def parse(arguments):
     parser.add_argument("--denoise-references", action="store_true",
                         help="clean the references' last noise with Blender's own denoiser, guides denoised first: "
                              "64 to 128 samples then serve as well as many more")
-    parser.add_argument("--light-groups", type=cl.positive, metavar="N",
-                        help="part each scene's lights among N at random, and keep what each part lights as a pass of "
-                             "its own (Combined_lights0 ...) in frames and references: their sum with any weights is a render "
-                             "of the scene lit otherwise")
     parser.add_argument("--guides-only", action="store_true",
                         help="trace no light beyond the surface that guides are of, in two thirds of the time: pairs for a "
                              "prefilter (their Combined is of no use), whose references keep albedo and normal")
@@ -272,8 +268,6 @@ def render_scene(options, library, records, seed, kind, scene_name):
             return f"rejected, {reason}"
         if kind not in options.blends:
             views.expose(stage.rng, stage.scene, guides[0])
-        if options.light_groups:
-            rendering.group_lights(stage.rng, stage.scene, options.light_groups)
         built = time.perf_counter() - start
         write_position(edits, list(stage.scene.view_layers))
         for region, crop in zip(regions, crop_names(options, scene_name)):

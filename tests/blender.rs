@@ -280,29 +280,6 @@ fn guides_alone_are_the_guides_of_whole_renders() {
 }
 
 #[test]
-fn light_groups_add_up_to_the_frame() {
-    let folder = tempfile::tempdir().unwrap();
-    let arguments = "--seeds 7:8 --kinds manylights --size 40 --ref-spp 8 --ref-noise 0 --light-groups 3";
-    generate(folder.path(), arguments);
-    let [pair] = testset::pairs(folder.path().to_str().unwrap()).unwrap().try_into().expect("one pair");
-    for path in [&pair.noisy, &pair.reference] {
-        let frame = Frame::read(path).unwrap();
-        let groups = passes::read_light_groups(&frame, Pass::Combined).unwrap();
-        assert_eq!(groups.keys().collect::<Vec<_>>(), ["lights0", "lights1", "lights2"]);
-        let whole = passes::read(&frame, None).unwrap();
-        let whole = &whole.get(Pass::Combined).unwrap().data;
-        let mean = whole.iter().sum::<f32>() / whole.len() as f32;
-        for (i, v) in whole.iter().enumerate() {
-            let sum: f32 = groups.values().map(|group| group.data[i]).sum();
-            assert!((sum - v).abs() < 2e-3 * (v + mean), "{sum} for {v}");
-        }
-        let lit =
-            groups.values().filter(|group| group.data.iter().sum::<f32>() > 0.01 * mean * whole.len() as f32);
-        assert!(lit.count() > 1, "more than one group lights something");
-    }
-}
-
-#[test]
 fn builds_every_kind_of_scene_without_assets() {
     let said = run(blender().arg(snippet("every_kind.py")).arg(script("")));
     let kinds: Vec<_> = said.lines().filter_map(|line| line.strip_prefix("KIND ")).collect();

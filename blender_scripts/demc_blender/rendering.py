@@ -55,20 +55,6 @@ def combined_only(edits, layers):
         edits.set(layer.cycles, "denoising_store_passes", False)
 
 
-def group_lights(rng, scene, count):
-    """Parts the objects and the world of an open scene among `count` light groups, each an additional pass: lights and what
-    glows alike, as many in each as can be."""
-    for layer in scene.view_layers:
-        for i in range(count):
-            layer.lightgroups.add(name=f"lights{i}")
-    lights = [o for o in scene.objects if o.type == "LIGHT"] + ([scene.world] if scene.world else [])
-    for owners in lights, [o for o in scene.objects if o.type != "LIGHT"]:
-        rng.shuffle(owners)
-        first = rng.randrange(count)
-        for i, owner in enumerate(owners):
-            owner.lightgroup = f"lights{(first + i) % count}"
-
-
 def stop_at_guides(edits, scene):
     """No light beyond the first surface that is not a mirror or clear glass, whose albedo and normal the denoising
     guides hold: those of nearly all pixels stay the same to the bit, in two thirds of the time."""

@@ -197,36 +197,6 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     Ok(set)
 }
 
-/// What each light group lights, (3, H, W), by name: Blender's passes `Combined_<group>` for `pass` Combined, and so on, of the
-/// layer that [`choose`] takes without a name. Empty where the frame has none, or not all three colours.
-///
-/// # Errors
-/// Pixels cannot be decoded.
-pub fn read_light_groups(frame: &Frame, pass: Pass) -> Result<BTreeMap<String, Planes>> {
-    let layers = layers(frame);
-    let layer = choose(frame, &layers, None)?;
-    let mut found: BTreeMap<&str, [Option<(usize, usize)>; 3]> = BTreeMap::new();
-    let prefixes =
-        pass.blender_names().iter().map(|name| format!("{}.{name}_", layer.name)).collect::<Vec<_>>();
-    for (p, part) in frame.parts().iter().enumerate() {
-        for (c, channel) in part.channels.iter().enumerate() {
-            let named = prefixes.iter().find_map(|prefix| channel.name.strip_prefix(prefix.as_str()));
-            let Some((group, component)) = named.and_then(|name| name.rsplit_once('.')) else { continue };
-            if let Some(at) = ["R", "G", "B"].iter().position(|colour| *colour == component) {
-                found.entry(group).or_default()[at] = Some((p, c));
-            }
-        }
-    }
-    let mut groups = BTreeMap::new();
-    for (group, channels) in found {
-        let [Some((part, r)), Some((_, g)), Some((_, b))] = channels else { continue };
-        let window = frame.parts()[part].data_window;
-        let image = frame.decode(part, &[&[r, g, b]])?.swap_remove(0);
-        groups.insert(group.into(), Planes::from_vec(3, window.width, window.height, image));
-    }
-    Ok(groups)
-}
-
 /// The values of `image`, (C, H, W) and stored in `from`, at the pixels of `to`.
 fn crop(image: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
     if from == to {

@@ -15,7 +15,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-pub use layers::{Layer, PassChannels, choose, layers, read, read_layer, read_light_groups};
+pub use layers::{Layer, PassChannels, choose, layers, read, read_layer};
 pub use names::{NOISY_IMAGE, POSITION_AOV};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};

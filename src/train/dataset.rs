@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
-use super::{Augment, relight::Relight};
+use super::Augment;
 use crate::{
     Error, Result,
     frame::{Frame, HALF_MAX},
@@ -35,20 +35,8 @@ struct Stored {
     reference: Vec<f16>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
     raw_reference: Option<Vec<f16>>,
-    /// What each light group lights of Combined, if frame and reference keep that; else one group of all. None where passes
-    /// hold light besides that no group is known of.
-    lights: Vec<Lights>,
     /// See [`pairing::warning`].
     warning: Option<String>,
-}
-
-/// What one light group lights, (3, H, W) each. Empty for the only group, which Combined holds.
-#[cfg_attr(test, derive(Clone))]
-#[derive(Default)]
-struct Lights {
-    noisy: Vec<f16>,
-    reference: Vec<f16>,
-    raw_reference: Option<Vec<f16>>,
 }
 
 /// A crop: noisy passes and the reference radiance.
@@ -116,7 +104,7 @@ impl Dataset {
     /// The whole of frame `index`, and its name.
     pub fn frame(&self, index: usize) -> (String, Sample) {
         let stored = &self.frames[index];
-        (stored.pair.id(), stored.crop((0, 0), (stored.width, stored.height), None))
+        (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
     /// The side of a step's crops: `most` pixels, or as many as a frame drawn by `rng` holds, down to a multiple of
@@ -129,7 +117,7 @@ impl Dataset {
     /// A random square crop of `side` pixels, augmented; all of it decided by `rng`. A frame is drawn as
     /// often as it is large, one that is too small never. Where there are more renders of it with as many samples, each pixel
     /// comes from one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
-    /// and no network gets to learn the noise of those that there are by heart; nor how they are lit: see [`Relight`].
+    /// and no network gets to learn the noise of those that there are by heart.
     /// A frame of `side` pixels must be there, as it is for a side from [`Self::draw_side`].
     pub fn draw(&self, side: usize, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
@@ -140,11 +128,10 @@ impl Dataset {
         };
         let x = rng.below(stored.width - side + 1);
         let y = rng.below(stored.height - side + 1);
-        let relight = Relight::draw(stored.lights.len(), rng);
-        let mut sample = stored.crop((x, y), (side, side), relight.as_ref());
+        let mut sample = stored.crop(x, y, side, side);
         if let seeds @ [_, ..] = self.seeds[index].as_slice() {
             let other = &self.frames[seeds[rng.below(seeds.len())]];
-            sample.passes = mixed(&sample.passes, &other.passes((x, y), (side, side), relight.as_ref()), rng);
+            sample.passes = mixed(&sample.passes, &other.passes((x, y), (side, side)), rng);
         }
         Augment::draw(rng).apply(&mut sample);
         sample
@@ -158,11 +145,11 @@ impl Dataset {
     }
 }
 
-/// Of each frame the others that have its reference, its number of samples, its passes and as many light groups.
+/// Of each frame the others that have its reference, its number of samples and its passes.
 fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     let key = |frame: &Stored| {
         let passes: Vec<Pass> = frame.passes.iter().map(|(pass, _)| *pass).collect();
-        (frame.pair.reference.clone(), frame.pair.spp, passes, frame.lights.len())
+        (frame.pair.reference.clone(), frame.pair.spp, passes)
     };
     let mut groups: HashMap<_, Vec<usize>> = HashMap::new();
     for (index, frame) in frames.iter().enumerate() {
@@ -171,27 +158,6 @@ fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     let others =
         |(index, frame)| groups[&key(frame)].iter().copied().filter(|other| *other != index).collect();
     frames.iter().enumerate().map(others).collect()
-}
-
-/// What each light group lights of a frame and its reference, if both keep the same groups; else one group of all.
-fn lights(noisy: &Frame, reference: &Frame, with_raw: bool) -> Result<Vec<Lights>> {
-    let groups = passes::read_light_groups(noisy, Pass::Combined)?;
-    let mut references = passes::read_light_groups(reference, Pass::Combined)?;
-    let mut raws = passes::read_light_groups(reference, Pass::NoisyImage)?;
-    let is_kept = |group: &String| references.contains_key(group) && (!with_raw || raws.contains_key(group));
-    if groups.len() < 2 || !groups.keys().all(is_kept) {
-        return Ok(vec![Lights::default()]);
-    }
-    // One value that is not finite would spread over all of a step.
-    let stored = |planes: Planes| {
-        to_half(&planes.data.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect::<Vec<_>>())
-    };
-    let lights = groups.into_iter().map(|(group, noisy)| Lights {
-        noisy: stored(noisy),
-        reference: references.remove(&group).map(stored).unwrap_or_default(),
-        raw_reference: raws.remove(&group).filter(|_| with_raw).map(stored),
-    });
-    Ok(lights.collect())
 }
 
 /// Takes each pixel, all passes of it, from either of two crops.
@@ -221,8 +187,7 @@ impl Stored {
             noisy.require(pass, "training")?;
         }
         noisy.sanitize();
-        let reference_frame = Frame::read(&pair.reference)?;
-        let mut reference = passes::read(&reference_frame, None)?;
+        let mut reference = passes::load(&pair.reference, None)?;
         reference.sanitize();
         let target = reference.require(Pass::Combined, "training")?;
         if (reference.width, reference.height) != (noisy.width, noisy.height) {
@@ -249,20 +214,15 @@ impl Stored {
         }
         let raw_reference =
             reference.get(Pass::NoisyImage).filter(|_| raw_references).map(|raw| to_half(&raw.data));
-        let kept = || noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
-        let lights = match kept().any(|(pass, _)| pass.carries_radiance() && pass != Pass::Combined) {
-            true => Vec::new(),
-            false => lights(&frame, &reference_frame, raw_reference.is_some())?,
-        };
+        let kept = noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
         Ok(Self {
             pair: pair.clone(),
             view_layer: noisy.view_layer.clone(),
             width: noisy.width,
             height: noisy.height,
-            passes: kept().map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
+            passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
             reference: to_half(&target.data),
             raw_reference,
-            lights,
             warning: pairing::warning(
                 pair.noisy.display(),
                 noisy.require(Pass::Combined, "training")?,
@@ -276,48 +236,22 @@ impl Stored {
         self.width.min(self.height)
     }
 
-    /// A crop, lit as it was rendered or otherwise.
-    fn crop(&self, at: (usize, usize), size: (usize, usize), relight: Option<&Relight>) -> Sample {
-        let lit = |whole: &[f16], of: fn(&Lights) -> Option<&[f16]>| self.lit(whole, of, at, size, relight);
+    fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
+        let cut = |data: &[f16]| self.cut(data, 3, (x, y), (width, height));
         Sample {
-            passes: self.passes(at, size, relight),
-            reference: lit(&self.reference, |lights| Some(&lights.reference)),
-            raw_reference: self.raw_reference.as_ref().map(|raw| lit(raw, |l| l.raw_reference.as_deref())),
+            passes: self.passes((x, y), (width, height)),
+            reference: cut(&self.reference),
+            raw_reference: self.raw_reference.as_deref().map(cut),
         }
     }
 
     /// The noisy passes of a crop.
-    fn passes(&self, at: (usize, usize), size: (usize, usize), relight: Option<&Relight>) -> PassSet {
-        let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, size.0, size.1);
+    fn passes(&self, at: (usize, usize), (width, height): (usize, usize)) -> PassSet {
+        let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
         for (pass, data) in &self.passes {
-            let planes = match pass {
-                Pass::Combined => self.lit(data, |lights| Some(&lights.noisy), at, size, relight),
-                _ => self.cut(data, pass.channels(), at, size),
-            };
-            passes.insert(*pass, planes);
+            passes.insert(*pass, self.cut(data, pass.channels(), at, (width, height)));
         }
         passes
-    }
-
-    /// A crop of radiance, `whole` or the sum of what all groups light of it.
-    fn lit(
-        &self,
-        whole: &[f16],
-        of: fn(&Lights) -> Option<&[f16]>,
-        at: (usize, usize),
-        size: (usize, usize),
-        relight: Option<&Relight>,
-    ) -> Planes {
-        let Some(relight) = relight else { return self.cut(whole, 3, at, size) };
-        let group = |lights| {
-            let light = if self.lights.len() == 1 {
-                whole
-            } else {
-                of(lights).expect("it is kept where the whole is")
-            };
-            self.cut(light, 3, at, size)
-        };
-        relight.sum(&self.lights.iter().map(group).collect::<Vec<_>>())
     }
 
     fn cut(
@@ -361,7 +295,6 @@ mod tests {
             passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
             reference: plane(3),
             raw_reference: None,
-            lights: vec![Lights::default()],
             warning: None,
         }
     }
@@ -376,45 +309,15 @@ mod tests {
             let sample = data.draw(8, &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             let values: BTreeSet<u32> = depth.iter().map(|v| *v as u32).collect();
-            // All passes of a pixel come from one render; exposure and tint alone may scale radiance.
-            let blue = sample.passes.get(Pass::Combined).unwrap().channel(2);
-            let scale = blue[0] / depth[0];
-            for (pixel, depth) in blue.iter().zip(depth) {
+            // All passes of a pixel come from one render; exposure alone may scale radiance.
+            let combined = sample.passes.get(Pass::Combined).unwrap();
+            let scale = combined.data[0] / depth[0];
+            for (pixel, depth) in combined.channel(2).iter().zip(depth) {
                 assert!((pixel - depth * scale).abs() < 1e-5 * pixel);
             }
             met.insert(values);
         }
         assert_eq!(met, [[1, 2].into(), [4].into(), [8].into()].into());
-    }
-
-    #[test]
-    fn what_light_groups_light_adds_up_to_frame_and_references_alike() {
-        let plane = |value: f32| vec![f16::from_f32(value); 3 * 8 * 8];
-        let group = |value: f32| Lights {
-            noisy: plane(value),
-            reference: plane(2.0 * value),
-            raw_reference: Some(plane(4.0 * value)),
-        };
-        let frame = |seed: u32| Stored {
-            pair: Pair { noisy: format!("noisy{seed}.exr").into(), ..stored("a", 4, 5.0).pair },
-            reference: plane(10.0),
-            raw_reference: Some(plane(20.0)),
-            lights: vec![group(2.0), group(3.0)],
-            ..stored("a", 4, 5.0)
-        };
-        let data = Dataset::of(vec![frame(0), frame(1)]);
-        let mut rng = Rng::new(6, 0);
-        let mut relit = 0;
-        for _ in 0..64 {
-            let Sample { passes, reference, raw_reference } = data.draw(8, &mut rng);
-            let combined = passes.get(Pass::Combined).unwrap();
-            let raw = raw_reference.unwrap();
-            for ((noisy, reference), raw) in combined.data.iter().zip(&reference.data).zip(&raw.data) {
-                assert!((reference / noisy - 2.0).abs() < 1e-5 && (raw / noisy - 4.0).abs() < 1e-5);
-            }
-            relit += usize::from((combined.channel(0)[0] / combined.channel(1)[0] - 1.0).abs() > 1e-3);
-        }
-        assert!((40..64).contains(&relit), "{relit} of 64 are tinted");
     }
 
     #[test]

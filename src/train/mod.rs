@@ -10,7 +10,6 @@ mod dataset;
 mod log;
 mod loss;
 mod optimizer;
-mod relight;
 mod run;
 
 pub use augment::Augment;
