@@ -12,9 +12,8 @@ import os
 
 import numpy as np
 
-from clean_references import exr, pairs, planes
+from clean_references import divisor, exr, pairs, planes
 
-ALBEDO_FLOOR = 0.05  # src/features.rs
 KEPT = ("Combined", "Denoising Normal", "Denoising Albedo")
 
 
@@ -24,7 +23,7 @@ def lit(channels):
     _, radiance_names = planes(channels, "Combined", "RGB")
     kept = {name: values for name, values in channels.items() if name.rsplit(".", 1)[0].endswith(KEPT)}
     for c, name in enumerate(radiance_names):
-        kept[name] = np.clip(albedo[..., c], 0, 1) + ALBEDO_FLOOR
+        kept[name] = divisor(albedo[..., c])
     kept.update({name: np.ones_like(albedo[..., 0]) for name in albedo_names})
     return kept
 

@@ -14,12 +14,9 @@ import os
 import shutil
 import tempfile
 
-import numpy as np
-
-from clean_references import denoise, exr, planes
+from clean_references import denoise, divisor, exr, planes
 
 GUIDES = {"albedo": ("Denoising Albedo", "RGB", "--alb"), "normal": ("Denoising Normal", "XYZ", "--nrm")}
-ALBEDO_FLOOR = 0.05  # src/features.rs
 
 
 def main():
@@ -50,9 +47,8 @@ def main():
                     clean = denoise(options.oidn, folder, "clean", **{option: noisy})
                 channels.update({name: clean[..., c] for c, name in enumerate(names)})
                 if guide == "albedo" and options.keep_quotient:
-                    floored = lambda albedo: np.clip(albedo, 0.0, 1.0) + ALBEDO_FLOOR
                     radiance, names = planes(channels, "Combined", "RGB")
-                    radiance = radiance * floored(clean) / floored(noisy)
+                    radiance = radiance * divisor(clean) / divisor(noisy)
                     channels.update({name: radiance[..., c] for c, name in enumerate(names)})
             exr.write_half(os.path.join(options.out, os.path.basename(source)), channels)
             shutil.copy(reference, options.out)

@@ -38,6 +38,11 @@ def planes(channels, ending, letters):
     return np.stack([channels[names[0]].astype("<f4") for names in found], axis=-1), [names[0] for names in found]
 
 
+def divisor(albedo):
+    """What radiance is divided by: `divisor` of src/features.rs."""
+    return np.clip(albedo, 0, 1) + 0.05
+
+
 def write_pfm(path, image):
     with open(path, "wb") as file:
         file.write(b"PF\n%d %d\n-1.0\n" % (image.shape[1], image.shape[0]))

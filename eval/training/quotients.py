@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clean_guides import ALBEDO_FLOOR
-from clean_references import exr, planes
+from clean_references import divisor, exr, planes
 
 NOISE = 0.05
 EPSILON = 1e-3  # of RelMSE
@@ -32,9 +31,7 @@ def main():
         scene = frame.name.rsplit("_", 1)[0]
         radiance = colours(frame, "Combined")
         reference = colours(frame.with_name(f"{scene}_ref.exr"), "Combined")
-        noisy, clean = (
-            colours(path, "Denoising Albedo").clip(0, 1) + ALBEDO_FLOOR for path in (frame, args.clean / frame.name)
-        )
+        noisy, clean = (divisor(colours(path, "Denoising Albedo")) for path in (frame, args.clean / frame.name))
         off = np.abs(noisy - clean).mean(axis=-1) > NOISE * clean.mean(axis=-1)
         errors = [
             ((image - reference) ** 2 / (reference**2 + EPSILON)).mean(axis=-1)[off]
