@@ -67,6 +67,17 @@ impl Planes {
         &mut self.data[c * n..][..n]
     }
 
+    /// Writes `rows`, planes of the same width and number, from row `first` on.
+    ///
+    /// # Panics
+    /// If widths or channels differ, or rows leave the planes.
+    pub fn write_rows(&mut self, first: usize, rows: &Self) {
+        assert_eq!((self.channels, self.width), (rows.channels, rows.width), "rows of the same planes");
+        for c in 0..self.channels {
+            self.channel_mut(c)[first * rows.width..][..rows.pixels()].copy_from_slice(rows.channel(c));
+        }
+    }
+
     /// A rectangle of pixels, from column `x` and row `y`: cuts tiles and undoes padding.
     ///
     /// # Panics

@@ -22,12 +22,15 @@ def find_blends(folder):
 
 
 def open_blend(stage, path):
-    """Opens a scene and returns a function that places its camera at random near where it was."""
+    """Opens a scene and returns a function that places its camera, one of several where there are, at random near where it was."""
     bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
     stage.scene = scene = bpy.context.scene
     if scene.camera is None:
         raise ValueError(f"{path} has no camera")
     rng = stage.rng
+    cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
+    if len(cameras) > 1:
+        scene.camera = rng.choice(cameras)
     relight(rng, scene)
     camera = scene.camera
     home = camera.matrix_world.copy()

@@ -12,23 +12,21 @@ use rayon::prelude::*;
 use super::{STEEPNESS, divisor, unit};
 use crate::{
     Result,
-    filters::solve::{LANES, Lanes, Symmetric},
+    filters::{
+        solve::{LANES, Lanes, Symmetric},
+        squares::{self, SQUARE, between},
+    },
     kernels::{
         logarithm::LogTransfer,
+        memory::plane_buffer,
         vectorised::{self, Vectorised},
     },
     passes::{Pass, PassSet},
     planes::Planes,
 };
 
-/// Rows and columns of the squares in which moments are gathered.
-const SQUARE: usize = 4;
-
 /// Weights of the squares on either side of one, binomial: a deviation of 1.4 squares.
 const WINDOW: [f32; 9] = [1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0];
-
-/// How many squares the window reaches to either side.
-const REACH: usize = WINDOW.len() / 2;
 
 /// Added to the variance of each axis of the normal, in variances of the light: 8 times the variance with which
 /// the 400 pixels of a window decide on a slope, by which slopes that noise alone may explain shrink.
@@ -89,7 +87,8 @@ impl Shading {
                 moment.iter_mut().zip(of_squares).for_each(|(moment, sum)| *moment = sum);
             }
         });
-        let around = columns(&rows(&moments, MOMENTS * squares), squares);
+        let mut around = plane_buffer(moments.len());
+        squares::around(&moments, MOMENTS, squares, &WINDOW, &mut around);
         let mut lines = vec![0.0; around.len() / MOMENTS * KEPT];
         let rows = lines.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares));
         rows.for_each(|(lines, moments)| {
@@ -129,12 +128,6 @@ impl Shading {
         });
         Ok(shading)
     }
-}
-
-/// The square before a pixel, counted from middle to middle, and how far on towards the next it is.
-fn between(at: usize, squares: usize) -> (usize, f32) {
-    let place = ((at as f32 + 0.5) / SQUARE as f32 - 0.5).clamp(0.0, (squares - 1) as f32);
-    (place as usize, place.fract())
 }
 
 /// The shading of a row of pixels.
@@ -225,31 +218,6 @@ impl Vectorised for Gather<'_> {
             }
         }
     }
-}
-
-/// Every value of lines of `len` values, weighted with those above and below.
-fn rows(values: &[f32], len: usize) -> Vec<f32> {
-    let mut output = vec![0.0; values.len()];
-    output.par_chunks_mut(len).enumerate().for_each(|(row, output)| {
-        // The window begins above the first row where that is nearer than it reaches.
-        let (first, skipped) = (row.saturating_sub(REACH), REACH.saturating_sub(row));
-        for (weight, line) in WINDOW[skipped..].iter().zip(values.chunks(len).skip(first)) {
-            output.iter_mut().zip(line).for_each(|(sum, v)| *sum += weight * v);
-        }
-    });
-    output
-}
-
-/// Every value of lines of `len` values, weighted with those to the left and right.
-fn columns(values: &[f32], len: usize) -> Vec<f32> {
-    let mut output = vec![0.0; values.len()];
-    output.par_chunks_mut(len).zip(values.par_chunks(len)).for_each(|(output, line)| {
-        for (tap, weight) in WINDOW.iter().enumerate() {
-            let (to, from) = (REACH.saturating_sub(tap).min(len), tap.saturating_sub(REACH).min(len));
-            output[to..].iter_mut().zip(&line[from..]).for_each(|(sum, v)| *sum += weight * v);
-        }
-    });
-    output
 }
 
 /// The slopes of light, as a natural logarithm, over the normal, and what they make of the mean normal, from moments.

@@ -68,7 +68,7 @@ pub struct FilterGradient<'a> {
 
 /// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2.
 #[inline(always)]
-pub(super) fn exp(x: f32) -> f32 {
+pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-LIMIT, LIMIT);
     // Adding 1.5 * 2^23 rounds to an integer, whose low bits then stand in the mantissa.
     const ROUND: f32 = 12_582_912.0;

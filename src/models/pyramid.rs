@@ -32,7 +32,8 @@ use crate::{
         GUIDE_PASSES, Inputs, Refined, Shading, albedo_as_radiance, exposure, guide_rows, guides,
         radiance_as_albedo,
     },
-    kernels::blend::CORNERS,
+    filters::refit::{Guides, Refit, Samples},
+    kernels::{blend::CORNERS, memory::plane_buffer},
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -335,7 +336,12 @@ impl Pyramid {
             };
             let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
             if pyramid.is_empty() {
-                return filtered.product(field(albedo)).amplify(gain).into_images();
+                let image = filtered.product(field(albedo)).amplify(gain);
+                if self.prefilter.is_none() {
+                    return image.into_images();
+                }
+                let factors = factors(image.values(), irradiance, guide_input, albedo);
+                return image.product(field(&factors)).into_images();
             }
             below = Some(filtered);
         }
@@ -355,6 +361,23 @@ impl Pyramid {
         let heads = self.heads.iter().enumerate().map(|(level, c)| (c, level + 1));
         encoders.chain(decoder).chain(heads).chain([(&self.full, 1)])
     }
+}
+
+/// What a refit multiplies denoised images by, (N, 3, H, W).
+fn factors(image: &[f32], irradiance: &Stacked, guide: &Stacked, albedo: &Stacked) -> Stacked {
+    let (shape, pixels) = (irradiance.0, irradiance.0.h * irradiance.0.w);
+    let mut factors = plane_buffer(image.len());
+    for (n, factors) in factors.chunks_exact_mut(3 * pixels).enumerate() {
+        let of_image = 3 * n * pixels..3 * (n + 1) * pixels;
+        let guides = Guides {
+            size: (shape.w, shape.h),
+            normal: &guide.1[(n * guide.0.c + 3) * pixels..][..3 * pixels],
+            albedo: &albedo.1[of_image.clone()],
+        };
+        let image = &image[of_image.clone()];
+        Refit::of(guides, image, Samples::Divided(&irradiance.1[of_image])).factors(guides, image, factors);
+    }
+    (shape, factors)
 }
 
 impl Network for Pyramid {

@@ -7,14 +7,16 @@
 use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
+use rayon::prelude::*;
 
 use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
-        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black,
+        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, divisor, exposure, guides, keep_black,
         radiance_as_albedo,
     },
+    filters::refit::{Guides, Refit, Samples},
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
@@ -54,9 +56,7 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         if image.height == 0 {
             image = Planes::unwritten(3, passes.width, passes.height);
         }
-        for c in 0..3 {
-            image.channel_mut(c)[first * part.width..][..part.pixels()].copy_from_slice(part.channel(c));
-        }
+        image.write_rows(first, &part);
         Ok(())
     };
     let mut beauty = Feed::new(network, passes, exposure, rows);
@@ -64,6 +64,7 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         let shading = Shading::of(passes, exposure, NEEDED_BY)?;
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         let mut held: Option<Planes> = None;
+        let mut divisors = Planes::unwritten(3, passes.width, passes.height);
         for band in bands {
             let size = padded(&band);
             let band = albedo_as_radiance(passes, band, size, NEEDED_BY)?;
@@ -81,10 +82,18 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
                 let rows = end - clean.height..end;
                 let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
                 let size = padded(&rows);
-                let refined = Refined { albedo: radiance_as_albedo(clean), shading }.padded_to(size);
+                let albedo = radiance_as_albedo(clean);
+                divisors.write_rows(rows.start, &albedo);
+                let refined = Refined { albedo, shading }.padded_to(size);
                 beauty.push(network.rows(passes, rows, size, exposure)?, Some(refined), &mut write)
             })?;
         }
+        divisors.data.par_iter_mut().for_each(|albedo| *albedo = divisor(*albedo));
+        let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+        let size = (passes.width, passes.height);
+        let guides = Guides { size, normal: &normal.data, albedo: &divisors.data };
+        let refit = Refit::of(guides, &image.data, Samples::Rendered(&radiance.data, exposure));
+        refit.apply(guides, &mut image.data, exposure.recip());
     } else {
         for band in bands {
             let size = padded(&band);
@@ -118,7 +127,10 @@ impl<'a> Feed<'a> {
         refined: Option<Refined>,
         done: &mut dyn FnMut(usize, Planes) -> Result<()>,
     ) -> Result<()> {
+        let refits = refined.is_some();
         let Inputs { planes, scale } = guides(&band, refined, self.exposure, NEEDED_BY)?;
+        // A refit takes exposed radiance, and scales it last.
+        let scale = if refits { 1.0 } else { scale };
         let (width, height) = self.size;
         let mut result = Ok(());
         let mut hand_out = |first: usize, field: &Field| {

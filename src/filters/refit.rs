@@ -1,0 +1,687 @@
+//! What guides and samples still tell of a frame that a network has denoised.
+//!
+//! A network blurs some of the texture that the albedo did not account for, and leaves blotches on even walls. Both show
+//! against the guides: around every pixel, two planes are fitted over the axes of the normal and the logarithms of the clean
+//! albedo. One is fitted to the noisy radiance over the denoised, whose hundreds of samples tell what slopes were missed, as
+//! regression over features does (Bitterli et al. 2016). The other is fitted to the logarithm of what was denoised, which gives way
+//! to it where it varies little besides: a guided filter (He et al. 2013) that has its own image for a guide as well.
+
+use rayon::prelude::*;
+
+use super::{
+    solve::{LANES, Lanes, Symmetric},
+    squares::{self, SQUARE, between},
+};
+use crate::kernels::{
+    filter::exp,
+    logarithm::ln,
+    memory::{PlaneBuffer, plane_buffer},
+    vectorised::{self, Vectorised},
+};
+
+/// Weights of the squares on either side of one, binomial: a deviation of one square.
+const WINDOW: [f32; 5] = [1.0, 4.0, 6.0, 4.0, 1.0];
+
+/// How many pixels a window counts for, over the sum of their weights: the square of that over the sum of squares.
+const PIXELS: f32 = 256.0 / (70.0 * 70.0);
+
+/// Three axes of the normal and three logarithms of the albedo.
+const GUIDES: usize = 6;
+
+/// What is fitted: a constant and the slopes.
+const KNOWN: usize = GUIDES + 1;
+
+/// What is fitted to, of the mean of the colours: the logarithm of what is denoised, and the samples over it.
+const TARGETS: usize = 2;
+
+/// Sums over pixels of the products of every two of the first, a lower triangle row by row; then for each target its products with
+/// those, and its square.
+const MOMENTS: usize = KNOWN * (KNOWN + 1) / 2 + TARGETS * (KNOWN + 1);
+
+/// What is kept of each square: the slopes of its change over the guides, a constant, and the share of its own logarithm that is
+/// taken away.
+const KEPT: usize = KNOWN + 1;
+
+/// Added to the variances of an axis and of a logarithm: how much of a guide is noise, or too little to tell of anything.
+const GUIDE_NOISE: [f32; GUIDES] = [1e-4, 1e-4, 1e-4, 4e-4, 4e-4, 4e-4];
+
+/// Deviation of the slopes that are there to be found in the samples: those that noise alone may explain shrink below it.
+const SLOPE: f32 = 0.2;
+
+/// Deviation of the blotches that a network leaves: what varies less beside the guides gives way to them.
+const BLOTCHES: f32 = 0.08;
+
+/// Exposed radiance over albedo (the mean of the colours, as below) that is added to samples and to what is denoised before one is divided by the other, and before
+/// the latter's logarithm: relative errors of what is darker count less and less.
+const SAMPLE_FLOOR: f32 = 0.2;
+const FLOOR: f32 = 0.01;
+
+/// A sample is at most this many times what was denoised, as fireflies would decide on slopes all around them.
+const MOST: f32 = 3.0;
+
+/// Exposed radiance over albedo, 11 times middle grey, from which on a pixel counts less and less: lamps say nothing of the walls
+/// around.
+const BRIGHT: f32 = 2.0;
+
+/// The logarithm of the largest change.
+const LARGEST: f32 = 0.7;
+
+/// A window that counts for no more than this has none of the frame's pixels, or lamps alone.
+const LEAST_COUNT: f32 = 1e-2;
+
+/// What samples vary by, and their level over what is denoised, are taken to be at least this.
+const LEAST_NOISE: f32 = 1e-3;
+const LEAST_LEVEL: f32 = 0.3;
+
+/// What is known of a frame besides its radiance, planes of (C, H, W).
+#[derive(Clone, Copy)]
+pub struct Guides<'a> {
+    /// Columns and rows.
+    pub size: (usize, usize),
+    /// Axes of the normal, three planes.
+    pub normal: &'a [f32],
+    /// What radiance is divided by, three planes: the albedo without its noise.
+    pub albedo: &'a [f32],
+}
+
+/// Noisy radiance, three planes.
+#[derive(Clone, Copy)]
+pub enum Samples<'a> {
+    /// Exposed and divided by albedo.
+    Divided(&'a [f32]),
+    /// As rendered, and the exposure.
+    Rendered(&'a [f32], f32),
+}
+
+impl Guides<'_> {
+    /// Row `y` of three planes.
+    #[inline(always)]
+    fn row<'p>(&self, planes: &'p [f32], y: usize) -> [&'p [f32]; 3] {
+        let (width, height) = self.size;
+        [0, 1, 2].map(|c| &planes[(c * height + y) * width..][..width])
+    }
+}
+
+/// The fits to a denoised frame.
+pub struct Refit {
+    squares: usize,
+    /// Of each row of squares, [`KEPT`] lines of values.
+    fits: PlaneBuffer,
+}
+
+impl Refit {
+    /// Fits to an exposed `image`, three planes, that was made of `samples`.
+    pub fn of(guides: Guides, image: &[f32], samples: Samples) -> Self {
+        let (width, height) = guides.size;
+        let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
+        let mut moments = plane_buffer(square_rows * MOMENTS * squares);
+        let rows = moments.par_chunks_mut(MOMENTS * squares).enumerate();
+        rows.for_each_init(
+            || Pixels::new(squares),
+            |pixels, (row, sums)| {
+                sums.fill(0.0);
+                for y in SQUARE * row..(SQUARE * (row + 1)).min(height) {
+                    vectorised::run(Gather { guides, image, samples, y, pixels: &mut *pixels, sums });
+                }
+            },
+        );
+        let mut around = plane_buffer(moments.len());
+        squares::around(&moments, MOMENTS, squares, &WINDOW, &mut around);
+        let mut fits = plane_buffer(square_rows * KEPT * squares);
+        let rows = fits.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares));
+        rows.for_each(|(fits, moments)| vectorised::run(FitRow { moments, fits, squares }));
+        Self { squares, fits }
+    }
+
+    /// What each pixel of the `image` fitted to should be multiplied by, three planes, all alike.
+    pub fn factors(&self, guides: Guides, image: &[f32], factors: &mut [f32]) {
+        self.each_row(guides, factors, |y, rows, memory| {
+            self.find(guides, guides.row(image, y), y, memory);
+            for row in rows {
+                interleave(&memory.factors, self.squares, row, |row, factor| *row = factor);
+            }
+        });
+    }
+
+    /// Multiplies the `image` fitted to by those factors, and by `scale`.
+    pub fn apply(&self, guides: Guides, image: &mut [f32], scale: f32) {
+        self.each_row(guides, image, |y, rows, memory| {
+            self.find(guides, rows.each_ref().map(|row| &**row), y, memory);
+            for row in rows {
+                interleave(&memory.factors, self.squares, row, |value, factor| *value = *value * factor * scale);
+            }
+        });
+    }
+
+    /// Gives `work` each row of three planes: its number, and memory of the thread's.
+    fn each_row(
+        &self,
+        guides: Guides,
+        planes: &mut [f32],
+        work: impl Fn(usize, [&mut [f32]; 3], &mut Memory) + Sync,
+    ) {
+        let (width, height) = guides.size;
+        let (red, rest) = planes.split_at_mut(width * height);
+        let (green, blue) = rest.split_at_mut(width * height);
+        let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
+        let memory = || Memory {
+            pixels: Pixels::new(self.squares),
+            fit: vec![0.0; KEPT * (self.squares + 2)],
+            factors: vec![0.0; SQUARE * self.squares],
+        };
+        red.zip(green).zip(blue).enumerate().for_each_init(memory, |memory, (y, ((red, green), blue))| {
+            work(y, [red, green, blue], memory);
+        });
+    }
+
+    /// Finds the factors of row `y`, which holds `image`.
+    fn find(&self, guides: Guides, image: [&[f32]; 3], y: usize, memory: &mut Memory) {
+        let line_len = KEPT * self.squares;
+        let square_rows = self.fits.len() / line_len;
+        let (above, share) = between(y, square_rows);
+        let near = [above, (above + 1).min(square_rows - 1)].map(|row| &self.fits[row * line_len..][..line_len]);
+        vectorised::run(Factors { guides, image, y, near, share, memory });
+    }
+}
+
+/// What a thread needs for the factors of a row.
+struct Memory {
+    pixels: Pixels,
+    /// The fits as they are at that row, a square more on either side.
+    fit: Vec<f32>,
+    factors: Vec<f32>,
+}
+
+/// What is known of the pixels of a row, and what they are fitted to. Lines hold first the first pixels of all squares, then the
+/// second, and so on: what is done to squares is so done to neighbouring values.
+struct Pixels {
+    squares: usize,
+    /// One, and the guides.
+    known: Vec<f32>,
+    targets: Vec<f32>,
+    /// How much each counts.
+    weight: Vec<f32>,
+    /// Radiance over albedo, the mean of the colours.
+    light: Vec<f32>,
+    /// Memory for a row.
+    albedo: Vec<f32>,
+    spare: Vec<f32>,
+}
+
+impl Pixels {
+    fn new(squares: usize) -> Self {
+        let len = SQUARE * squares;
+        let line = |count: usize, value: f32| vec![value; count * len];
+        Self {
+            squares,
+            known: line(KNOWN, 1.0),
+            targets: line(TARGETS, 0.0),
+            weight: line(1, 0.0),
+            light: line(1, 0.0),
+            albedo: line(3, 1.0),
+            spare: line(2, 0.0),
+        }
+    }
+
+    /// Reads what is known of row `y`: how much its pixels count, their guides, and the logarithm of what is denoised, the first
+    /// target. A normal is the mean of the 3x3 around a pixel: at 4 samples its noise would show.
+    #[inline(always)]
+    fn read(&mut self, guides: Guides, image: [&[f32]; 3], y: usize) {
+        let len = SQUARE * self.squares;
+        let width = guides.size.0;
+        let near = [y.saturating_sub(1), y, (y + 1).min(guides.size.1 - 1)];
+        let [above, row, below] = near.map(|y| guides.row(guides.normal, y));
+        let (column, mean) = self.spare.split_at_mut(len);
+        let (column, mean) = (&mut column[..width], &mut mean[..width]);
+        for c in 0..3 {
+            let read = row[c].iter().zip(above[c].iter().zip(below[c]));
+            for (v, (row, (above, below))) in column.iter_mut().zip(read) {
+                *v = 0.25 * (unit(*above) + unit(*below)) + 0.5 * unit(*row);
+            }
+            mean[0] = 0.75 * column[0] + 0.25 * column[1.min(width - 1)];
+            mean[width - 1] = 0.75 * column[width - 1] + 0.25 * column[width.saturating_sub(2)];
+            for (mean, near) in mean.iter_mut().skip(1).zip(column.windows(3)) {
+                *mean = 0.25 * (near[0] + near[2]) + 0.5 * near[1];
+            }
+            part(mean, self.squares, &mut self.known[(1 + c) * len..][..len]);
+        }
+        for (c, row) in guides.row(guides.albedo, y).into_iter().enumerate() {
+            let albedo = &mut self.albedo[c * len..][..len];
+            part(row, self.squares, albedo);
+            let logarithms = &mut self.known[(4 + c) * len..][..len];
+            logarithms.iter_mut().zip(albedo).for_each(|(logarithm, a)| *logarithm = ln(*a));
+        }
+        let line = &mut self.spare[..len];
+        self.light.fill(0.0);
+        for (c, row) in image.into_iter().enumerate() {
+            part(row, self.squares, line);
+            let albedo = &self.albedo[c * len..][..len];
+            for (sum, (v, a)) in self.light.iter_mut().zip(line.iter().zip(albedo)) {
+                *sum += v.max(0.0) / (3.0 * a);
+            }
+        }
+        for ((weight, target), light) in self.weight.iter_mut().zip(&mut self.targets).zip(&self.light) {
+            let square = (light * (1.0 / BRIGHT)) * (light * (1.0 / BRIGHT));
+            *weight = 1.0 / (1.0 + square * square);
+            *target = ln(light + FLOOR);
+        }
+        // Pixels of the last squares beyond the frame.
+        for beyond in width..len {
+            self.weight[beyond % SQUARE * self.squares + beyond / SQUARE] = 0.0;
+        }
+    }
+
+    /// Reads the samples over what is denoised, the other target.
+    #[inline(always)]
+    fn read_samples(&mut self, guides: Guides, samples: Samples, y: usize) {
+        let len = SQUARE * self.squares;
+        let (line, target) = (&mut self.spare[..len], &mut self.targets[len..]);
+        target.fill(0.0);
+        for c in 0..3 {
+            let albedo = &self.albedo[c * len..][..len];
+            match samples {
+                Samples::Divided(samples) => {
+                    part(guides.row(samples, y)[c], self.squares, line);
+                    target.iter_mut().zip(&*line).for_each(|(sum, sample)| *sum += sample);
+                }
+                Samples::Rendered(samples, exposure) => {
+                    part(guides.row(samples, y)[c], self.squares, line);
+                    let read = line.iter().zip(albedo);
+                    target.iter_mut().zip(read).for_each(|(sum, (v, a))| *sum += v.max(0.0) * exposure / a);
+                }
+            }
+        }
+        for (target, light) in target.iter_mut().zip(&self.light) {
+            *target = ((*target * (1.0 / 3.0) + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
+        }
+    }
+}
+
+/// An axis of a normal, which is no longer than 1.
+#[inline(always)]
+fn unit(axis: f32) -> f32 {
+    axis.clamp(-1.0, 1.0)
+}
+
+/// Parts a row of pixels as [`Pixels`] has them. What lies beyond the row keeps its value.
+#[inline(always)]
+fn part(row: &[f32], squares: usize, line: &mut [f32]) {
+    let (whole, rest) = row.as_chunks::<SQUARE>();
+    let [first, second, third, fourth] = [0, 1, 2, 3].map(|n| n * squares);
+    for (s, square) in whole.iter().enumerate() {
+        line[first + s] = square[0];
+        line[second + s] = square[1];
+        line[third + s] = square[2];
+        line[fourth + s] = square[3];
+    }
+    for (n, v) in rest.iter().enumerate() {
+        line[n * squares + whole.len()] = *v;
+    }
+}
+
+/// Does `work` with each pixel of a row and its value in a line.
+#[inline(always)]
+fn interleave(line: &[f32], squares: usize, row: &mut [f32], work: impl Fn(&mut f32, f32)) {
+    for (s, square) in row.chunks_mut(SQUARE).enumerate() {
+        square.iter_mut().enumerate().for_each(|(n, pixel)| work(pixel, line[n * squares + s]));
+    }
+}
+
+/// What a row of pixels adds to the moments of its squares.
+struct Gather<'a> {
+    guides: Guides<'a>,
+    image: &'a [f32],
+    samples: Samples<'a>,
+    y: usize,
+    pixels: &'a mut Pixels,
+    /// [`MOMENTS`] lines of squares.
+    sums: &'a mut [f32],
+}
+
+impl Vectorised for Gather<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { guides, image, samples, y, pixels, sums } = self;
+        pixels.read(guides, guides.row(image, y), y);
+        pixels.read_samples(guides, samples, y);
+        let Pixels { squares, known, targets, weight, spare, .. } = pixels;
+        let len = SQUARE * *squares;
+        let weighted = &mut spare[..len];
+        let mut sums = sums.chunks_exact_mut(*squares);
+        for i in 0..KNOWN {
+            scale(weight, &known[i * len..][..len], weighted);
+            for line in known.chunks_exact(len).take(i + 1) {
+                add_products(weighted, line, sums.next().expect("a line for each pair"));
+            }
+        }
+        for target in targets.chunks_exact(len) {
+            scale(weight, target, weighted);
+            for line in known.chunks_exact(len) {
+                add_products(weighted, line, sums.next().expect("a line for each pair"));
+            }
+            add_products(weighted, target, sums.next().expect("a line for each square"));
+        }
+    }
+}
+
+/// Writes `weight` times each value.
+#[inline(always)]
+fn scale(weight: &[f32], values: &[f32], output: &mut [f32]) {
+    output.iter_mut().zip(weight.iter().zip(values)).for_each(|(output, (w, v))| *output = w * v);
+}
+
+/// Adds to each square the products of its pixels.
+#[inline(always)]
+fn add_products(a: &[f32], b: &[f32], sums: &mut [f32]) {
+    let n = sums.len();
+    let [a0, a1, a2, a3] = [0, 1, 2, 3].map(|i| &a[i * n..][..n]);
+    let [b0, b1, b2, b3] = [0, 1, 2, 3].map(|i| &b[i * n..][..n]);
+    for s in 0..n {
+        sums[s] += (a0[s] * b0[s] + a1[s] * b1[s]) + (a2[s] * b2[s] + a3[s] * b3[s]);
+    }
+}
+
+/// Fits planes around every square of a row.
+struct FitRow<'a> {
+    /// [`MOMENTS`] lines of `squares` values.
+    moments: &'a [f32],
+    /// [`KEPT`] such lines, to be written.
+    fits: &'a mut [f32],
+    squares: usize,
+}
+
+impl Vectorised for FitRow<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { moments, fits, squares } = self;
+        for first in (0..squares).step_by(LANES) {
+            let part = first..(first + LANES).min(squares);
+            let mut lanes = [[0.0; LANES]; MOMENTS];
+            for (lanes, line) in lanes.iter_mut().zip(moments.chunks_exact(squares)) {
+                lanes[..part.len()].copy_from_slice(&line[part.clone()]);
+            }
+            for (line, kept) in fits.chunks_exact_mut(squares).zip(fit(&lanes)) {
+                line[part.clone()].copy_from_slice(&kept[..part.len()]);
+            }
+        }
+    }
+}
+
+/// `f` of each lane.
+#[inline(always)]
+fn each(f: impl Fn(usize) -> f32) -> Lanes {
+    let mut lanes = [0.0; LANES];
+    for (l, lane) in lanes.iter_mut().enumerate() {
+        *lane = f(l);
+    }
+    lanes
+}
+
+/// The fits of one square a lane, from its moments, as [`KEPT`] tells.
+#[inline(always)]
+fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
+    let (of_guides, of_targets) = moments.split_at(KNOWN * (KNOWN + 1) / 2);
+    let count = of_guides[0];
+    let inverse = each(|l| if count[l] > LEAST_COUNT { 1.0 / count[l] } else { 0.0 });
+    let covariance = |sum: &Lanes, a: &Lanes, b: &Lanes| each(|l| sum[l] * inverse[l] - a[l] * b[l]);
+    let mut means = [[0.0; LANES]; GUIDES];
+    let mut covariances = Vec::with_capacity(GUIDES * (GUIDES + 1) / 2);
+    let mut row = 1;
+    for i in 0..GUIDES {
+        means[i] = each(|l| of_guides[row][l] * inverse[l]);
+        for j in 0..=i {
+            let noise = if i == j { GUIDE_NOISE[i] } else { 0.0 };
+            let found = covariance(&of_guides[row + 1 + j], &means[i], &means[j]);
+            covariances.push(each(|l| found[l].max(if i == j { 0.0 } else { f32::MIN }) + noise));
+        }
+        row += i + 2;
+    }
+    let mut targets = [([0.0; LANES], [[0.0; LANES]; GUIDES], [0.0; LANES]); TARGETS];
+    for ((mean, with, variance), sums) in targets.iter_mut().zip(of_targets.chunks_exact(KNOWN + 1)) {
+        *mean = each(|l| sums[0][l] * inverse[l]);
+        for i in 0..GUIDES {
+            with[i] = covariance(&sums[1 + i], &means[i], mean);
+        }
+        let found = covariance(&sums[KNOWN], mean, mean);
+        *variance = each(|l| found[l].max(0.0));
+    }
+    let [(mean, with, variance), (level, mut missed, noise)] = targets;
+
+    // Slopes of the samples: a ridge that is the variance with which as many of them decide on one.
+    let doubt = each(|l| noise[l].max(LEAST_NOISE) / ((PIXELS * SLOPE * SLOPE) * count[l].max(LEAST_COUNT)));
+    let mut doubted = covariances.clone();
+    let mut diagonal = 0;
+    for i in 0..GUIDES {
+        doubted[diagonal] = each(|l| doubted[diagonal][l] + doubt[l]);
+        diagonal += i + 2;
+    }
+    let mut doubted = Symmetric::of(GUIDES, doubted);
+    doubted.factor();
+    doubted.solve(&mut missed);
+    let mut plain = Symmetric::of(GUIDES, covariances);
+    plain.factor();
+    let mut smooth = with;
+    plain.solve(&mut smooth);
+
+    let mut rest = variance;
+    for i in 0..GUIDES {
+        rest = each(|l| rest[l] - smooth[i][l] * with[i][l]);
+    }
+    let given = each(|l| {
+        let share = BLOTCHES * BLOTCHES / (rest[l].max(0.0) + BLOTCHES * BLOTCHES);
+        if inverse[l] > 0.0 { share } else { 0.0 }
+    });
+    let mut kept = [[0.0; LANES]; KEPT];
+    let mut constant = each(|l| given[l] * mean[l]);
+    for i in 0..GUIDES {
+        // What was missed lies on a plane itself, so of it nothing is taken away.
+        kept[i] = each(|l| given[l] * smooth[i][l] + missed[i][l] / level[l].max(LEAST_LEVEL));
+        constant = each(|l| constant[l] - kept[i][l] * means[i][l]);
+    }
+    kept[GUIDES] = constant;
+    kept[KNOWN] = given;
+    kept
+}
+
+/// The factors of a row of pixels.
+struct Factors<'a> {
+    guides: Guides<'a>,
+    image: [&'a [f32]; 3],
+    y: usize,
+    /// The fits of the squares above and below, and how far the row is on the way to the latter.
+    near: [&'a [f32]; 2],
+    share: f32,
+    memory: &'a mut Memory,
+}
+
+impl Vectorised for Factors<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { guides, image, y, near: [above, below], share, memory } = self;
+        let Memory { pixels, fit, factors } = memory;
+        pixels.read(guides, image, y);
+        let Pixels { squares, known, targets, weight, .. } = pixels;
+        let (squares, len) = (*squares, SQUARE * *squares);
+        let lines = above.chunks_exact(squares).zip(below.chunks_exact(squares));
+        for (fit, (above, below)) in fit.chunks_exact_mut(squares + 2).zip(lines) {
+            for (fit, (a, b)) in fit[1..].iter_mut().zip(above.iter().zip(below)) {
+                *fit = a + (b - a) * share;
+            }
+            fit[0] = fit[1];
+            fit[squares + 1] = fit[squares];
+        }
+        let mut fit = fit.chunks_exact(squares + 2);
+        factors.fill(0.0);
+        for guide in known[len..].chunks_exact(len) {
+            add_interpolated(1.0, fit.next().expect("a line for each guide"), guide, factors);
+        }
+        add_interpolated(1.0, fit.next().expect("a line of constants"), &known[..len], factors);
+        add_interpolated(-1.0, fit.next().expect("a line of shares"), &targets[..len], factors);
+        for (factor, weight) in factors.iter_mut().zip(&*weight) {
+            *factor = exp((*factor * weight).clamp(-LARGEST, LARGEST));
+        }
+    }
+}
+
+/// Adds values of squares, interpolated between their middles, times those of pixels and `sign`.
+#[inline(always)]
+fn add_interpolated(sign: f32, squares: &[f32], pixels: &[f32], sums: &mut [f32]) {
+    let n = squares.len() - 2;
+    for (phase, (sums, pixels)) in sums.chunks_exact_mut(n).zip(pixels.chunks_exact(n)).enumerate() {
+        // The first half of a square's pixels lies between its middle and that of the square before.
+        let (first, share) = between_of(phase);
+        let (left, right) = (&squares[first..][..n], &squares[first + 1..][..n]);
+        for ((sum, pixel), (left, right)) in sums.iter_mut().zip(pixels).zip(left.iter().zip(right)) {
+            *sum += sign * (left + (right - left) * share) * pixel;
+        }
+    }
+}
+
+/// For the pixels `phase` of squares, how many squares on from the one before they lie, and how far on towards the next.
+#[inline(always)]
+fn between_of(phase: usize) -> (usize, f32) {
+    let place = (phase as f32 + 0.5) / SQUARE as f32 + 0.5;
+    (place as usize, place.fract())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filters::variance::tests::noise;
+
+    const SIZE: (usize, usize) = (71, 54);
+    const PIXELS: usize = SIZE.0 * SIZE.1;
+
+    /// A frame whose radiance over albedo is `light` of a pixel in what was denoised, `samples` in what was rendered.
+    struct Frame {
+        normal: Vec<f32>,
+        albedo: Vec<f32>,
+        image: Vec<f32>,
+        samples: Vec<f32>,
+    }
+
+    impl Frame {
+        fn new(albedo: &[f32], light: impl Fn(usize) -> f32, samples: impl Fn(usize) -> f32) -> Self {
+            let lit = |of: &dyn Fn(usize) -> f32| (0..3 * PIXELS).map(|i| albedo[i] * of(i % PIXELS)).collect();
+            let (image, samples) = (lit(&light), lit(&samples));
+            Self { normal: vec![0.5; 3 * PIXELS], albedo: albedo.to_vec(), image, samples }
+        }
+
+        fn guides(&self) -> Guides<'_> {
+            Guides { size: SIZE, normal: &self.normal, albedo: &self.albedo }
+        }
+
+        /// Radiance over albedo of the first colour after a refit.
+        fn refitted(&self) -> Vec<f32> {
+            let mut image = self.image.clone();
+            let refit = Refit::of(self.guides(), &image, Samples::Rendered(&self.samples, 1.0));
+            refit.apply(self.guides(), &mut image, 1.0);
+            image[..PIXELS].iter().zip(&self.albedo).map(|(v, a)| v / a).collect()
+        }
+    }
+
+    fn grey(value: f32) -> Vec<f32> {
+        vec![value; 3 * PIXELS]
+    }
+
+    /// An albedo of random greys.
+    fn textured() -> Vec<f32> {
+        noise(5, PIXELS, 1.0).into_iter().map(|v| 0.65 + 0.3 * v.clamp(-1.0, 1.0)).collect::<Vec<_>>().repeat(3)
+    }
+
+    /// Mean and deviation.
+    fn spread_of(values: &[f32]) -> (f32, f32) {
+        let n = values.len() as f32;
+        let mean = values.iter().sum::<f32>() / n;
+        (mean, (values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt())
+    }
+
+    #[test]
+    fn texture_that_was_missed_is_found_in_noisy_samples() {
+        let albedo = textured();
+        let random = noise(6, PIXELS, 1.0);
+        // The light that comes back falls with the albedo, which the network has not seen.
+        let lost = |i: usize| (albedo[i] / 0.65).powf(-0.4);
+        let frame = Frame::new(&albedo, |_| 0.8, |i| 0.8 * lost(i) * (1.0 + 0.5 * random[i].clamp(-1.0, 1.0)));
+        let found = frame.refitted();
+        let products = |a: &dyn Fn(usize) -> f32| (0..PIXELS).map(|i| a(i) * lost(i).ln()).sum::<f32>();
+        let share = products(&|i| (found[i] / 0.8).ln()) / products(&|i| lost(i).ln());
+        assert!((0.6..1.1).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn blotches_go_and_edges_stay() {
+        let random = noise(7, PIXELS, 0.02);
+        let is_lit = |i: usize| i % SIZE.0 >= 35;
+        let light = |i: usize| if is_lit(i) { 0.4 } else { 0.2 } * (1.0 + random[i]);
+        let frame = Frame::new(&grey(0.5), light, light);
+        let found = frame.refitted();
+        let of = |columns: std::ops::Range<usize>| -> Vec<f32> {
+            (0..PIXELS).filter(|i| columns.contains(&(i % SIZE.0))).map(|i| found[i]).collect()
+        };
+        let ((dark, uneven), (bright, _)) = (spread_of(&of(4..16)), spread_of(&of(55..67)));
+        assert!(uneven / dark < 0.4 * 0.02, "{uneven} of {dark}");
+        assert!((dark - 0.2).abs() < 2e-3 && (bright - 0.4).abs() < 4e-3, "{dark} {bright}");
+        let (last, first) = (spread_of(&of(34..35)).0, spread_of(&of(35..36)).0);
+        assert!((last - 0.2).abs() < 0.01 && (first - 0.4).abs() < 0.02, "{last} {first}");
+    }
+
+    #[test]
+    fn noise_of_samples_alone_changes_little() {
+        let (albedo, random) = (textured(), noise(8, PIXELS, 1.0));
+        let frame = Frame::new(&albedo, |_| 0.2, |i| 0.2 * (1.0 + 2.0 * random[i]).max(0.0));
+        let (_, change) = spread_of(&frame.refitted());
+        assert!(change / 0.2 < 0.06, "{change}");
+    }
+
+    #[test]
+    fn lamps_and_fireflies_say_nothing_of_what_is_around() {
+        let (albedo, random) = (textured(), noise(9, PIXELS, 0.1));
+        let light = |i: usize| 0.2 * (1.0 + random[i]);
+        let lamp = |i: usize| (20..26).contains(&(i % SIZE.0)) && (20..26).contains(&(i / SIZE.0));
+        let firefly = |i: usize| i == 40 * SIZE.0 + 50;
+        let without = Frame::new(&albedo, light, light).refitted();
+        let with = Frame::new(
+            &albedo,
+            |i| if lamp(i) { 500.0 } else { light(i) },
+            |i| if lamp(i) { 500.0 } else if firefly(i) { 1e4 } else { light(i) },
+        );
+        let found = with.refitted();
+        for i in (0..PIXELS).filter(|i| !lamp(*i)) {
+            assert!((found[i] / without[i]).ln().abs() < 0.1, "{i}: {} for {}", found[i], without[i]);
+        }
+        assert!((0..PIXELS).filter(|i| lamp(*i)).all(|i| (found[i] - 500.0).abs() < 1.0));
+    }
+
+    #[test]
+    fn however_samples_are_given_factors_are_what_is_applied() {
+        let (albedo, random) = (textured(), noise(10, PIXELS, 0.3));
+        let frame = Frame::new(&albedo, |i| 0.2 + 0.1 * random[i].abs(), |i| 0.2 * (1.0 + random[i]).max(0.0));
+        let divided: Vec<f32> =
+            frame.samples.iter().zip(&frame.albedo).map(|(v, a)| v.max(0.0) * 1.5 / a).collect();
+        let rendered = Refit::of(frame.guides(), &frame.image, Samples::Rendered(&frame.samples, 1.5));
+        let divided = Refit::of(frame.guides(), &frame.image, Samples::Divided(&divided));
+        let mut factors = vec![0.0; 3 * PIXELS];
+        divided.factors(frame.guides(), &frame.image, &mut factors);
+        let mut image = frame.image.clone();
+        rendered.apply(frame.guides(), &mut image, 0.5);
+        let want: Vec<f32> = frame.image.iter().zip(&factors).map(|(v, f)| v * f * 0.5).collect();
+        assert_eq!(image, want);
+        assert!(factors.iter().any(|f| (f - 1.0).abs() > 0.01));
+    }
+
+    #[test]
+    fn black_and_tiny_frames_stay_finite() {
+        let black = Frame::new(&grey(0.05), |_| 0.0, |_| 0.0);
+        assert!(black.refitted().iter().all(|v| *v == 0.0));
+        for size in [(1, 1), (3, 2), (5, 1), (2, 9)] {
+            let n = 3 * size.0 * size.1;
+            let (normal, albedo, mut image) = (vec![0.3; n], vec![0.6; n], noise(11, n, 1.0));
+            image.iter_mut().for_each(|v| *v = v.abs());
+            let guides = Guides { size, normal: &normal, albedo: &albedo };
+            let samples = image.clone();
+            Refit::of(guides, &image, Samples::Rendered(&samples, 1.0)).apply(guides, &mut image, 1.0);
+            assert!(image.iter().all(|v| v.is_finite()), "{size:?}: {image:?}");
+        }
+    }
+}
