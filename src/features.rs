@@ -273,7 +273,7 @@ fn texture(albedo: f32) -> f32 {
 
 /// What radiance is divided by.
 #[inline(always)]
-pub fn divisor(albedo: f32) -> f32 {
+fn divisor(albedo: f32) -> f32 {
     texture(albedo) + ALBEDO_FLOOR
 }
 

@@ -18,7 +18,6 @@ use crate::{
     },
     kernels::{
         logarithm::LogTransfer,
-        memory::plane_buffer,
         vectorised::{self, Vectorised},
     },
     passes::{Pass, PassSet},
@@ -87,23 +86,28 @@ impl Shading {
                 moment.iter_mut().zip(of_squares).for_each(|(moment, sum)| *moment = sum);
             }
         });
-        let mut around = plane_buffer(moments.len());
-        squares::around(&moments, MOMENTS, squares, &WINDOW, &mut around);
-        let mut lines = vec![0.0; around.len() / MOMENTS * KEPT];
-        let rows = lines.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares));
-        rows.for_each(|(lines, moments)| {
-            for first in (0..squares).step_by(LANES) {
-                let part = first..(first + LANES).min(squares);
-                let kept = fit(std::array::from_fn(|k| {
-                    let mut lanes = [0.0; LANES];
-                    lanes[..part.len()].copy_from_slice(&moments[k * squares..][part.clone()]);
-                    lanes
-                }));
-                for (line, kept) in lines.chunks_mut(squares).zip(kept) {
-                    line[part.clone()].copy_from_slice(&kept[..part.len()]);
+        let rows: Vec<&[f32]> = moments.chunks(MOMENTS * squares).collect();
+        let mut lines = vec![0.0; rows.len() * KEPT * squares];
+        let memory = || [(); 2].map(|()| vec![0.0; MOMENTS * squares]);
+        lines.par_chunks_mut(KEPT * squares).enumerate().for_each_init(
+            memory,
+            |[of_rows, moments], (row, lines)| {
+                let near = |tap: usize| rows.get((row + tap).checked_sub(WINDOW.len() / 2)?);
+                let near = WINDOW.iter().enumerate().filter_map(|(tap, weight)| Some((*weight, *near(tap)?)));
+                squares::around(near, squares, &WINDOW, of_rows, moments);
+                for first in (0..squares).step_by(LANES) {
+                    let part = first..(first + LANES).min(squares);
+                    let kept = fit(std::array::from_fn(|k| {
+                        let mut lanes = [0.0; LANES];
+                        lanes[..part.len()].copy_from_slice(&moments[k * squares..][part.clone()]);
+                        lanes
+                    }));
+                    for (line, kept) in lines.chunks_mut(squares).zip(kept) {
+                        line[part.clone()].copy_from_slice(&kept[..part.len()]);
+                    }
                 }
-            }
-        });
+            },
+        );
         Ok(Self { squares, lines })
     }
 

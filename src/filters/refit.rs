@@ -6,6 +6,8 @@
 //! regression over features does (Bitterli et al. 2016). The other is fitted to the logarithm of what was denoised, which gives way
 //! to it where it varies little besides: a guided filter (He et al. 2013) that has its own image for a guide as well.
 
+use std::{collections::VecDeque, ops::Range};
+
 use rayon::prelude::*;
 
 use super::{
@@ -15,7 +17,6 @@ use super::{
 use crate::kernels::{
     filter::exp,
     logarithm::ln,
-    memory::{PlaneBuffer, plane_buffer},
     vectorised::{self, Vectorised},
 };
 
@@ -73,18 +74,20 @@ const LEAST_COUNT: f32 = 1e-2;
 const LEAST_NOISE: f32 = 1e-3;
 const LEAST_LEVEL: f32 = 0.3;
 
-/// What is known of a frame besides its radiance, planes of (C, H, W).
+/// What is known of a frame besides its radiance.
 #[derive(Clone, Copy)]
 pub struct Guides<'a> {
     /// Columns and rows.
     pub size: (usize, usize),
-    /// Axes of the normal, three planes.
+    /// Axes of the normal, (3, H, W).
     pub normal: &'a [f32],
-    /// What radiance is divided by, three planes: the albedo without its noise.
+    /// What radiance is divided by, the albedo without its noise: rows from `first` on, as many as there are, (3, R, W).
     pub albedo: &'a [f32],
+    /// The first of those rows.
+    pub first: usize,
 }
 
-/// Noisy radiance, three planes.
+/// Noisy radiance, (3, H, W).
 #[derive(Clone, Copy)]
 pub enum Samples<'a> {
     /// Exposed and divided by albedo.
@@ -100,86 +103,136 @@ impl Guides<'_> {
         let (width, height) = self.size;
         [0, 1, 2].map(|c| &planes[(c * height + y) * width..][..width])
     }
+
+    /// Row `y` of the albedo.
+    #[inline(always)]
+    fn albedo_row(&self, y: usize) -> [&[f32]; 3] {
+        let (width, plane) = (self.size.0, self.albedo.len() / 3);
+        [0, 1, 2].map(|c| &self.albedo[c * plane + (y - self.first) * width..][..width])
+    }
 }
 
-/// The fits to a denoised frame.
+/// A refit that goes down a frame as the frame is denoised, and keeps of it no more than the windows take.
 pub struct Refit {
     squares: usize,
-    /// Of each row of squares, [`KEPT`] lines of values.
-    fits: PlaneBuffer,
+    square_rows: usize,
+    /// Moments of rows of squares: the number of the first, and [`MOMENTS`] lines each.
+    moments: (usize, VecDeque<Vec<f32>>),
+    /// Fits of rows of squares: the number of the first, and [`KEPT`] lines each.
+    fits: (usize, VecDeque<Vec<f32>>),
+    /// Rows of pixels that are done.
+    done: usize,
 }
 
 impl Refit {
-    /// Fits to an exposed `image`, three planes, that was made of `samples`.
-    pub fn of(guides: Guides, image: &[f32], samples: Samples) -> Self {
-        let (width, height) = guides.size;
-        let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
-        let mut moments = plane_buffer(square_rows * MOMENTS * squares);
-        let rows = moments.par_chunks_mut(MOMENTS * squares).enumerate();
-        rows.for_each_init(
+    /// A refit of a frame of so many columns and rows.
+    pub fn new((width, height): (usize, usize)) -> Self {
+        let [squares, square_rows] = [width, height].map(|n| n.div_ceil(SQUARE));
+        Self { squares, square_rows, moments: Default::default(), fits: Default::default(), done: 0 }
+    }
+
+    /// Rows of pixels that are done: their albedo is not asked for again.
+    pub fn done(&self) -> usize {
+        self.done
+    }
+
+    /// Does `change` with every value of an exposed `image`, (3, H, W), and what it should be multiplied by, as far as that can be
+    /// known when its first `rows` rows are there. It was made of `samples`.
+    pub fn advance(
+        &mut self,
+        guides: Guides,
+        image: &mut [f32],
+        samples: Samples,
+        rows: usize,
+        change: impl Fn(&mut f32, f32) + Sync,
+    ) {
+        let (squares, reach) = (self.squares, WINDOW.len() / 2);
+        let (first, moments) = &mut self.moments;
+        let gathered = *first + moments.len();
+        let end = if rows == guides.size.1 { self.square_rows } else { rows / SQUARE };
+        let read = &*image;
+        let new = (gathered..end.max(gathered)).into_par_iter().map_init(
             || Pixels::new(squares),
-            |pixels, (row, sums)| {
-                sums.fill(0.0);
-                for y in SQUARE * row..(SQUARE * (row + 1)).min(height) {
-                    vectorised::run(Gather { guides, image, samples, y, pixels: &mut *pixels, sums });
+            |pixels, row| {
+                let mut sums = vec![0.0; MOMENTS * squares];
+                for y in SQUARE * row..(SQUARE * (row + 1)).min(guides.size.1) {
+                    let (pixels, sums) = (&mut *pixels, &mut sums[..]);
+                    vectorised::run(Gather { guides, image: read, samples, y, pixels, sums });
                 }
+                sums
             },
         );
-        let mut around = plane_buffer(moments.len());
-        squares::around(&moments, MOMENTS, squares, &WINDOW, &mut around);
-        let mut fits = plane_buffer(square_rows * KEPT * squares);
-        let rows = fits.par_chunks_mut(KEPT * squares).zip(around.par_chunks(MOMENTS * squares));
-        rows.for_each(|(fits, moments)| vectorised::run(FitRow { moments, fits, squares }));
-        Self { squares, fits }
+        moments.extend(new.collect::<Vec<_>>());
+
+        let end = *first + moments.len();
+        let end = if end == self.square_rows { end } else { end.saturating_sub(reach) };
+        let (first_fit, fits) = &mut self.fits;
+        let fitted = *first_fit + fits.len();
+        let new = (fitted..end.max(fitted)).into_par_iter().map_init(
+            || [(); 2].map(|()| vec![0.0; MOMENTS * squares]),
+            |[of_rows, around], row| {
+                let near = |tap: usize| moments.get((row + tap).checked_sub(reach + *first)?);
+                let lines =
+                    WINDOW.iter().enumerate().filter_map(|(tap, weight)| Some((*weight, &near(tap)?[..])));
+                let mut fits = vec![0.0; KEPT * squares];
+                squares::around(lines, squares, &WINDOW, of_rows, around);
+                vectorised::run(FitRow { moments: around, fits: &mut fits, squares });
+                fits
+            },
+        );
+        fits.extend(new.collect::<Vec<_>>());
+
+        // A pixel lies between the middles of two squares.
+        let end = match *first_fit + fits.len() {
+            end if end == self.square_rows => guides.size.1,
+            end if end > 1 => SQUARE * end - SQUARE / 2,
+            _ => 0,
+        };
+        let rows = self.done..end.max(self.done);
+        self.each_row(guides, image, rows.clone(), |row, factor| change(row, factor));
+        self.done = rows.end;
+        let (first, moments) = &mut self.moments;
+        let (first_fit, fits) = &mut self.fits;
+        let unused = (*first_fit + fits.len()).saturating_sub(reach).saturating_sub(*first);
+        moments.drain(..unused.min(moments.len()));
+        *first += unused;
+        let unused = between(self.done, self.square_rows).0.saturating_sub(*first_fit);
+        fits.drain(..unused);
+        *first_fit += unused;
     }
 
-    /// What each pixel of the `image` fitted to should be multiplied by, three planes, all alike.
-    pub fn factors(&self, guides: Guides, image: &[f32], factors: &mut [f32]) {
-        self.each_row(guides, factors, |y, rows, memory| {
-            self.find(guides, guides.row(image, y), y, memory);
-            for row in rows {
-                interleave(&memory.factors, self.squares, row, |row, factor| *row = factor);
-            }
-        });
-    }
-
-    /// Multiplies the `image` fitted to by those factors, and by `scale`.
-    pub fn apply(&self, guides: Guides, image: &mut [f32], scale: f32) {
-        self.each_row(guides, image, |y, rows, memory| {
-            self.find(guides, rows.each_ref().map(|row| &**row), y, memory);
-            for row in rows {
-                interleave(&memory.factors, self.squares, row, |value, factor| *value = *value * factor * scale);
-            }
-        });
-    }
-
-    /// Gives `work` each row of three planes: its number, and memory of the thread's.
+    /// Does `change` with every value of some rows and its factor.
     fn each_row(
         &self,
         guides: Guides,
-        planes: &mut [f32],
-        work: impl Fn(usize, [&mut [f32]; 3], &mut Memory) + Sync,
+        image: &mut [f32],
+        rows: Range<usize>,
+        change: impl Fn(&mut f32, f32) + Sync,
     ) {
         let (width, height) = guides.size;
-        let (red, rest) = planes.split_at_mut(width * height);
+        let (red, rest) = image.split_at_mut(width * height);
         let (green, blue) = rest.split_at_mut(width * height);
-        let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
+        let [red, green, blue] =
+            [red, green, blue].map(|plane| plane[rows.start * width..rows.end * width].par_chunks_mut(width));
         let memory = || Memory {
             pixels: Pixels::new(self.squares),
             fit: vec![0.0; KEPT * (self.squares + 2)],
             factors: vec![0.0; SQUARE * self.squares],
         };
-        red.zip(green).zip(blue).enumerate().for_each_init(memory, |memory, (y, ((red, green), blue))| {
-            work(y, [red, green, blue], memory);
+        let colours = red.zip(green).zip(blue).zip(rows);
+        colours.for_each_init(memory, |memory, (((red, green), blue), y)| {
+            self.find(guides, [red, green, blue], y, memory);
+            for row in [red, green, blue] {
+                interleave(&memory.factors, self.squares, row, &change);
+            }
         });
     }
 
     /// Finds the factors of row `y`, which holds `image`.
     fn find(&self, guides: Guides, image: [&[f32]; 3], y: usize, memory: &mut Memory) {
-        let line_len = KEPT * self.squares;
-        let square_rows = self.fits.len() / line_len;
-        let (above, share) = between(y, square_rows);
-        let near = [above, (above + 1).min(square_rows - 1)].map(|row| &self.fits[row * line_len..][..line_len]);
+        let (above, share) = between(y, self.square_rows);
+        let (first, fits) = &self.fits;
+        let near = [above, (above + 1).min(self.square_rows - 1)].map(|row| &fits[row - first][..]);
         vectorised::run(Factors { guides, image, y, near, share, memory });
     }
 }
@@ -245,7 +298,7 @@ impl Pixels {
             }
             part(mean, self.squares, &mut self.known[(1 + c) * len..][..len]);
         }
-        for (c, row) in guides.row(guides.albedo, y).into_iter().enumerate() {
+        for (c, row) in guides.albedo_row(y).into_iter().enumerate() {
             let albedo = &mut self.albedo[c * len..][..len];
             part(row, self.squares, albedo);
             let logarithms = &mut self.known[(4 + c) * len..][..len];
@@ -562,20 +615,21 @@ mod tests {
 
     impl Frame {
         fn new(albedo: &[f32], light: impl Fn(usize) -> f32, samples: impl Fn(usize) -> f32) -> Self {
-            let lit = |of: &dyn Fn(usize) -> f32| (0..3 * PIXELS).map(|i| albedo[i] * of(i % PIXELS)).collect();
+            let lit =
+                |of: &dyn Fn(usize) -> f32| (0..3 * PIXELS).map(|i| albedo[i] * of(i % PIXELS)).collect();
             let (image, samples) = (lit(&light), lit(&samples));
             Self { normal: vec![0.5; 3 * PIXELS], albedo: albedo.to_vec(), image, samples }
         }
 
         fn guides(&self) -> Guides<'_> {
-            Guides { size: SIZE, normal: &self.normal, albedo: &self.albedo }
+            Guides { size: SIZE, normal: &self.normal, albedo: &self.albedo, first: 0 }
         }
 
         /// Radiance over albedo of the first colour after a refit.
         fn refitted(&self) -> Vec<f32> {
             let mut image = self.image.clone();
-            let refit = Refit::of(self.guides(), &image, Samples::Rendered(&self.samples, 1.0));
-            refit.apply(self.guides(), &mut image, 1.0);
+            let samples = Samples::Rendered(&self.samples, 1.0);
+            Refit::new(SIZE).advance(self.guides(), &mut image, samples, SIZE.1, |v, factor| *v *= factor);
             image[..PIXELS].iter().zip(&self.albedo).map(|(v, a)| v / a).collect()
         }
     }
@@ -586,7 +640,11 @@ mod tests {
 
     /// An albedo of random greys.
     fn textured() -> Vec<f32> {
-        noise(5, PIXELS, 1.0).into_iter().map(|v| 0.65 + 0.3 * v.clamp(-1.0, 1.0)).collect::<Vec<_>>().repeat(3)
+        noise(5, PIXELS, 1.0)
+            .into_iter()
+            .map(|v| 0.65 + 0.3 * v.clamp(-1.0, 1.0))
+            .collect::<Vec<_>>()
+            .repeat(3)
     }
 
     /// Mean and deviation.
@@ -602,7 +660,8 @@ mod tests {
         let random = noise(6, PIXELS, 1.0);
         // The light that comes back falls with the albedo, which the network has not seen.
         let lost = |i: usize| (albedo[i] / 0.65).powf(-0.4);
-        let frame = Frame::new(&albedo, |_| 0.8, |i| 0.8 * lost(i) * (1.0 + 0.5 * random[i].clamp(-1.0, 1.0)));
+        let frame =
+            Frame::new(&albedo, |_| 0.8, |i| 0.8 * lost(i) * (1.0 + 0.5 * random[i].clamp(-1.0, 1.0)));
         let found = frame.refitted();
         let products = |a: &dyn Fn(usize) -> f32| (0..PIXELS).map(|i| a(i) * lost(i).ln()).sum::<f32>();
         let share = products(&|i| (found[i] / 0.8).ln()) / products(&|i| lost(i).ln());
@@ -644,7 +703,15 @@ mod tests {
         let with = Frame::new(
             &albedo,
             |i| if lamp(i) { 500.0 } else { light(i) },
-            |i| if lamp(i) { 500.0 } else if firefly(i) { 1e4 } else { light(i) },
+            |i| {
+                if lamp(i) {
+                    500.0
+                } else if firefly(i) {
+                    1e4
+                } else {
+                    light(i)
+                }
+            },
         );
         let found = with.refitted();
         for i in (0..PIXELS).filter(|i| !lamp(*i)) {
@@ -654,20 +721,32 @@ mod tests {
     }
 
     #[test]
-    fn however_samples_are_given_factors_are_what_is_applied() {
+    fn neither_how_samples_are_given_nor_how_rows_arrive_matters() {
         let (albedo, random) = (textured(), noise(10, PIXELS, 0.3));
-        let frame = Frame::new(&albedo, |i| 0.2 + 0.1 * random[i].abs(), |i| 0.2 * (1.0 + random[i]).max(0.0));
+        let frame =
+            Frame::new(&albedo, |i| 0.2 + 0.1 * random[i].abs(), |i| 0.2 * (1.0 + random[i]).max(0.0));
         let divided: Vec<f32> =
             frame.samples.iter().zip(&frame.albedo).map(|(v, a)| v.max(0.0) * 1.5 / a).collect();
-        let rendered = Refit::of(frame.guides(), &frame.image, Samples::Rendered(&frame.samples, 1.5));
-        let divided = Refit::of(frame.guides(), &frame.image, Samples::Divided(&divided));
-        let mut factors = vec![0.0; 3 * PIXELS];
-        divided.factors(frame.guides(), &frame.image, &mut factors);
-        let mut image = frame.image.clone();
-        rendered.apply(frame.guides(), &mut image, 0.5);
-        let want: Vec<f32> = frame.image.iter().zip(&factors).map(|(v, f)| v * f * 0.5).collect();
-        assert_eq!(image, want);
-        assert!(factors.iter().any(|f| (f - 1.0).abs() > 0.01));
+        let mut whole = frame.image.clone();
+        let samples = Samples::Divided(&divided);
+        Refit::new(SIZE).advance(frame.guides(), &mut whole, samples, SIZE.1, |v, factor| *v *= factor);
+        assert!(whole.iter().zip(&frame.image).any(|(a, b)| (a / b - 1.0).abs() > 0.01));
+        for step in [1, 7, 16] {
+            let (mut image, mut refit) = (frame.image.clone(), Refit::new(SIZE));
+            for rows in (0..SIZE.1).step_by(step).map(|y| (y + step).min(SIZE.1)) {
+                // Only the albedo of rows that are under way is there.
+                let first = refit.done();
+                let part: Vec<f32> = (0..3)
+                    .flat_map(|c| &frame.albedo[c * PIXELS + first * SIZE.0..c * PIXELS + rows * SIZE.0])
+                    .copied()
+                    .collect();
+                let guides = Guides { albedo: &part, first, ..frame.guides() };
+                let samples = Samples::Rendered(&frame.samples, 1.5);
+                refit.advance(guides, &mut image, samples, rows, |v, factor| *v *= factor);
+                assert!(refit.moments.1.len() <= 4 + step.div_ceil(SQUARE), "{}", refit.moments.1.len());
+            }
+            assert!(image == whole && refit.done() == SIZE.1, "{step} rows at a time");
+        }
     }
 
     #[test]
@@ -678,9 +757,10 @@ mod tests {
             let n = 3 * size.0 * size.1;
             let (normal, albedo, mut image) = (vec![0.3; n], vec![0.6; n], noise(11, n, 1.0));
             image.iter_mut().for_each(|v| *v = v.abs());
-            let guides = Guides { size, normal: &normal, albedo: &albedo };
+            let guides = Guides { size, normal: &normal, albedo: &albedo, first: 0 };
             let samples = image.clone();
-            Refit::of(guides, &image, Samples::Rendered(&samples, 1.0)).apply(guides, &mut image, 1.0);
+            let samples = Samples::Rendered(&samples, 1.0);
+            Refit::new(size).advance(guides, &mut image, samples, size.1, |v, factor| *v *= factor);
             assert!(image.iter().all(|v| v.is_finite()), "{size:?}: {image:?}");
         }
     }

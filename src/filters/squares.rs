@@ -1,8 +1,6 @@
 //! Sums over 4x4 squares of pixels and over windows of squares, in which the fits to a frame are gathered (He and Sun 2015:
 //! what a guided filter does changes slowly, so it need not be found anew for every pixel).
 
-use rayon::prelude::*;
-
 use crate::kernels::vectorised::{self, Vectorised};
 
 /// Rows and columns of a square.
@@ -14,26 +12,21 @@ pub fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
-/// Writes every value of rows of `lines` lines of `squares` values, weighted with those around it: `window` holds an odd number of
-/// weights, of rows and of columns alike. Beyond the frame there is nothing.
-///
-/// # Panics
-/// If lengths do not fit.
-pub fn around(values: &[f32], lines: usize, squares: usize, window: &[f32], output: &mut [f32]) {
-    let row_len = lines * squares;
-    assert_eq!((values.len(), values.len() % row_len), (output.len(), 0));
-    output.par_chunks_mut(row_len).enumerate().for_each_init(
-        || vec![0.0; row_len],
-        |of_rows, (row, output)| {
-            vectorised::run(Around { values, row, squares, window, of_rows, output });
-        },
-    );
+/// Writes to `output` every value of lines of `squares` values, weighted with those around it: `rows` are those above, at and below it, each
+/// with its weight, and `window` holds an odd number of weights for what is to the left and right. Beyond the frame there is nothing.
+pub fn around<'a>(
+    rows: impl Iterator<Item = (f32, &'a [f32])>,
+    squares: usize,
+    window: &[f32],
+    of_rows: &mut [f32],
+    output: &mut [f32],
+) {
+    vectorised::run(Around { rows, squares, window, of_rows, output });
 }
 
-/// A row of [`around`].
-struct Around<'a> {
-    values: &'a [f32],
-    row: usize,
+/// See [`around`].
+struct Around<'a, R> {
+    rows: R,
     squares: usize,
     window: &'a [f32],
     /// Memory for the weighted sum of rows.
@@ -41,17 +34,14 @@ struct Around<'a> {
     output: &'a mut [f32],
 }
 
-impl Vectorised for Around<'_> {
+impl<'a, R: Iterator<Item = (f32, &'a [f32])>> Vectorised for Around<'_, R> {
     #[inline(always)]
     fn run(self) {
-        let Self { values, row, squares, window, of_rows, output } = self;
+        let Self { rows, squares, window, of_rows, output } = self;
         let reach = window.len() / 2;
-        // The window begins above the first row where that is nearer than it reaches.
-        let (first, skipped) = (row.saturating_sub(reach), reach.saturating_sub(row));
-        let rows = values.chunks_exact(of_rows.len()).skip(first);
-        add_weighted(window[skipped..].iter().copied().zip(rows), of_rows);
+        add_weighted(rows, of_rows);
+        output.fill(0.0);
         for (output, line) in output.chunks_exact_mut(squares).zip(of_rows.chunks_exact(squares)) {
-            output.fill(0.0);
             for (tap, weight) in window.iter().enumerate() {
                 let to = reach.saturating_sub(tap).min(squares);
                 let from = tap.saturating_sub(reach).min(squares);

@@ -33,7 +33,7 @@ use crate::{
         radiance_as_albedo,
     },
     filters::refit::{Guides, Refit, Samples},
-    kernels::{blend::CORNERS, memory::plane_buffer},
+    kernels::{blend::CORNERS, memory::PlaneBuffer},
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -366,16 +366,14 @@ impl Pyramid {
 /// What a refit multiplies denoised images by, (N, 3, H, W).
 fn factors(image: &[f32], irradiance: &Stacked, guide: &Stacked, albedo: &Stacked) -> Stacked {
     let (shape, pixels) = (irradiance.0, irradiance.0.h * irradiance.0.w);
-    let mut factors = plane_buffer(image.len());
-    for (n, factors) in factors.chunks_exact_mut(3 * pixels).enumerate() {
+    let size = (shape.w, shape.h);
+    let mut factors = PlaneBuffer::from(image.to_vec());
+    for (n, image) in factors.chunks_exact_mut(3 * pixels).enumerate() {
         let of_image = 3 * n * pixels..3 * (n + 1) * pixels;
-        let guides = Guides {
-            size: (shape.w, shape.h),
-            normal: &guide.1[(n * guide.0.c + 3) * pixels..][..3 * pixels],
-            albedo: &albedo.1[of_image.clone()],
-        };
-        let image = &image[of_image.clone()];
-        Refit::of(guides, image, Samples::Divided(&irradiance.1[of_image])).factors(guides, image, factors);
+        let normal = &guide.1[(n * guide.0.c + 3) * pixels..][..3 * pixels];
+        let guides = Guides { size, normal, albedo: &albedo.1[of_image.clone()], first: 0 };
+        let samples = Samples::Divided(&irradiance.1[of_image]);
+        Refit::new(size).advance(guides, image, samples, shape.h, |value, factor| *value = factor);
     }
     (shape, factors)
 }

@@ -7,13 +7,12 @@
 use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
-use rayon::prelude::*;
 
 use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
-        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, divisor, exposure, guides, keep_black,
+        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black,
         radiance_as_albedo,
     },
     filters::refit::{Guides, Refit, Samples},
@@ -47,16 +46,36 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         |rows: &Range<usize>| (width, if rows.end == passes.height { height } else { rows.end } - rows.start);
     let starts = (0..passes.height).step_by(rows).filter(|&y| y == 0 || !is_last(y));
     let bands = starts.map(|y| y..if is_last(y + rows) { passes.height } else { y + rows });
+    let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+    let size = (passes.width, passes.height);
+    let mut refit = Refit::new(size);
+    // The albedo of what the refit has under way.
+    let mut divisors = Planes::default();
     let mut image = Planes::default();
-    let mut write = |first: usize, part: Planes| {
+    let mut write = |first: usize, part: Planes, albedo: Option<Planes>| {
+        let end = first + part.height;
         if part.height == passes.height {
             image = part;
-            return Ok(());
+        } else {
+            if image.height == 0 {
+                image = Planes::unwritten(3, size.0, size.1);
+            }
+            image.write_rows(first, &part);
         }
-        if image.height == 0 {
-            image = Planes::unwritten(3, passes.width, passes.height);
+        if let Some(albedo) = albedo {
+            let first = refit.done();
+            divisors = match divisors.height {
+                0 => albedo,
+                _ => divisors.above(&albedo),
+            };
+            let guides = Guides { size, normal: &normal.data, albedo: &divisors.data, first };
+            let samples = Samples::Rendered(&radiance.data, exposure);
+            refit.advance(guides, &mut image.data, samples, end, |v, factor| {
+                *v = *v * factor * exposure.recip()
+            });
+            let done = refit.done() - first;
+            divisors = divisors.window((0, done), (size.0, divisors.height - done));
         }
-        image.write_rows(first, &part);
         Ok(())
     };
     let mut beauty = Feed::new(network, passes, exposure, rows);
@@ -64,12 +83,11 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         let shading = Shading::of(passes, exposure, NEEDED_BY)?;
         let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
         let mut held: Option<Planes> = None;
-        let mut divisors = Planes::unwritten(3, passes.width, passes.height);
         for band in bands {
             let size = padded(&band);
             let band = albedo_as_radiance(passes, band, size, NEEDED_BY)?;
             // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
-            prefiltered.push(band, None, &mut |first, clean| {
+            prefiltered.push(band, None, &mut |first, clean, _| {
                 let end = first + clean.height;
                 let clean = match held.take() {
                     Some(held) => held.above(&clean),
@@ -82,18 +100,10 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
                 let rows = end - clean.height..end;
                 let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
                 let size = padded(&rows);
-                let albedo = radiance_as_albedo(clean);
-                divisors.write_rows(rows.start, &albedo);
-                let refined = Refined { albedo, shading }.padded_to(size);
+                let refined = Refined { albedo: radiance_as_albedo(clean), shading }.padded_to(size);
                 beauty.push(network.rows(passes, rows, size, exposure)?, Some(refined), &mut write)
             })?;
         }
-        divisors.data.par_iter_mut().for_each(|albedo| *albedo = divisor(*albedo));
-        let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
-        let size = (passes.width, passes.height);
-        let guides = Guides { size, normal: &normal.data, albedo: &divisors.data };
-        let refit = Refit::of(guides, &image.data, Samples::Rendered(&radiance.data, exposure));
-        refit.apply(guides, &mut image.data, exposure.recip());
     } else {
         for band in bands {
             let size = padded(&band);
@@ -125,7 +135,7 @@ impl<'a> Feed<'a> {
         &mut self,
         band: PassSet,
         refined: Option<Refined>,
-        done: &mut dyn FnMut(usize, Planes) -> Result<()>,
+        done: &mut dyn FnMut(usize, Planes, Option<Planes>) -> Result<()>,
     ) -> Result<()> {
         let refits = refined.is_some();
         let Inputs { planes, scale } = guides(&band, refined, self.exposure, NEEDED_BY)?;
@@ -133,18 +143,20 @@ impl<'a> Feed<'a> {
         let scale = if refits { 1.0 } else { scale };
         let (width, height) = self.size;
         let mut result = Ok(());
-        let mut hand_out = |first: usize, field: &Field| {
+        let mut hand_out = |first: usize, field: &Field, albedo: &Field| {
             let (_, _, h, w) = field.extent();
             let rows = h.min(height.saturating_sub(first));
             if rows == 0 || result.is_err() {
                 return;
             }
-            let values = field.values();
-            let part = Planes::from_rows(3, (width, rows), |c, y, into| {
-                let from = &values[(c * h + y) * w..];
-                into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
-            });
-            result = done(first, part);
+            let part = |field: &Field, scale: f32| {
+                let values = field.values();
+                Planes::from_rows(3, (width, rows), |c, y, into| {
+                    let from = &values[(c * h + y) * w..];
+                    into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
+                })
+            };
+            result = done(first, part(field, scale), refits.then(|| part(albedo, 1.0)));
         };
         self.frame.push(planes);
         self.frame.advance(&mut hand_out);
@@ -273,8 +285,8 @@ impl<'a> Frame<'a> {
     }
 
     /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
-    /// first row, and radiance.
-    fn advance(&mut self, done: &mut impl FnMut(usize, &Field)) {
+    /// first row, radiance, and the albedo.
+    fn advance(&mut self, done: &mut impl FnMut(usize, &Field, &Field)) {
         self.encode();
         self.decode();
         self.reduce();
@@ -371,7 +383,7 @@ impl<'a> Frame<'a> {
     }
 
     /// Filters the image; at full resolution, hands out what becomes of it.
-    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field)) {
+    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field, &Field)) {
         let (k, reach) = (kernel_of(scale), kernel_of(scale) / 2);
         let Scale { image, confidence, kernels, blended, smooth, filtered, .. } = &mut self.scales[scale];
         let source = if scale == LEVELS { &*image } else { &*blended };
@@ -390,7 +402,7 @@ impl<'a> Frame<'a> {
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
             let albedo = self.albedo.rows(rows.clone());
-            done(rows.start, &output.product(albedo).amplify(gain));
+            done(rows.start, &output.product(albedo.fork()).amplify(gain), &albedo);
         }
     }
 
