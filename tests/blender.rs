@@ -315,3 +315,23 @@ fn makes_assets_of_furniture_libraries_and_of_images() {
     let index = fs::read_to_string(furniture.join("models.tsv")).unwrap();
     assert!(index.contains("test_maker_lowtable\tfurniture\t1.2\tTest library\tSomebody\tCC0"), "{index}");
 }
+
+#[test]
+fn makes_scenes_of_tracks() {
+    let folder = tempfile::tempdir().unwrap();
+    let (data, out) = (folder.path().join("data"), folder.path().join("tracks"));
+    run(blender().arg(snippet("make_track.py")).arg(&data));
+    let said = run(blender().arg(script("import_tracks.py")).arg("--out").arg(&out).arg(&data));
+    assert!(said.contains("broken: left out") && said.contains("is no mesh of version 1"), "{said}");
+    assert!(said.contains("1 tracks in") && said.contains("1 left out"), "{said}");
+    let said = run(blender().arg(snippet("use_track.py")).arg(out.join("yard.blend")));
+    let meshes: Vec<_> = said.lines().filter(|line| line.starts_with("MESH")).collect();
+    // Two of the three walls, as the third only glows; what only stops karts is not there.
+    assert_eq!(meshes.len(), 2, "{said}");
+    let first = "MESH 4 -20.0 -20.0 0.0 20.0 20.0 8.0 (1.0, 0.5, 0.0, 1.0) ['wall.png']";
+    assert!(meshes.contains(&first), "{said}");
+    // Turned a quarter, twice as high, and moved.
+    assert!(meshes.iter().any(|mesh| mesh.starts_with("MESH 4 -20.0 70.0 0.0 20.0 110.0 16.0")), "{said}");
+    assert!(said.contains("LIGHT POINT (3.0, 4.0, 3.0) (1.0, 0.0, 0.0)"), "{said}");
+    assert!(said.contains("LIGHT SUN") && said.contains("CAMERAS 24"), "{said}");
+}
