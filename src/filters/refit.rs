@@ -52,6 +52,9 @@ const SLOPE: f32 = 0.2;
 /// Deviation of the blotches that a network leaves: what varies less beside the guides gives way to them.
 const BLOTCHES: f32 = 0.08;
 
+/// Variance of the samples over what was denoised from which on blotches are that large: with less noise there is less of them.
+const NOISY: f32 = 0.05;
+
 /// Exposed radiance over albedo (the mean of the colours, as below) that is added to samples and to what is denoised before one is divided by the other, and before
 /// the latter's logarithm: relative errors of what is darker count less and less.
 const SAMPLE_FLOOR: f32 = 0.2;
@@ -521,7 +524,8 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
         rest = each(|l| rest[l] - smooth[i][l] * with[i][l]);
     }
     let given = each(|l| {
-        let share = BLOTCHES * BLOTCHES / (rest[l].max(0.0) + BLOTCHES * BLOTCHES);
+        let blotches = BLOTCHES * BLOTCHES * (noise[l].max(LEAST_NOISE) * (1.0 / NOISY)).min(1.0);
+        let share = blotches / (rest[l].max(0.0) + blotches);
         if inverse[l] > 0.0 { share } else { 0.0 }
     });
     let mut kept = [[0.0; LANES]; KEPT];
@@ -673,7 +677,8 @@ mod tests {
         let random = noise(7, PIXELS, 0.02);
         let is_lit = |i: usize| i % SIZE.0 >= 35;
         let light = |i: usize| if is_lit(i) { 0.4 } else { 0.2 } * (1.0 + random[i]);
-        let frame = Frame::new(&grey(0.5), light, light);
+        let noisy = noise(12, PIXELS, 1.0);
+        let frame = Frame::new(&grey(0.5), light, |i| light(i) * (1.0 + noisy[i]).max(0.0));
         let found = frame.refitted();
         let of = |columns: std::ops::Range<usize>| -> Vec<f32> {
             (0..PIXELS).filter(|i| columns.contains(&(i % SIZE.0))).map(|i| found[i]).collect()
