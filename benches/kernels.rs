@@ -83,7 +83,7 @@ fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Fo
         ),
         Format::Int8 { step } => (
             Operand::quantize(View::new(shape, &x), step),
-            Weights::quantize(&weights, &[(i, step)], o, geometry),
+            Weights::quantize(engine, &weights, &[(i, step)], o, geometry),
         ),
     };
     let bias = blocks(o.div_ceil(LANES));

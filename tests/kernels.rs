@@ -305,17 +305,21 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
     let x: Vec<f32> = (noise(seed, shape.n * shape.c * area).iter().enumerate())
         .map(|(i, v)| (v.abs() * 255.0).round() * step_of(i / area % shape.c))
         .collect();
-    // Each output's largest weight is 127 steps, so that no other weight is rounded.
+    // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that no other weight is
+    // rounded.
+    let (largest, adds) = if engine.adds_in_16_bits() { (124.0, true) } else { (127.0, false) };
     let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];
     let levels = noise(seed + 1, w.len());
     for o in 0..outputs {
         let scale = 2f32.powi(o as i32 % 5 - 6);
+        let has_four = adds && o % 2 == 1 && channels[0] > 5;
         for i in 0..shape.c {
             for t in 0..geometry.taps() {
-                let level = if (i, t) == (0, 0) {
-                    -127.0
-                } else {
-                    (levels[(o * shape.c + i) * geometry.taps() + t] * 127.0).round()
+                let level = match (i, t) {
+                    (0 | 1 | 4 | 5, 0) if has_four => -largest / 4.0,
+                    (0, 0) => -largest,
+                    (1 | 4 | 5, 0) => 0.0,
+                    _ => (levels[(o * shape.c + i) * geometry.taps() + t] * 31.0).round(),
                 };
                 w[weight_index(geometry, outputs, shape.c, o, i, t)] = level * scale / step_of(i);
             }
@@ -341,7 +345,7 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
         })
         .collect();
     let operands: Vec<_> = operands.iter().collect();
-    let packed = narrow::conv::Weights::quantize(&w, &sources, outputs, geometry);
+    let packed = narrow::conv::Weights::quantize(engine, &w, &sources, outputs, geometry);
     let mut padded = bias.clone();
     padded.resize(outputs.next_multiple_of(LANES), 0.0);
     let bias: Vec<Block> = padded.as_chunks::<LANES>().0.iter().map(|c| Block(*c)).collect();
@@ -383,6 +387,42 @@ proptest! {
     ) {
         for engine in Engine::available() {
             check_int8(engine, geometry, Shape::new(n, c, h, w), split, outputs, seed % 1000);
+        }
+    }
+}
+
+/// Whatever the weights, the largest activations do not overflow any sum.
+fn check_largest(engine: Engine, geometry: Geometry, (channels, outputs): (usize, usize), seed: u64) {
+    let shape = Shape::new(1, channels, 2, 40);
+    let x = vec![255.0; channels * shape.h * shape.w];
+    let x = narrow::Operand::quantize(View::new(shape, &blocked(shape, &x)), 1.0);
+    // Many channels of one sign, and a few that decide on the steps.
+    let w: Vec<f32> =
+        noise(seed, channels * outputs * geometry.taps()).iter().map(|v| v.abs().powi(3)).collect();
+    let w: Vec<f32> = w.iter().zip(noise(seed + 1, w.len())).map(|(w, v)| w.copysign(v + 0.7)).collect();
+    let weights = narrow::conv::Weights::quantize(engine, &w, &[(channels, 1.0)], outputs, geometry);
+    let (oh, ow) = geometry.output(shape.h, shape.w);
+    let out_shape = shape.with_channels(outputs).with_size(oh, ow);
+    let bias = vec![Block::default(); out_shape.planes()];
+    let of = |engine: Engine| {
+        let mut out = vec![Block::default(); out_shape.blocks()];
+        let to = narrow::conv::Output::F32(ViewMut::new(out_shape, &mut out));
+        let linear = Epilogue { relu: false, accumulate: false };
+        narrow::conv::convolve(engine, &[&x], &weights, &bias, linear, to);
+        plain(out_shape, &out)
+    };
+    assert!(of(engine) == of(Engine::PORTABLE), "{engine:?}");
+}
+
+proptest! {
+    #[test]
+    fn eight_bits_do_not_overflow(
+        size in (1usize..150, 1usize..40),
+        geometry in prop::sample::select(vec![Geometry::Same(1), Geometry::Same(3), Geometry::Transposed]),
+        seed in any::<u64>(),
+    ) {
+        for engine in Engine::available() {
+            check_largest(engine, geometry, size, seed % 1000);
         }
     }
 }

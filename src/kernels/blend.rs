@@ -126,7 +126,9 @@ impl Kernel for Row<'_> {
                 let negative = S::mul(read(alpha), S::splat(-1.0));
                 let share = S::div(one, S::add(one, S::exp(negative)));
                 let part = S::div(share, total);
-                let weights = weights.map(|weight| S::mul(weight, part));
+                for weight in &mut weights {
+                    *weight = S::mul(*weight, part);
+                }
                 let rest = S::fma(share, S::splat(-1.0), one);
                 for (c, output) in output.iter_mut().enumerate() {
                     let mut sum = S::mul(read(of(fine, c)), rest);

@@ -410,6 +410,218 @@ mod x86 {
             // SAFETY: the caller's promise.
             unsafe { (_mm256_max_ps(a.0, b.0), _mm256_max_ps(a.1, b.1)) }
         }
+        #[inline(always)]
+        unsafe fn read_some(p: *const f32, lanes: Range<usize>, other: f32) -> Self::V {
+            // SAFETY: the caller's promise; lanes that a mask leaves out are not read.
+            unsafe {
+                if lanes == (0..LANES) {
+                    return Self::read(p);
+                }
+                (read_some_eight(p, lanes.clone(), 0, other), read_some_eight(p, lanes, HALF, other))
+            }
+        }
+        #[inline(always)]
+        unsafe fn write_first(p: *mut f32, count: usize, v: Self::V) {
+            // SAFETY: the caller's promise; lanes that the mask leaves out are not written.
+            unsafe {
+                if count == LANES {
+                    return Self::write(p, v);
+                }
+                _mm256_maskstore_ps(p, below(count, 0), v.0);
+                _mm256_maskstore_ps(p.wrapping_add(HALF), below(count, HALF), v.1);
+            }
+        }
+        #[inline(always)]
+        unsafe fn transpose(mut rows: [Self::V; LANES]) -> [Self::V; LANES] {
+            let mut quarters = [[[rows[0].0; HALF]; 2]; 2];
+            for i in 0..LANES {
+                quarters[i / HALF][0][i % HALF] = rows[i].0;
+                quarters[i / HALF][1][i % HALF] = rows[i].1;
+            }
+            // SAFETY: the caller's promise.
+            let [[a, b], [c, d]] = unsafe {
+                let [[a, b], [c, d]] = quarters;
+                [[transpose_eight(a), transpose_eight(b)], [transpose_eight(c), transpose_eight(d)]]
+            };
+            for i in 0..HALF {
+                rows[i] = (a[i], c[i]);
+                rows[HALF + i] = (b[i], d[i]);
+            }
+            rows
+        }
+        #[inline(always)]
+        unsafe fn transpose_pairs(mut rows: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
+            let mut quarters = [[[rows[0].0; PAIRS / 2]; 2]; 2];
+            for i in 0..PAIRS {
+                quarters[2 * i / PAIRS][0][i % (PAIRS / 2)] = rows[i].0;
+                quarters[2 * i / PAIRS][1][i % (PAIRS / 2)] = rows[i].1;
+            }
+            // SAFETY: the caller's promise.
+            let [[a, b], [c, d]] = unsafe {
+                let [[a, b], [c, d]] = quarters;
+                [
+                    [transpose_four_pairs(a), transpose_four_pairs(b)],
+                    [transpose_four_pairs(c), transpose_four_pairs(d)],
+                ]
+            };
+            for i in 0..PAIRS / 2 {
+                rows[i] = (a[i], c[i]);
+                rows[PAIRS / 2 + i] = (b[i], d[i]);
+            }
+            rows
+        }
+        #[inline(always)]
+        unsafe fn double(p: *const f32) -> [Self::V; 2] {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let own = _mm256_setr_epi32(1, 1, 2, 2, 3, 3, 4, 4);
+                let near = _mm256_setr_epi32(0, 2, 1, 3, 2, 4, 3, 5);
+                let (low, high) = (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(HALF / 2)));
+                [
+                    (_mm256_permutevar8x32_ps(low, own), _mm256_permutevar8x32_ps(high, own)),
+                    (_mm256_permutevar8x32_ps(low, near), _mm256_permutevar8x32_ps(high, near)),
+                ]
+            }
+        }
+        #[inline(always)]
+        unsafe fn exp(x: Self::V) -> Self::V {
+            // SAFETY: the caller's promise.
+            unsafe { (exp_eight(x.0), exp_eight(x.1)) }
+        }
+        #[inline(always)]
+        unsafe fn bytes(v: Self::V) -> [u8; LANES] {
+            // SAFETY: the caller's promise; both are 16 bytes. What no whole number of 32 bits holds would come out negative.
+            unsafe {
+                let most = _mm256_set1_ps(255.0);
+                let low = _mm256_cvtps_epi32(_mm256_min_ps(v.0, most));
+                let high = _mm256_cvtps_epi32(_mm256_min_ps(v.1, most));
+                let words = _mm256_permute4x64_epi64::<IN_ORDER>(_mm256_packus_epi32(low, high));
+                let (low, high) = (_mm256_castsi256_si128(words), _mm256_extracti128_si256::<1>(words));
+                std::mem::transmute(_mm_packus_epi16(low, high))
+            }
+        }
+    }
+
+    /// Lanes of an AVX2 register.
+    const HALF: usize = LANES / 2;
+
+    /// What [`_mm256_permute4x64_epi64`] takes to bring the quarters of two packed vectors back in order.
+    const IN_ORDER: i32 = 0xd8;
+
+    /// What [`_mm256_permute2f128_ps`] takes of two vectors: the lower 128 bits of both, or the upper.
+    const LOW: i32 = 0x20;
+    const HIGH: i32 = 0x31;
+
+    /// All bits of those of eight lanes, the first of them lane `first`, that come before lane `end`.
+    ///
+    /// # Safety
+    /// The processor has AVX2.
+    #[inline(always)]
+    unsafe fn below(end: usize, first: usize) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+            _mm256_cmpgt_epi32(_mm256_set1_epi32(end as i32 - first as i32), lanes)
+        }
+    }
+
+    /// Eight lanes of [`Simd::read_some`] from lane `first` on.
+    ///
+    /// # Safety
+    /// As that; the processor has AVX2.
+    #[inline(always)]
+    unsafe fn read_some_eight(p: *const f32, lanes: Range<usize>, first: usize, other: f32) -> __m256 {
+        // SAFETY: the caller's promise; lanes that the mask leaves out are not read.
+        unsafe {
+            let mask = _mm256_andnot_si256(below(lanes.start, first), below(lanes.end, first));
+            let read = _mm256_maskload_ps(p.wrapping_add(first), mask);
+            _mm256_blendv_ps(_mm256_set1_ps(other), read, _mm256_castsi256_ps(mask))
+        }
+    }
+
+    /// Lane `j` of vector `i` becomes lane `i` of vector `j`.
+    ///
+    /// # Safety
+    /// The processor has AVX2.
+    #[inline(always)]
+    unsafe fn transpose_eight(mut r: [__m256; HALF]) -> [__m256; HALF] {
+        // SAFETY: the caller's promise. 2x2, then 4x4 inside 128-bit lanes, then the lanes themselves.
+        unsafe {
+            let mut t = r;
+            for i in 0..4 {
+                t[2 * i] = _mm256_unpacklo_ps(r[2 * i], r[2 * i + 1]);
+                t[2 * i + 1] = _mm256_unpackhi_ps(r[2 * i], r[2 * i + 1]);
+            }
+            for i in [0, 4] {
+                r[i] = unpack_pairs(t[i], t[i + 2])[0];
+                r[i + 1] = unpack_pairs(t[i], t[i + 2])[1];
+                r[i + 2] = unpack_pairs(t[i + 1], t[i + 3])[0];
+                r[i + 3] = unpack_pairs(t[i + 1], t[i + 3])[1];
+            }
+            for i in 0..4 {
+                t[i] = _mm256_permute2f128_ps::<LOW>(r[i], r[i + 4]);
+                t[i + 4] = _mm256_permute2f128_ps::<HIGH>(r[i], r[i + 4]);
+            }
+            t
+        }
+    }
+
+    /// Pair `j` of vector `i` becomes pair `i` of vector `j`.
+    ///
+    /// # Safety
+    /// The processor has AVX2.
+    #[inline(always)]
+    unsafe fn transpose_four_pairs(r: [__m256; 4]) -> [__m256; 4] {
+        // SAFETY: the caller's promise. 2x2 inside 128-bit lanes, then the lanes themselves.
+        unsafe {
+            let [a, b] = unpack_pairs(r[0], r[1]);
+            let [c, d] = unpack_pairs(r[2], r[3]);
+            [
+                _mm256_permute2f128_ps::<LOW>(a, c),
+                _mm256_permute2f128_ps::<LOW>(b, d),
+                _mm256_permute2f128_ps::<HIGH>(a, c),
+                _mm256_permute2f128_ps::<HIGH>(b, d),
+            ]
+        }
+    }
+
+    /// The first pairs of 128-bit lanes of two vectors, and the second.
+    ///
+    /// # Safety
+    /// The processor has AVX2.
+    #[inline(always)]
+    unsafe fn unpack_pairs(a: __m256, b: __m256) -> [__m256; 2] {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let (a, b) = (_mm256_castps_pd(a), _mm256_castps_pd(b));
+            [_mm256_castpd_ps(_mm256_unpacklo_pd(a, b)), _mm256_castpd_ps(_mm256_unpackhi_pd(a, b))]
+        }
+    }
+
+    /// [`Simd::exp`] of eight lanes.
+    ///
+    /// # Safety
+    /// The processor has AVX2 and FMA.
+    #[inline(always)]
+    unsafe fn exp_eight(x: __m256) -> __m256 {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let limit = _mm256_set1_ps(LIMIT);
+            let x = _mm256_max_ps(x, _mm256_sub_ps(_mm256_setzero_ps(), limit));
+            let x = _mm256_min_ps(x, limit);
+            let n = _mm256_mul_ps(x, _mm256_set1_ps(std::f32::consts::LOG2_E));
+            let n = _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(n);
+            let r = _mm256_fnmadd_ps(n, _mm256_set1_ps(LN_2[0]), x);
+            let r = _mm256_fnmadd_ps(n, _mm256_set1_ps(LN_2[1]), r);
+            let mut p = _mm256_set1_ps(EXP[0]);
+            for c in &EXP[1..] {
+                p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(*c));
+            }
+            let p = _mm256_fmadd_ps(_mm256_mul_ps(p, r), r, r);
+            let power = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
+            let power = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(power));
+            _mm256_mul_ps(_mm256_add_ps(p, _mm256_set1_ps(1.0)), power)
+        }
     }
 
     /// One register of sixteen lanes.

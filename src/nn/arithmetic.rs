@@ -79,7 +79,10 @@ impl Arithmetic {
             Precision::Int8 => {
                 assert_eq!(steps.len(), inputs.len(), "one step a source");
                 let sources: Vec<(usize, f32)> = inputs.iter().copied().zip(steps.iter().copied()).collect();
-                Packed::Narrow(narrow::conv::Weights::quantize(weights, &sources, *outputs, *geometry))
+                let engine = Engine::detect();
+                Packed::Narrow(narrow::conv::Weights::quantize(
+                    engine, weights, &sources, *outputs, *geometry,
+                ))
             }
             Precision::F32 => {
                 let mut packed = vec![Block::default(); conv::packed_len(inputs, *outputs, *geometry)];

@@ -7,7 +7,9 @@
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{CHUNK, Engine, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIGHT_STEPS, WORD, Wide};
+use super::{
+    CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIGHT_STEPS, WORD, Wide,
+};
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
@@ -31,7 +33,7 @@ fn spread(geometry: Geometry) -> usize {
 }
 
 /// The taps of output phase `(py, px)`, those of the first input phase first.
-fn taps(geometry: Geometry, (py, px): (usize, usize)) -> Vec<Tap> {
+fn taps_of(geometry: Geometry, (py, px): (usize, usize)) -> Vec<Tap> {
     let signed = |v: usize| isize::try_from(v).expect("kernels are small");
     match geometry {
         Geometry::Same(k) => (0..k * k)
@@ -67,7 +69,7 @@ fn taps(geometry: Geometry, (py, px): (usize, usize)) -> Vec<Tap> {
 
 /// The terms of a phase over all planes of an operand: `(plane without phase, tap)`.
 fn terms(geometry: Geometry, planes: usize, phase: (usize, usize)) -> Vec<(usize, Tap)> {
-    let taps = taps(geometry, phase);
+    let taps = taps_of(geometry, phase);
     (0..planes).flat_map(|plane| taps.iter().map(move |&tap| (plane, tap))).collect()
 }
 
@@ -127,32 +129,68 @@ impl Weights {
         }
     }
 
-    /// Rounds the weights of a layer to 8 bits and packs them, where each source has channels in 8 bits of some
-    /// step. Steps of sources become part of the weights; each output then has a step of its own, as fine as
-    /// its largest weight allows.
+    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels in 8 bits
+    /// of some step. Steps of sources become part of the weights; each output then has a step of its own, as fine as
+    /// its largest weights allow.
     ///
     /// # Panics
     /// If `weights` has the wrong length.
-    pub fn quantize(weights: &[f32], sources: &[(usize, f32)], outputs: usize, geometry: Geometry) -> Self {
+    pub fn quantize(
+        engine: Engine,
+        weights: &[f32],
+        sources: &[(usize, f32)],
+        outputs: usize,
+        geometry: Geometry,
+    ) -> Self {
         let taps = geometry.taps();
         let steps: Vec<f32> =
             sources.iter().flat_map(|&(channels, step)| (0..channels).map(move |_| step)).collect();
         let total = steps.len();
         assert_eq!(weights.len(), total * outputs * taps);
         let weight = |o, i, t| weights[weight_index(geometry, outputs, total, o, i, t)] * steps[i];
+        // Channels of two rows of weights, which share sums of 16 bits.
+        let groups: Vec<Vec<usize>> = sources
+            .iter()
+            .scan(0, |first, (channels, _)| {
+                let of_source: Vec<usize> = (*first..*first + channels).collect();
+                *first += channels;
+                Some(of_source)
+            })
+            .flat_map(|of_source| of_source.chunks(2 * WORD).map(<[_]>::to_vec).collect::<Vec<_>>())
+            .collect();
         let mut scale = vec![Block::default(); outputs.div_ceil(LANES)];
         for o in 0..outputs {
-            let all = (0..total).flat_map(|i| (0..taps).map(move |t| (i, t)));
-            let largest = all.fold(0.0f32, |largest, (i, t)| largest.max(weight(o, i, t).abs()));
-            scale[o / LANES].0[o % LANES] = (largest / WEIGHT_STEPS).max(f32::MIN_POSITIVE);
+            let mut least = f32::MIN_POSITIVE;
+            for (group, t) in groups.iter().flat_map(|group| (0..taps).map(move |t| (group, t))) {
+                let group: Vec<f32> = group.iter().map(|&i| weight(o, i, t)).collect();
+                least = least.max(least_step(engine, &group));
+            }
+            scale[o / LANES].0[o % LANES] = least;
+        }
+        let spread = spread(geometry);
+        let phases = (0..spread * spread).map(|phase| taps_of(geometry, (phase / spread, phase % spread)));
+        let phases: Vec<Vec<Tap>> = phases.collect();
+        let mut rounded = vec![0.0; weights.len()];
+        for (row, rounded) in rounded.chunks_exact_mut(taps).enumerate() {
+            let (o, i) = (row / total, row % total);
+            for phase in &phases {
+                // Neighbouring pixels differ little, so what one tap loses the next makes good, where steps are coarse.
+                let mut lost = 0.0;
+                for tap in phase {
+                    let wanted = weight(o, i, tap.index) / scale[o / LANES].0[o % LANES] + lost;
+                    rounded[tap.index] = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
+                    if engine.adds_in_16_bits() {
+                        lost = wanted - rounded[tap.index];
+                    }
+                }
+            }
         }
         let inputs = sources.iter().map(|&(channels, step)| (channels, Format::Int8 { step })).collect();
-        let packed =
-            Self::build(geometry, inputs, outputs, |o, i, t| weight(o, i, t) / scale[o / LANES].0[o % LANES]);
+        let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
         Self { scale, ..packed }
     }
 
-    /// Fills the rows from `weight(output, input, tap)`, which counts steps where the format has them.
+    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has them.
     fn build(
         geometry: Geometry,
         inputs: Vec<(usize, Format)>,
@@ -187,9 +225,7 @@ impl Weights {
                         let (row, at) = (&mut rows[i / side], side * l + i % side);
                         match format {
                             Format::Bf16 => row.set_bf16(at, bf16::from_f32(value)),
-                            Format::Int8 { .. } => {
-                                row.0[at] = (value.round_ties_even() as i8).to_ne_bytes()[0]
-                            }
+                            Format::Int8 { .. } => row.0[at] = (value as i8).to_ne_bytes()[0],
                         }
                     }
                 }
@@ -201,6 +237,19 @@ impl Weights {
         let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
         Self { rows, groups, geometry, inputs, outputs, scale }
     }
+}
+
+/// The finest step in which an engine can multiply the weights of the channels of two rows, or of fewer.
+fn least_step(engine: Engine, channels: &[f32]) -> f32 {
+    let mut largest = 0.0f32;
+    // Of the first two channels of either row and of the others, of either sign.
+    let mut sums = [[0.0f32; 2]; WORD / 2];
+    for (i, weight) in channels.iter().enumerate() {
+        largest = largest.max(weight.abs());
+        sums[i % WORD / 2][usize::from(*weight < 0.0)] += weight.abs();
+    }
+    let fitting = if engine.adds_in_16_bits() { FITTING_STEPS } else { f32::INFINITY };
+    sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
 /// Where a convolution writes.

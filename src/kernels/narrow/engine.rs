@@ -13,7 +13,14 @@ pub struct Engine(Unit);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Unit {
     Portable,
-    /// AVX512-VNNI: four multiply-accumulates of 8 bits a lane. bfloat16 is [`Unit::Portable`]'s.
+    /// AVX2: four multiply-accumulates of 8 bits a lane, in three instructions. bfloat16 is [`Unit::Portable`]'s, here and up to
+    /// AVX512-VNNI.
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    /// AVX-VNNI: as many in one.
+    #[cfg(target_arch = "x86_64")]
+    AvxVnni,
+    /// AVX512-VNNI: four multiply-accumulates of 8 bits a lane, of twice as many.
     #[cfg(target_arch = "x86_64")]
     Vnni,
     /// AVX512-BF16 besides: two multiply-accumulates a lane.
@@ -39,21 +46,29 @@ impl Engine {
         #[allow(unused_mut)]
         let mut engines = vec![Engine::PORTABLE];
         #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
-            engines.push(Engine(Unit::Vnni));
-            if is_x86_feature_detected!("avx512bf16") {
-                engines.push(Engine(Unit::Avx512));
-                #[cfg(target_os = "linux")]
-                if amx::permitted() {
-                    engines.push(Engine(Unit::Amx));
+        {
+            if is_x86_feature_detected!("avx2") {
+                engines.push(Engine(Unit::Avx2));
+                if is_x86_feature_detected!("avxvnni") {
+                    engines.push(Engine(Unit::AvxVnni));
+                }
+            }
+            if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
+                engines.push(Engine(Unit::Vnni));
+                if is_x86_feature_detected!("avx512bf16") {
+                    engines.push(Engine(Unit::Avx512));
+                    #[cfg(target_os = "linux")]
+                    if amx::permitted() {
+                        engines.push(Engine(Unit::Amx));
+                    }
                 }
             }
         }
         engines
     }
 
-    /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `vnni`, `avx512`,
-    /// `amx`) chooses a slower one, to compare them.
+    /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `avx2`, `avxvnni`, `vnni`,
+    /// `avx512`, `amx`) chooses a slower one, to compare them.
     pub fn detect() -> Engine {
         static CHOICE: OnceLock<Engine> = OnceLock::new();
         *CHOICE.get_or_init(|| {
@@ -79,7 +94,7 @@ impl Engine {
     /// Whether it has instructions for bfloat16.
     pub fn has_bf16(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return !matches!(self.0, Unit::Portable | Unit::Vnni);
+        return !matches!(self.0, Unit::Portable | Unit::Avx2 | Unit::AvxVnni | Unit::Vnni);
         #[cfg(not(target_arch = "x86_64"))]
         false
     }
@@ -87,7 +102,15 @@ impl Engine {
     /// Whether its products of 8 bits are faster than all others.
     pub fn prefers_int8(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return matches!(self.0, Unit::Vnni | Unit::Avx512);
+        return !matches!(self.0, Unit::Portable | Unit::Amx);
+        #[cfg(not(target_arch = "x86_64"))]
+        false
+    }
+
+    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels.
+    pub fn adds_in_16_bits(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return self.0 == Unit::Avx2;
         #[cfg(not(target_arch = "x86_64"))]
         false
     }
@@ -123,7 +146,15 @@ impl Engine {
         unsafe {
             match (self.0, format) {
                 #[cfg(target_arch = "x86_64")]
-                (unit, Format::Int8 { .. }) if unit != Unit::Portable => {
+                (Unit::Avx2, Format::Int8 { .. }) => {
+                    avx2::multiply((terms, groups), position, weights, (outputs, plane), sums);
+                }
+                #[cfg(target_arch = "x86_64")]
+                (Unit::AvxVnni, Format::Int8 { .. }) => {
+                    avx2::multiply_vnni((terms, groups), position, weights, (outputs, plane), sums);
+                }
+                #[cfg(target_arch = "x86_64")]
+                (Unit::Vnni | Unit::Avx512 | Unit::Amx, Format::Int8 { .. }) => {
                     avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
@@ -331,6 +362,120 @@ mod portable {
                 unsafe { rows.add(c * stride + i).write(value) };
             }
         }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod avx2 {
+    use std::arch::x86_64::*;
+
+    use super::{CHUNK, GROUP, LANES, Sums, Term, WORD, Wide};
+
+    /// Positions whose sums stay in registers, two for each.
+    const TILE: usize = 4;
+
+    /// Lanes of a register.
+    const HALF: usize = LANES / 2;
+
+    /// The products of the words of two rows.
+    trait Product {
+        /// `acc[i] + sum over rows r and j of x[r][i][j] w[r][i][j]`.
+        ///
+        /// # Safety
+        /// The processor has the instructions.
+        unsafe fn add(acc: __m256i, x: [__m256i; 2], w: [__m256i; 2]) -> __m256i;
+    }
+
+    /// Two products of each row add up in 16 bits, as weights are made to fit into
+    /// ([`FITTING_STEPS`](super::super::FITTING_STEPS)), then in 32.
+    struct Words;
+
+    impl Product for Words {
+        #[inline(always)]
+        unsafe fn add(acc: __m256i, x: [__m256i; 2], w: [__m256i; 2]) -> __m256i {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let [a, b] = [0, 1].map(|r| _mm256_maddubs_epi16(x[r], w[r]));
+                _mm256_add_epi32(acc, _mm256_madd_epi16(_mm256_add_epi16(a, b), _mm256_set1_epi16(1)))
+            }
+        }
+    }
+
+    /// AVX-VNNI.
+    struct Vnni;
+
+    impl Product for Vnni {
+        #[inline(always)]
+        unsafe fn add(acc: __m256i, x: [__m256i; 2], w: [__m256i; 2]) -> __m256i {
+            // SAFETY: the caller's promise.
+            unsafe { _mm256_dpbusd_avx_epi32(_mm256_dpbusd_avx_epi32(acc, x[0], w[0]), x[1], w[1]) }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub unsafe fn multiply(
+        terms: (&[Term], &[u8]),
+        position: usize,
+        weights: *const Wide,
+        outputs: (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe { tiles::<Words>(terms, position, weights, outputs, sums) }
+    }
+
+    #[target_feature(enable = "avx2,avxvnni")]
+    pub unsafe fn multiply_vnni(
+        terms: (&[Term], &[u8]),
+        position: usize,
+        weights: *const Wide,
+        outputs: (usize, usize),
+        sums: &mut Sums,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe { tiles::<Vnni>(terms, position, weights, outputs, sums) }
+    }
+
+    /// # Safety
+    /// As [`super::Engine::multiply`], and the processor has the instructions of `P`.
+    #[inline(always)]
+    unsafe fn tiles<P: Product>(
+        (terms, groups): (&[Term], &[u8]),
+        position: usize,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        sums: &mut Sums,
+    ) {
+        for (o, sums) in sums.0[..outputs].iter_mut().enumerate() {
+            for (tile, sums) in sums.as_chunks_mut::<TILE>().0.iter_mut().enumerate() {
+                // SAFETY: the caller's promise; a block is two registers.
+                unsafe {
+                    let mut acc = [[_mm256_setzero_si256(); 2]; TILE];
+                    for (term, &groups) in terms.iter().zip(groups) {
+                        let mut x = term.input.add(position + tile * TILE).cast::<u8>();
+                        let mut w = weights.byte_add(term.weights).add(o * plane).cast::<__m256i>();
+                        for _ in 0..GROUP / 2 * usize::from(groups) {
+                            let row = |at: usize| [0, 1].map(|row| _mm256_load_si256(w.add(2 * row + at)));
+                            let w_of = [row(0), row(1)];
+                            for (p, acc) in acc.iter_mut().enumerate() {
+                                let x = [0, 1].map(|row| {
+                                    let x = x.add(p * size_of::<Wide>() + WORD * row);
+                                    _mm256_set1_epi32(x.cast::<i32>().read_unaligned())
+                                });
+                                *acc = [P::add(acc[0], x, w_of[0]), P::add(acc[1], x, w_of[1])];
+                            }
+                            (x, w) = (x.add(2 * WORD), w.add(4));
+                        }
+                    }
+                    for (sum, acc) in sums.iter_mut().zip(acc) {
+                        for (half, acc) in acc.into_iter().enumerate() {
+                            _mm256_store_ps(sum.0[half * HALF..].as_mut_ptr(), _mm256_cvtepi32_ps(acc));
+                        }
+                    }
+                }
+            }
+        }
+        const { assert!(CHUNK.is_multiple_of(TILE)) };
     }
 }
 

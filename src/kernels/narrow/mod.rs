@@ -67,6 +67,10 @@ const GROUP: usize = 4;
 /// Largest weight in steps.
 const WEIGHT_STEPS: f32 = 127.0;
 
+/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves, before rounding them adds up to
+/// one step each: 128 times the largest activation is the most that 16 bits hold.
+const FITTING_STEPS: f32 = 124.0 - 1e-4;
+
 /// Largest activation in steps.
 pub const ACTIVATION_STEPS: f32 = 255.0;
 
