@@ -5,7 +5,7 @@ use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     conv::{Direction, Epilogue, Geometry, convolve, packed_len},
     narrow::{
-        Engine, Format, Operand,
+        Engine, Format, Operand, Steps,
         conv::{self, Output, Weights},
     },
     peak,
@@ -81,9 +81,9 @@ fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Fo
             Operand::narrow(engine, View::new(shape, &x), geometry),
             Weights::pack(&weights, &[i], o, geometry, Direction::Forward, 0),
         ),
-        Format::Int8 { step } => (
-            Operand::quantize(View::new(shape, &x), step),
-            Weights::quantize(engine, &weights, &[(i, step)], o, geometry),
+        Format::Int8(steps) => (
+            Operand::quantize(View::new(shape, &x), steps),
+            Weights::quantize(engine, &weights, &[(i, steps)], o, geometry),
         ),
     };
     let bias = blocks(o.div_ceil(LANES));
@@ -95,7 +95,7 @@ fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Fo
 }
 
 /// Eight bits of some step.
-const INT8: Format = Format::Int8 { step: 0.01 };
+const INT8: Format = Format::Int8(Steps { step: 0.01, zero: 0 });
 
 fn input_gradient_of(bencher: Bencher, (n, i, o, h, w): Layer, geometry: Geometry) {
     let (oh, ow) = geometry.output(h, w);

@@ -33,7 +33,7 @@ use crate::{
         radiance_as_albedo,
     },
     filters::refit::{Guides, Refit, Samples},
-    kernels::{blend::CORNERS, memory::PlaneBuffer},
+    kernels::{blend::CORNERS, memory::PlaneBuffer, narrow::Steps},
     nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -63,6 +63,10 @@ pub const PREFILTER: &str = "prefilter.";
 
 /// Who asks for passes, in messages.
 const NEEDED_BY: &str = "this model";
+
+/// The values that the radiance encoder's and the guide encoder's inputs may have in 8 bits: logarithms up to 300 times white,
+/// beyond which brightness decides on no kernel; and all that albedo and normals are.
+const INPUT_STEPS: [Steps; 2] = [Steps::to(3.0), Steps::within(1.0)];
 
 /// Channels of the radiance encoder's and of the guide encoder's input, before space to depth; and what the latter has
 /// besides where there is a prefilter.
@@ -426,27 +430,26 @@ impl Network for Pyramid {
             prefilter.freeze();
         }
         // Every layer takes in the steps of what it reads.
-        for encoder in &mut self.encoders {
-            let mut above = Vec::new();
+        for (encoder, mut above) in self.encoders.iter_mut().zip(INPUT_STEPS) {
             for [first, second] in &mut encoder.levels {
-                first.freeze(&above);
-                second.freeze(&[first.step()]);
-                above = vec![second.step()];
+                first.freeze(&[above]);
+                second.freeze(&[first.steps()]);
+                above = second.steps();
             }
         }
         let mut below = None;
         for (level, layers) in (0..LEVELS).rev().zip(&mut self.decoder) {
             let mut sources =
-                self.encoders.each_ref().map(|encoder| encoder.levels[level][1].step()).to_vec();
+                self.encoders.each_ref().map(|encoder| encoder.levels[level][1].steps()).to_vec();
             if let (Some(up), Some(below)) = (&mut layers.up, below) {
                 up.freeze(&[below]);
-                sources.push(up.step());
+                sources.push(up.steps());
             }
             layers.fuse.freeze(&sources);
-            layers.refine.freeze(&[layers.fuse.step()]);
-            let step = layers.refine.step();
-            self.heads[level].freeze(&[step]);
-            below = Some(step);
+            layers.refine.freeze(&[layers.fuse.steps()]);
+            let steps = layers.refine.steps();
+            self.heads[level].freeze(&[steps]);
+            below = Some(steps);
         }
         self.full.freeze(&[below.expect("there are levels")]);
     }

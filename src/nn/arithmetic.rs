@@ -7,10 +7,10 @@ use super::{
     pool::{Buffer, PlaneBuffer, plane_buffer},
 };
 use crate::kernels::{
-    Block, LANES, Shape, View, ViewMut,
+    Block, Shape, View, ViewMut,
     conv::{self, Direction, Epilogue, Geometry},
     layout::from_blocked_shuffled,
-    narrow::{self, Engine, Format, Operand},
+    narrow::{self, Engine, Format, Operand, Steps},
     simd::Tier,
     weight_grad,
 };
@@ -23,8 +23,7 @@ pub enum Precision {
     F32,
     /// To bfloat16 (8 bits of mantissa), as matrix units want them.
     Bf16,
-    /// To 8 bits, in steps that fit the ranges a trained network's activations have; for inference only. A
-    /// network's inputs, which have signs, stay as [`Precision::of_inputs`] has them.
+    /// To 8 bits, in steps that fit the ranges a trained network's inputs and activations have; for inference only.
     Int8,
 }
 
@@ -32,13 +31,6 @@ impl Precision {
     /// The fastest one on this processor in which networks can be trained.
     pub fn fastest_trained() -> Self {
         if Engine::detect().prefers_bf16() { Self::Bf16 } else { Self::F32 }
-    }
-
-    /// The fastest one on this processor for a first layer of so many outputs, the rest being computed in 8 bits. What
-    /// few outputs take is the time of reading, which bfloat16 halves even where it multiplies no faster.
-    fn of_inputs(outputs: usize) -> Self {
-        let is_bound_by_memory = outputs <= LANES;
-        if is_bound_by_memory && Engine::detect().has_bf16() { Self::Bf16 } else { Self::fastest_trained() }
     }
 
     /// The fastest one on this processor for inference; 8 bits only where the ranges are known.
@@ -68,17 +60,13 @@ pub struct Arithmetic {
 }
 
 impl Arithmetic {
-    /// Weights as [`Arithmetic::forward`] wants them. For 8 bits, `steps` are those of the sources; without
-    /// any, the sources are a network's inputs.
-    pub(super) fn pack(&self, weights: &[f32], steps: &[f32]) -> Packed {
+    /// Weights as [`Arithmetic::forward`] wants them. For 8 bits, `steps` are those of the sources.
+    pub(super) fn pack(&self, weights: &[f32], steps: &[Steps]) -> Packed {
         let Self { inputs, outputs, geometry, .. } = self;
         match self.precision {
-            Precision::Int8 if steps.is_empty() => {
-                Self { precision: Precision::of_inputs(*outputs), ..self.clone() }.pack(weights, steps)
-            }
             Precision::Int8 => {
                 assert_eq!(steps.len(), inputs.len(), "one step a source");
-                let sources: Vec<(usize, f32)> = inputs.iter().copied().zip(steps.iter().copied()).collect();
+                let sources: Vec<_> = inputs.iter().copied().zip(steps.iter().copied()).collect();
                 let engine = Engine::detect();
                 Packed::Narrow(narrow::conv::Weights::quantize(
                     engine, weights, &sources, *outputs, *geometry,
@@ -114,12 +102,12 @@ impl Arithmetic {
                 let (tier, geometry) = (Tier::detect(), self.geometry);
                 conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
                 match format {
-                    Some(Format::Int8 { step }) => Data::Narrow(Operand::quantize(output.view(), step)),
+                    Some(Format::Int8(steps)) => Data::Narrow(Operand::quantize(output.view(), steps)),
                     _ => Data::F32(output),
                 }
             }
             Packed::Narrow(weights) => {
-                let narrowed = self.narrowed(sources);
+                let narrowed = self.narrowed(sources, weights);
                 let operands = operands(sources, &narrowed);
                 if let Some(format) = format {
                     let mut output = Operand::new(shape, format);
@@ -153,7 +141,7 @@ impl Arithmetic {
             }
             Packed::Narrow(weights) => {
                 let epilogue = Epilogue { relu: false, accumulate: false };
-                let narrowed = self.narrowed(sources);
+                let narrowed = self.narrowed(sources, weights);
                 let to = narrow::conv::Output::Planes { shape, factor, values: &mut values };
                 let operands = operands(sources, &narrowed);
                 narrow::conv::convolve(Engine::detect(), &operands, weights, bias, epilogue, to);
@@ -162,13 +150,16 @@ impl Arithmetic {
         values
     }
 
-    /// Those of a layer's sources that are not narrow, rounded.
-    fn narrowed(&self, sources: &[&Data]) -> Vec<Option<Operand>> {
-        let narrow = |source: &&Data| match source {
-            Data::F32(buffer) => Some(Operand::narrow(Engine::detect(), buffer.view(), self.geometry)),
-            Data::Narrow(_) => None,
+    /// Those of a layer's sources that are not narrow, rounded to what its weights are to be multiplied with.
+    fn narrowed(&self, sources: &[&Data], weights: &narrow::conv::Weights) -> Vec<Option<Operand>> {
+        let narrow = |(source, format): (&&Data, Format)| match (source, format) {
+            (Data::Narrow(_), _) => None,
+            (Data::F32(buffer), Format::Bf16) => {
+                Some(Operand::narrow(Engine::detect(), buffer.view(), self.geometry))
+            }
+            (Data::F32(buffer), Format::Int8(steps)) => Some(Operand::quantize(buffer.view(), steps)),
         };
-        sources.iter().map(narrow).collect()
+        sources.iter().zip(weights.formats()).map(narrow).collect()
     }
 
     /// Adds the gradient of the weights to `into`.

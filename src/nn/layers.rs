@@ -19,7 +19,7 @@ use super::{
 use crate::kernels::{
     Block, LANES, Shape,
     conv::{Geometry, weight_index},
-    narrow::{self, Format},
+    narrow::{self, Format, Steps},
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
     weight_grad::bias_gradient,
 };
@@ -105,8 +105,9 @@ impl Conv {
     /// As that.
     pub fn input_halved(&self, planes: Shape, values: &[f32]) -> Activation<NoneTape> {
         match self.frozen.as_deref() {
-            Some(Packed::Narrow(_)) => {
-                let operand = narrow::Operand::halved(narrow::Engine::detect(), planes, values);
+            Some(Packed::Narrow(weights)) => {
+                let format = weights.formats().next().expect("a layer has a source");
+                let operand = narrow::Operand::halved(narrow::Engine::detect(), format, planes, values);
                 Activation::constant(Data::Narrow(operand))
             }
             _ => Activation::input_halved(planes, values),
@@ -196,18 +197,18 @@ impl Conv {
     }
 
     /// Packs the weights once for all forward passes to come, until the layer is changed again. For 8 bits,
-    /// `steps` are those of its sources; without any, they are a network's inputs.
-    pub fn freeze(&mut self, steps: &[f32]) {
+    /// `steps` are those of its sources.
+    pub fn freeze(&mut self, steps: &[Steps]) {
         self.frozen = Some(Arc::new(self.arithmetic.pack(&self.weight.values(), steps)));
     }
 
-    /// The difference between neighbouring values of its output in 8 bits.
+    /// The values of its output in 8 bits.
     ///
     /// # Panics
     /// If its range is unknown.
-    pub fn step(&self) -> f32 {
+    pub fn steps(&self) -> Steps {
         let range = self.range.expect("only layers of known range are quantized");
-        (RANGE_MARGIN * range).max(f32::MIN_POSITIVE.sqrt()) / narrow::ACTIVATION_STEPS
+        Steps::to((RANGE_MARGIN * range).max(f32::MIN_POSITIVE.sqrt()))
     }
 
     /// Whether it can compute in 8 bits, if its sources can: they are to know their ranges.
@@ -254,7 +255,7 @@ impl Conv {
             _ if T::OWNS_TAPE || !self.relu => None,
             Precision::F32 => None,
             Precision::Bf16 => Some(Format::Bf16),
-            Precision::Int8 => Some(Format::Int8 { step: self.step() }),
+            Precision::Int8 => Some(Format::Int8(self.steps())),
         };
         let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, (shape_out, format));
 

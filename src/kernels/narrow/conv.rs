@@ -8,7 +8,8 @@ use half::bf16;
 use rayon::prelude::*;
 
 use super::{
-    CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Sums, Term, WEIGHT_STEPS, WORD, Wide,
+    CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Steps, Sums, Term, WEIGHT_STEPS, WORD,
+    Wide,
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
@@ -85,6 +86,8 @@ pub struct Weights {
     outputs: usize,
     /// What sums are multiplied by, a block an output plane.
     scale: Vec<Block>,
+    /// What is added to them then: sums are too large by what activations count as steps where they are zero.
+    shift: Vec<Block>,
 }
 
 /// A plane of an operand among the inputs of a layer.
@@ -130,21 +133,21 @@ impl Weights {
     }
 
     /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels in 8 bits
-    /// of some step. Steps of sources become part of the weights; each output then has a step of its own, as fine as
-    /// its largest weights allow.
+    /// of some step, of which one is zero. Steps of sources become part of the weights; each output then has a step of its
+    /// own, as fine as its largest weights allow.
     ///
     /// # Panics
-    /// If `weights` has the wrong length.
+    /// If `weights` has the wrong length, or a phase of a transposed layer would need a shift of its own.
     pub fn quantize(
         engine: Engine,
         weights: &[f32],
-        sources: &[(usize, f32)],
+        sources: &[(usize, Steps)],
         outputs: usize,
         geometry: Geometry,
     ) -> Self {
         let taps = geometry.taps();
         let steps: Vec<f32> =
-            sources.iter().flat_map(|&(channels, step)| (0..channels).map(move |_| step)).collect();
+            sources.iter().flat_map(|&(channels, steps)| (0..channels).map(move |_| steps.step)).collect();
         let total = steps.len();
         assert_eq!(weights.len(), total * outputs * taps);
         let weight = |o, i, t| weights[weight_index(geometry, outputs, total, o, i, t)] * steps[i];
@@ -185,9 +188,18 @@ impl Weights {
                 }
             }
         }
-        let inputs = sources.iter().map(|&(channels, step)| (channels, Format::Int8 { step })).collect();
+        let zeros = sources.iter().flat_map(|&(channels, steps)| (0..channels).map(move |_| steps.zero));
+        let zeros: Vec<f32> = zeros.map(f32::from).collect();
+        assert!(spread == 1 || zeros.iter().all(|zero| *zero == 0.0), "phases have other sums");
+        let mut shift = vec![Block::default(); outputs.div_ceil(LANES)];
+        for (o, rounded) in rounded.chunks_exact((total * taps).max(1)).enumerate() {
+            let of_inputs = rounded.chunks_exact(taps).zip(&zeros);
+            let sum: f32 = of_inputs.map(|(weights, zero)| weights.iter().sum::<f32>() * zero).sum();
+            shift[o / LANES].0[o % LANES] = -sum * scale[o / LANES].0[o % LANES];
+        }
+        let inputs = sources.iter().map(|&(channels, steps)| (channels, Format::Int8(steps))).collect();
         let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
-        Self { scale, ..packed }
+        Self { scale, shift, ..packed }
     }
 
     /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has them.
@@ -225,7 +237,7 @@ impl Weights {
                         let (row, at) = (&mut rows[i / side], side * l + i % side);
                         match format {
                             Format::Bf16 => row.set_bf16(at, bf16::from_f32(value)),
-                            Format::Int8 { .. } => row.0[at] = (value as i8).to_ne_bytes()[0],
+                            Format::Int8(_) => row.0[at] = (value as i8).to_ne_bytes()[0],
                         }
                     }
                 }
@@ -235,7 +247,13 @@ impl Weights {
         let groups =
             of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
         let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
-        Self { rows, groups, geometry, inputs, outputs, scale }
+        let shift = vec![Block::default(); scale.len()];
+        Self { rows, groups, geometry, inputs, outputs, scale, shift }
+    }
+
+    /// What each source is to be rounded to.
+    pub fn formats(&self) -> impl Iterator<Item = Format> {
+        self.inputs.iter().map(|(_, format)| *format)
     }
 }
 
@@ -345,8 +363,8 @@ pub fn convolve(
             assert!(!epilogue.accumulate && !operand.grid.split);
             let step = match operand.format {
                 Format::Bf16 => 1.0,
-                Format::Int8 { step } => {
-                    assert!(epilogue.relu, "8 bits hold nothing negative");
+                Format::Int8(Steps { step, zero }) => {
+                    assert!(epilogue.relu && zero == 0, "layers write nothing negative in 8 bits");
                     step
                 }
             };
@@ -360,7 +378,10 @@ pub fn convolve(
     // What is stored counts steps.
     let in_steps =
         |blocks: &[Block]| -> Vec<Block> { blocks.iter().map(|b| Block(b.0.map(|v| v / step))).collect() };
-    let (scale, bias) = (in_steps(&weights.scale), in_steps(bias));
+    let bias: Vec<Block> = (bias.iter().zip(&weights.shift))
+        .map(|(bias, shift)| Block(std::array::from_fn(|l| bias.0[l] + shift.0[l])))
+        .collect();
+    let (scale, bias) = (in_steps(&weights.scale), in_steps(&bias));
     let tier = Tier::detect();
     (0..out.n * bands).into_par_iter().for_each(|task| {
         let y0 = task % bands * band;
@@ -512,7 +533,7 @@ impl Band<'_> {
                         let at = wides.0.add(start + column * spread);
                         match format {
                             Format::Bf16 => self.narrow(&finish[..outputs], sums, at),
-                            Format::Int8 { .. } => {
+                            Format::Int8(_) => {
                                 let at = at.cast::<u8>().add(plane % blocks * LANES);
                                 for i in 0..run {
                                     let at = at.add(i * spread * size_of::<Wide>()).cast::<[u8; LANES]>();

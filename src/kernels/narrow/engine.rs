@@ -146,15 +146,15 @@ impl Engine {
         unsafe {
             match (self.0, format) {
                 #[cfg(target_arch = "x86_64")]
-                (Unit::Avx2, Format::Int8 { .. }) => {
+                (Unit::Avx2, Format::Int8(_)) => {
                     avx2::multiply((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
-                (Unit::AvxVnni, Format::Int8 { .. }) => {
+                (Unit::AvxVnni, Format::Int8(_)) => {
                     avx2::multiply_vnni((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
-                (Unit::Vnni | Unit::Avx512 | Unit::Amx, Format::Int8 { .. }) => {
+                (Unit::Vnni | Unit::Avx512 | Unit::Amx, Format::Int8(_)) => {
                     avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
@@ -289,7 +289,7 @@ mod portable {
                                     let product = |i, j| x.bf16(i).to_f32() * w.bf16(j).to_f32();
                                     real[l] += product(2 * i, 2 * l) + product(2 * i + 1, 2 * l + 1);
                                 }
-                                Format::Int8 { .. } => {
+                                Format::Int8(_) => {
                                     let product = |c| {
                                         let w = i8::from_ne_bytes([w.0[WORD * l + c]]);
                                         i32::from(x.0[WORD * i + c]) * i32::from(w)
@@ -302,7 +302,7 @@ mod portable {
                 }
                 sum.0 = match format {
                     Format::Bf16 => real,
-                    Format::Int8 { .. } => whole.map(|v| v as f32),
+                    Format::Int8(_) => whole.map(|v| v as f32),
                 };
             }
         }

@@ -35,12 +35,30 @@ use super::{
 pub enum Format {
     /// bfloat16: f32 with 8 bits of mantissa.
     Bf16,
-    /// Eight bits: activations, none negative, in as many `step`s; weights in steps of their own for every
-    /// output, with a sign. Sums are exact.
-    Int8 {
-        /// The difference between neighbouring values of an activation.
-        step: f32,
-    },
+    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign. Sums
+    /// are exact.
+    Int8(Steps),
+}
+
+/// The 256 values that an activation may have in 8 bits.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Steps {
+    /// The difference between neighbouring values.
+    pub step: f32,
+    /// Which of them is zero: the first where nothing is negative.
+    pub zero: u8,
+}
+
+impl Steps {
+    /// From zero to `largest`.
+    pub const fn to(largest: f32) -> Self {
+        Self { step: largest / ACTIVATION_STEPS, zero: 0 }
+    }
+
+    /// From `-largest` to `largest`.
+    pub const fn within(largest: f32) -> Self {
+        Self { step: 2.0 * largest / (ACTIVATION_STEPS - 1.0), zero: 128 }
+    }
 }
 
 impl Format {
@@ -48,7 +66,15 @@ impl Format {
     pub const fn channels(self) -> usize {
         match self {
             Format::Bf16 => WIDE,
-            Format::Int8 { .. } => 2 * WIDE,
+            Format::Int8(_) => 2 * WIDE,
+        }
+    }
+
+    /// What borders hold.
+    fn nothing(self) -> Wide {
+        match self {
+            Format::Bf16 => Wide::ZERO,
+            Format::Int8(steps) => Wide([steps.zero; BYTES]),
         }
     }
 }
@@ -184,7 +210,7 @@ impl Operand {
         let mut operand = Self::allocate(shape, Grid::new(shape, false), format);
         let grid = operand.grid;
         let body = operand.body_mut();
-        body.par_chunks_mut(grid.positions()).for_each(|plane| grid.fill_border(plane, Wide::ZERO));
+        body.par_chunks_mut(grid.positions()).for_each(|plane| grid.fill_border(plane, format.nothing()));
         operand
     }
 
@@ -221,35 +247,46 @@ impl Operand {
         operand
     }
 
-    /// Planes rounded to bfloat16, whose pixels in 2x2 squares become channels of one pixel (space to depth):
+    /// Planes in a format, whose pixels in 2x2 squares become channels of one pixel (space to depth):
     /// (N, C, H, W) -> (N, 4C, H/2, W/2)
     ///
     /// # Panics
     /// If rows or columns are odd, or there are not as many values as `planes` demands.
-    pub fn halved(engine: Engine, planes: Shape, values: &[f32]) -> Self {
+    pub fn halved(engine: Engine, format: Format, planes: Shape, values: &[f32]) -> Self {
         let shape = planes.squares();
-        let mut operand = Self::new(shape, Format::Bf16);
-        let planes = operand.planes();
+        let mut operand = Self::new(shape, format);
+        let (planes, blocks) = (operand.planes(), format.channels() / LANES);
         operand.each_row(|plane, y, row| {
-            let put = |x: usize, low: &[Block], high: Option<&[Block]>| {
-                engine.narrow(low, high, &mut row[x..][..low.len()]);
-            };
-            let at = (plane / planes, plane % planes * (WIDE / LANES), y);
-            Tier::detect().run(HalvedRow { shape, values, at, put });
+            let (image, first) = (plane / planes, plane % planes * blocks);
+            for plane in (first..shape.planes().min(first + blocks)).step_by(WIDE / LANES) {
+                let put = |x: usize, low: &[Block], high: Option<&[Block]>| {
+                    let row = &mut row[x..][..low.len()];
+                    match format {
+                        Format::Bf16 => engine.narrow(low, high, row),
+                        Format::Int8(steps) => {
+                            let lane = (plane - first) * LANES;
+                            quantize(steps, low, row, lane);
+                            high.into_iter().for_each(|high| quantize(steps, high, row, lane + LANES));
+                        }
+                    }
+                };
+                Tier::detect().run(HalvedRow { shape, values, at: (image, plane, y), put });
+            }
         });
         operand
     }
 
-    /// An activation without negative values, a ReLU's output, in 8 bits.
-    pub fn quantize(source: View, step: f32) -> Self {
+    /// An activation in 8 bits.
+    pub fn quantize(source: View, steps: Steps) -> Self {
         let shape = source.shape;
-        let mut operand = Self::new(shape, Format::Int8 { step });
-        let (planes, stride) = (operand.planes(), shape.plane_stride());
-        operand.body_mut().par_chunks_mut(stride).enumerate().for_each(|(i, out)| {
-            let (image, first) = (i / planes, i % planes * (2 * WIDE / LANES));
-            for plane in first..shape.planes().min(first + 2 * WIDE / LANES) {
-                let blocks = &source.data[(image * shape.planes() + plane) * stride..][..stride];
-                Tier::detect().run(Quantize { blocks, step, out, lane: (plane - first) * LANES });
+        let mut operand = Self::new(shape, Format::Int8(steps));
+        let planes = operand.planes();
+        let blocks = operand.format.channels() / LANES;
+        operand.each_row(|plane, y, row| {
+            let (image, first) = (plane / planes, plane % planes * blocks);
+            for plane in first..shape.planes().min(first + blocks) {
+                let blocks = &source.data[shape.row(image, plane, y)..][..shape.w];
+                quantize(steps, blocks, row, (plane - first) * LANES);
             }
         });
         operand
@@ -270,7 +307,9 @@ impl Operand {
             for (out, wide) in out.iter_mut().zip(from) {
                 out.0 = std::array::from_fn(|l| match self.format {
                     Format::Bf16 => wide.bf16(first + l).to_f32(),
-                    Format::Int8 { step } => f32::from(wide.0[first + l]) * step,
+                    Format::Int8(Steps { step, zero }) => {
+                        f32::from(i16::from(wide.0[first + l]) - i16::from(zero)) * step
+                    }
                 });
             }
         });
@@ -342,15 +381,20 @@ impl Format {
                 }
                 max
             }
-            Format::Int8 { .. } => Wide(std::array::from_fn(|i| a.0[i].max(b.0[i]))),
+            Format::Int8(_) => Wide(std::array::from_fn(|i| a.0[i].max(b.0[i]))),
         }
     }
 }
 
-/// Sixteen channels of a plane in as many steps, from byte `lane` of each value on.
+/// Writes blocks in steps to the bytes from `lane` on of as many values.
+fn quantize(steps: Steps, blocks: &[Block], out: &mut [Wide], lane: usize) {
+    Tier::detect().run(Quantize { blocks, steps, out, lane });
+}
+
+/// See [`quantize`].
 struct Quantize<'a> {
     blocks: &'a [Block],
-    step: f32,
+    steps: Steps,
     out: &'a mut [Wide],
     lane: usize,
 }
@@ -360,7 +404,11 @@ impl Kernel for Quantize<'_> {
     unsafe fn run<S: Simd>(self) {
         for (out, block) in self.out.iter_mut().zip(self.blocks) {
             // SAFETY: vectors are the tier's.
-            let bytes = unsafe { S::bytes(S::div(S::load(block), S::splat(self.step))) };
+            let bytes = unsafe {
+                let Steps { step, zero } = self.steps;
+                let steps = S::add(S::div(S::load(block), S::splat(step)), S::splat(zero.into()));
+                S::bytes(S::max(steps, S::splat(0.0)))
+            };
             out.0[self.lane..][..LANES].copy_from_slice(&bytes);
         }
     }
