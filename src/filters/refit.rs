@@ -44,28 +44,28 @@ const MOMENTS: usize = KNOWN * (KNOWN + 1) / 2 + TARGETS * (KNOWN + 1);
 const KEPT: usize = KNOWN + 1;
 
 /// Added to the variances of an axis and of a logarithm: how much of a guide is noise, or too little to tell of anything.
-const GUIDE_NOISE: [f32; GUIDES] = [1e-4, 1e-4, 1e-4, 4e-4, 4e-4, 4e-4];
+const GUIDE_NOISE: [f32; GUIDES] = [3e-5, 3e-5, 3e-5, 2e-4, 2e-4, 2e-4];
 
 /// Deviation of the slopes that are there to be found in the samples: those that noise alone may explain shrink below it.
-const SLOPE: f32 = 0.2;
+const SLOPE: f32 = 0.35;
 
 /// Deviation of the blotches that a network leaves: what varies less beside the guides gives way to them.
-const BLOTCHES: f32 = 0.08;
+const BLOTCHES: f32 = 0.09;
 
 /// Variance of the samples over what was denoised from which on blotches are that large: with less noise there is less of them.
-const NOISY: f32 = 0.05;
+const NOISY: f32 = 0.1;
 
-/// Exposed radiance over albedo (the mean of the colours, as below) that is added to samples and to what is denoised before one is divided by the other, and before
-/// the latter's logarithm: relative errors of what is darker count less and less.
-const SAMPLE_FLOOR: f32 = 0.2;
-const FLOOR: f32 = 0.01;
+/// Exposed radiance over albedo (the mean of the colours, as below) that is added to samples and to what is denoised before one is
+/// divided by the other, and before the latter's logarithm: relative errors of what is darker count less and less.
+const SAMPLE_FLOOR: f32 = 0.3;
+const FLOOR: f32 = 0.007;
 
 /// A sample is at most this many times what was denoised, as fireflies would decide on slopes all around them.
-const MOST: f32 = 3.0;
+const MOST: f32 = 2.0;
 
-/// Exposed radiance over albedo, 11 times middle grey, from which on a pixel counts less and less: lamps say nothing of the walls
+/// Exposed radiance over albedo, 8 times middle grey, from which on a pixel counts less and less: lamps say nothing of the walls
 /// around.
-const BRIGHT: f32 = 2.0;
+const BRIGHT: f32 = 1.5;
 
 /// The logarithm of the largest change.
 const LARGEST: f32 = 0.7;
