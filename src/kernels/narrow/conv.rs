@@ -4,6 +4,8 @@
 //! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
 //! then taps.
 
+use std::ops::Range;
+
 use half::bf16;
 use rayon::prelude::*;
 
@@ -146,56 +148,33 @@ impl Weights {
         geometry: Geometry,
     ) -> Self {
         let taps = geometry.taps();
-        let steps: Vec<f32> =
-            sources.iter().flat_map(|&(channels, steps)| (0..channels).map(move |_| steps.step)).collect();
-        let total = steps.len();
+        let channels = sources.iter().flat_map(|&(channels, steps)| (0..channels).map(move |_| steps));
+        let channels: Vec<Steps> = channels.collect();
+        let total = channels.len();
         assert_eq!(weights.len(), total * outputs * taps);
-        let weight = |o, i, t| weights[weight_index(geometry, outputs, total, o, i, t)] * steps[i];
-        // Channels of two rows of weights, which share sums of 16 bits.
-        let groups: Vec<Vec<usize>> = sources
-            .iter()
-            .scan(0, |first, (channels, _)| {
-                let of_source: Vec<usize> = (*first..*first + channels).collect();
-                *first += channels;
-                Some(of_source)
-            })
-            .flat_map(|of_source| of_source.chunks(2 * WORD).map(<[_]>::to_vec).collect::<Vec<_>>())
-            .collect();
-        let mut scale = vec![Block::default(); outputs.div_ceil(LANES)];
-        for o in 0..outputs {
-            let mut least = f32::MIN_POSITIVE;
-            for (group, t) in groups.iter().flat_map(|group| (0..taps).map(move |t| (group, t))) {
-                let group: Vec<f32> = group.iter().map(|&i| weight(o, i, t)).collect();
-                least = least.max(least_step(engine, &group));
-            }
-            scale[o / LANES].0[o % LANES] = least;
-        }
         let spread = spread(geometry);
+        assert!(spread == 1 || channels.iter().all(|steps| steps.zero == 0), "phases have sums of their own");
         let phases = (0..spread * spread).map(|phase| taps_of(geometry, (phase / spread, phase % spread)));
         let phases: Vec<Vec<Tap>> = phases.collect();
-        let mut rounded = vec![0.0; weights.len()];
-        for (row, rounded) in rounded.chunks_exact_mut(taps).enumerate() {
-            let (o, i) = (row / total, row % total);
-            for phase in &phases {
-                // Neighbouring pixels differ little, so what one tap loses the next makes good, where steps are coarse.
-                let mut lost = 0.0;
-                for tap in phase {
-                    let wanted = weight(o, i, tap.index) / scale[o / LANES].0[o % LANES] + lost;
-                    rounded[tap.index] = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
-                    if engine.adds_in_16_bits() {
-                        lost = wanted - rounded[tap.index];
-                    }
-                }
+        let weight =
+            |o, i: usize, t| weights[weight_index(geometry, outputs, total, o, i, t)] * channels[i].step;
+        let pairs = row_pairs(sources);
+        let [mut scale, mut shift] = [(); 2].map(|()| vec![Block::default(); outputs.div_ceil(LANES)]);
+        let mut rounded = Vec::with_capacity(weights.len());
+        for o in 0..outputs {
+            let mut step = f32::MIN_POSITIVE;
+            for (pair, t) in pairs.iter().flat_map(|pair| (0..taps).map(move |t| (pair, t))) {
+                step = step.max(least_step(engine, pair.clone().map(|i| weight(o, i, t))));
             }
-        }
-        let zeros = sources.iter().flat_map(|&(channels, steps)| (0..channels).map(move |_| steps.zero));
-        let zeros: Vec<f32> = zeros.map(f32::from).collect();
-        assert!(spread == 1 || zeros.iter().all(|zero| *zero == 0.0), "phases have other sums");
-        let mut shift = vec![Block::default(); outputs.div_ceil(LANES)];
-        for (o, rounded) in rounded.chunks_exact((total * taps).max(1)).enumerate() {
-            let of_inputs = rounded.chunks_exact(taps).zip(&zeros);
-            let sum: f32 = of_inputs.map(|(weights, zero)| weights.iter().sum::<f32>() * zero).sum();
-            shift[o / LANES].0[o % LANES] = -sum * scale[o / LANES].0[o % LANES];
+            let mut excess = 0.0;
+            for (i, steps) in channels.iter().enumerate() {
+                let mut of_channel: Vec<f32> = (0..taps).map(|t| weight(o, i, t) / step).collect();
+                phases.iter().for_each(|taps| round(engine, taps, &mut of_channel));
+                excess += of_channel.iter().sum::<f32>() * f32::from(steps.zero);
+                rounded.extend(of_channel);
+            }
+            let (block, lane) = (o / LANES, o % LANES);
+            (scale[block].0[lane], shift[block].0[lane]) = (step, -excess * step);
         }
         let inputs = sources.iter().map(|&(channels, steps)| (channels, Format::Int8(steps))).collect();
         let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
@@ -257,17 +236,43 @@ impl Weights {
     }
 }
 
+/// The channels of every two rows of weights, none of which has channels of two sources.
+fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
+    let mut end = 0;
+    let mut pairs = Vec::new();
+    for (channels, _) in sources {
+        let first = end;
+        end += channels;
+        pairs.extend((first..end).step_by(2 * WORD).map(|at| at..end.min(at + 2 * WORD)));
+    }
+    pairs
+}
+
 /// The finest step in which an engine can multiply the weights of the channels of two rows, or of fewer.
-fn least_step(engine: Engine, channels: &[f32]) -> f32 {
+fn least_step(engine: Engine, channels: impl Iterator<Item = f32>) -> f32 {
     let mut largest = 0.0f32;
     // Of the first two channels of either row and of the others, of either sign.
     let mut sums = [[0.0f32; 2]; WORD / 2];
-    for (i, weight) in channels.iter().enumerate() {
+    for (i, weight) in channels.enumerate() {
         largest = largest.max(weight.abs());
-        sums[i % WORD / 2][usize::from(*weight < 0.0)] += weight.abs();
+        sums[i % WORD / 2][usize::from(weight < 0.0)] += weight.abs();
     }
     let fitting = if engine.adds_in_16_bits() { FITTING_STEPS } else { f32::INFINITY };
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
+}
+
+/// Rounds some taps of a channel's weights, which count steps. Where those are coarse, what one tap loses the next makes good, as
+/// neighbouring pixels differ little.
+fn round(engine: Engine, taps: &[Tap], weights: &mut [f32]) {
+    let mut lost = 0.0;
+    for tap in taps {
+        let wanted = weights[tap.index] + lost;
+        let rounded = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
+        weights[tap.index] = rounded;
+        if engine.adds_in_16_bits() {
+            lost = wanted - rounded;
+        }
+    }
 }
 
 /// Where a convolution writes.
