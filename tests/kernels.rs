@@ -313,7 +313,8 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
         .collect();
     // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that no other weight is
     // rounded.
-    let (largest, adds) = if engine.adds_in_16_bits() { (124.0, true) } else { (127.0, false) };
+    let adds = engine.adds_in_16_bits();
+    let (largest, others) = if adds { (124.0, 31.0) } else { (127.0, 127.0) };
     let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];
     let levels = noise(seed + 1, w.len());
     for o in 0..outputs {
@@ -324,8 +325,8 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
                 let level = match (i, t) {
                     (0 | 1 | 4 | 5, 0) if has_four => -largest / 4.0,
                     (0, 0) => -largest,
-                    (1 | 4 | 5, 0) => 0.0,
-                    _ => (levels[(o * shape.c + i) * geometry.taps() + t] * 31.0).round(),
+                    (1 | 4 | 5, 0) if adds => 0.0,
+                    _ => (levels[(o * shape.c + i) * geometry.taps() + t] * others).round(),
                 };
                 w[weight_index(geometry, outputs, shape.c, o, i, t)] = level * scale / step_of(i);
             }

@@ -569,10 +569,8 @@ mod x86 {
                 t[2 * i + 1] = _mm256_unpackhi_ps(r[2 * i], r[2 * i + 1]);
             }
             for i in [0, 4] {
-                r[i] = unpack_pairs(t[i], t[i + 2])[0];
-                r[i + 1] = unpack_pairs(t[i], t[i + 2])[1];
-                r[i + 2] = unpack_pairs(t[i + 1], t[i + 3])[0];
-                r[i + 3] = unpack_pairs(t[i + 1], t[i + 3])[1];
+                [r[i], r[i + 1]] = unpack_pairs(t[i], t[i + 2]);
+                [r[i + 2], r[i + 3]] = unpack_pairs(t[i + 1], t[i + 3]);
             }
             for i in 0..4 {
                 t[i] = _mm256_permute2f128_ps::<LOW>(r[i], r[i + 4]);

@@ -35,8 +35,9 @@ fn spread(geometry: Geometry) -> usize {
     if geometry == Geometry::Transposed { 2 } else { 1 }
 }
 
-/// The taps of output phase `(py, px)`, those of the first input phase first.
-fn taps_of(geometry: Geometry, (py, px): (usize, usize)) -> Vec<Tap> {
+/// The taps of an output phase, those of the first input phase first.
+fn taps_of(geometry: Geometry, phase: usize) -> Vec<Tap> {
+    let (py, px) = (phase / spread(geometry), phase % spread(geometry));
     let signed = |v: usize| isize::try_from(v).expect("kernels are small");
     match geometry {
         Geometry::Same(k) => (0..k * k)
@@ -71,7 +72,7 @@ fn taps_of(geometry: Geometry, (py, px): (usize, usize)) -> Vec<Tap> {
 }
 
 /// The terms of a phase over all planes of an operand: `(plane without phase, tap)`.
-fn terms(geometry: Geometry, planes: usize, phase: (usize, usize)) -> Vec<(usize, Tap)> {
+fn terms(geometry: Geometry, planes: usize, phase: usize) -> Vec<(usize, Tap)> {
     let taps = taps_of(geometry, phase);
     (0..planes).flat_map(|plane| taps.iter().map(move |&tap| (plane, tap))).collect()
 }
@@ -154,27 +155,30 @@ impl Weights {
         assert_eq!(weights.len(), total * outputs * taps);
         let spread = spread(geometry);
         assert!(spread == 1 || channels.iter().all(|steps| steps.zero == 0), "phases have sums of their own");
-        let phases = (0..spread * spread).map(|phase| taps_of(geometry, (phase / spread, phase % spread)));
-        let phases: Vec<Vec<Tap>> = phases.collect();
-        let weight =
-            |o, i: usize, t| weights[weight_index(geometry, outputs, total, o, i, t)] * channels[i].step;
+        let phases: Vec<Vec<Tap>> = (0..spread * spread).map(|phase| taps_of(geometry, phase)).collect();
         let pairs = row_pairs(sources);
-        let [mut scale, mut shift] = [(); 2].map(|()| vec![Block::default(); outputs.div_ceil(LANES)]);
-        let mut rounded = Vec::with_capacity(weights.len());
-        for o in 0..outputs {
+        let mut rounded = vec![0.0; weights.len()];
+        let of_outputs = rounded.par_chunks_exact_mut(total * taps).enumerate().map(|(o, of_output)| {
+            for (i, (of_channel, steps)) in of_output.chunks_exact_mut(taps).zip(&channels).enumerate() {
+                for (t, value) in of_channel.iter_mut().enumerate() {
+                    *value = weights[weight_index(geometry, outputs, total, o, i, t)] * steps.step;
+                }
+            }
             let mut step = f32::MIN_POSITIVE;
             for (pair, t) in pairs.iter().flat_map(|pair| (0..taps).map(move |t| (pair, t))) {
-                step = step.max(least_step(engine, pair.clone().map(|i| weight(o, i, t))));
+                step = step.max(least_step(engine, pair.clone().map(|i| of_output[i * taps + t])));
             }
             let mut excess = 0.0;
-            for (i, steps) in channels.iter().enumerate() {
-                let mut of_channel: Vec<f32> = (0..taps).map(|t| weight(o, i, t) / step).collect();
-                phases.iter().for_each(|taps| round(engine, taps, &mut of_channel));
+            for (of_channel, steps) in of_output.chunks_exact_mut(taps).zip(&channels) {
+                of_channel.iter_mut().for_each(|value| *value /= step);
+                phases.iter().for_each(|taps| round(engine, taps, of_channel));
                 excess += of_channel.iter().sum::<f32>() * f32::from(steps.zero);
-                rounded.extend(of_channel);
             }
-            let (block, lane) = (o / LANES, o % LANES);
-            (scale[block].0[lane], shift[block].0[lane]) = (step, -excess * step);
+            (step, -excess * step)
+        });
+        let [mut scale, mut shift] = [(); 2].map(|()| vec![Block::default(); outputs.div_ceil(LANES)]);
+        for (o, of_output) in of_outputs.collect::<Vec<_>>().into_iter().enumerate() {
+            (scale[o / LANES].0[o % LANES], shift[o / LANES].0[o % LANES]) = of_output;
         }
         let inputs = sources.iter().map(|&(channels, steps)| (channels, Format::Int8(steps))).collect();
         let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
@@ -202,9 +206,8 @@ impl Weights {
         // Channels of a row of weights.
         let side = WORD * format.channels() / size_of::<Wide>();
         let spread = spread(geometry);
-        let terms: Vec<(usize, Tap)> = (0..spread * spread)
-            .flat_map(|phase| terms(geometry, planes.len(), (phase / spread, phase % spread)))
-            .collect();
+        let terms: Vec<(usize, Tap)> =
+            (0..spread * spread).flat_map(|phase| terms(geometry, planes.len(), phase)).collect();
         let mut rows = vec![Wide::ZERO; outputs.div_ceil(LANES) * terms.len() * LANES];
         rows.par_chunks_mut(terms.len() * LANES).enumerate().for_each(|(plane, rows)| {
             let lanes = (outputs - plane * LANES).min(LANES);
@@ -347,11 +350,7 @@ pub fn convolve(
                 signed((n * step + tap.phase) * grid.positions()) + tap.dy * signed(grid.stride()) + tap.dx;
             Term { input: first.wrapping_offset(at), weights: i * LANES * size_of::<Wide>() }
         };
-        terms(geometry, planes.len(), (phase / spread, phase % spread))
-            .into_iter()
-            .enumerate()
-            .map(place)
-            .collect()
+        terms(geometry, planes.len(), phase).into_iter().enumerate().map(place).collect()
     };
     let phases: Vec<Vec<Vec<Term>>> =
         (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();

@@ -92,7 +92,7 @@ impl Engine {
     }
 
     /// Whether it has instructions for bfloat16.
-    pub fn has_bf16(self) -> bool {
+    fn has_bf16(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         return !matches!(self.0, Unit::Portable | Unit::Avx2 | Unit::AvxVnni | Unit::Vnni);
         #[cfg(not(target_arch = "x86_64"))]
