@@ -313,7 +313,7 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
         .collect();
     // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that no other weight is
     // rounded.
-    let adds = engine.adds_in_16_bits();
+    let adds = engine.adds_in_16_bits(geometry);
     let (largest, others) = if adds { (124.0, 31.0) } else { (127.0, 127.0) };
     let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];
     let levels = noise(seed + 1, w.len());

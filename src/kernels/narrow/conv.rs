@@ -2,7 +2,7 @@
 //!
 //! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for a
 //! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
-//! then taps.
+//! then taps. Where squares of outputs are computed together, they are as [`winograd::pack`] says.
 
 use std::ops::Range;
 
@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use super::{
     CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Steps, Sums, Term, WEIGHT_STEPS, WORD,
     Wide,
+    winograd::{self, FITTING_SUM, Part, SIDE, Squares},
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
@@ -80,9 +81,11 @@ fn terms(geometry: Geometry, planes: usize, phase: usize) -> Vec<(usize, Tap)> {
 /// A layer's weights, rounded and packed for one direction.
 #[derive(Debug)]
 pub struct Weights {
-    rows: Vec<Wide>,
-    /// Groups of rows that each term of a phase needs; the same for every phase.
-    groups: Vec<u8>,
+    pub(super) rows: Vec<Wide>,
+    /// Groups of rows that each term of a phase, or each part, needs; the same for every phase.
+    pub(super) groups: Vec<u8>,
+    /// The parts of the sources where squares of outputs are computed together; none where it is tap by tap.
+    parts: Vec<Part>,
     geometry: Geometry,
     /// Channels and format of every source read.
     inputs: Vec<(usize, Format)>,
@@ -156,6 +159,7 @@ impl Weights {
         let spread = spread(geometry);
         assert!(spread == 1 || channels.iter().all(|steps| steps.zero == 0), "phases have sums of their own");
         let phases: Vec<Vec<Tap>> = (0..spread * spread).map(|phase| taps_of(geometry, phase)).collect();
+        let in_16_bits = engine.adds_in_16_bits(geometry);
         let pairs = row_pairs(sources);
         let mut rounded = vec![0.0; weights.len()];
         let of_outputs = rounded.par_chunks_exact_mut(total * taps).enumerate().map(|(o, of_output)| {
@@ -166,12 +170,16 @@ impl Weights {
             }
             let mut step = f32::MIN_POSITIVE;
             for (pair, t) in pairs.iter().flat_map(|pair| (0..taps).map(move |t| (pair, t))) {
-                step = step.max(least_step(engine, pair.clone().map(|i| of_output[i * taps + t])));
+                step = step.max(least_step(in_16_bits, pair.clone().map(|i| of_output[i * taps + t])));
+            }
+            for sign in [1.0, -1.0] {
+                let sum: f32 = of_output.iter().map(|value| (sign * value).max(0.0)).sum();
+                step = step.max(sum / FITTING_SUM);
             }
             let mut excess = 0.0;
             for (of_channel, steps) in of_output.chunks_exact_mut(taps).zip(&channels) {
                 of_channel.iter_mut().for_each(|value| *value /= step);
-                phases.iter().for_each(|taps| round(engine, taps, of_channel));
+                phases.iter().for_each(|taps| round(in_16_bits, taps, of_channel));
                 excess += of_channel.iter().sum::<f32>() * f32::from(steps.zero);
             }
             (step, -excess * step)
@@ -181,6 +189,15 @@ impl Weights {
             (scale[o / LANES].0[o % LANES], shift[o / LANES].0[o % LANES]) = of_output;
         }
         let inputs = sources.iter().map(|&(channels, steps)| (channels, Format::Int8(steps))).collect();
+        if engine.prefers_squares(geometry) {
+            let parts = winograd::parts(sources.iter().map(|(channels, _)| *channels));
+            let kernel = |o: usize, i: usize| {
+                let of_channel = &rounded[(o * total + i) * taps..];
+                std::array::from_fn(|t| of_channel[t] as i16)
+            };
+            let (rows, groups) = (winograd::pack(&parts, outputs, kernel), winograd::groups(&parts));
+            return Self { rows, groups, parts, geometry, inputs, outputs, scale, shift };
+        }
         let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
         Self { scale, shift, ..packed }
     }
@@ -230,7 +247,7 @@ impl Weights {
             of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
         let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
         let shift = vec![Block::default(); scale.len()];
-        Self { rows, groups, geometry, inputs, outputs, scale, shift }
+        Self { rows, groups, parts: Vec::new(), geometry, inputs, outputs, scale, shift }
     }
 
     /// What each source is to be rounded to.
@@ -251,8 +268,8 @@ fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     pairs
 }
 
-/// The finest step in which an engine can multiply the weights of the channels of two rows, or of fewer.
-fn least_step(engine: Engine, channels: impl Iterator<Item = f32>) -> f32 {
+/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added up in 16 bits or not.
+fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     let mut largest = 0.0f32;
     // Of the first two channels of either row and of the others, of either sign.
     let mut sums = [[0.0f32; 2]; WORD / 2];
@@ -260,19 +277,19 @@ fn least_step(engine: Engine, channels: impl Iterator<Item = f32>) -> f32 {
         largest = largest.max(weight.abs());
         sums[i % WORD / 2][usize::from(weight < 0.0)] += weight.abs();
     }
-    let fitting = if engine.adds_in_16_bits() { FITTING_STEPS } else { f32::INFINITY };
+    let fitting = if in_16_bits { FITTING_STEPS } else { f32::INFINITY };
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
 /// Rounds some taps of a channel's weights, which count steps. Where those are coarse, what one tap loses the next makes good, as
 /// neighbouring pixels differ little.
-fn round(engine: Engine, taps: &[Tap], weights: &mut [f32]) {
+fn round(in_16_bits: bool, taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
         let wanted = weights[tap.index] + lost;
         let rounded = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
         weights[tap.index] = rounded;
-        if engine.adds_in_16_bits() {
+        if in_16_bits {
             lost = wanted - rounded;
         }
     }
@@ -333,7 +350,7 @@ pub fn convolve(
     assert!(epilogue.accumulate || bias.len() == out.planes());
     assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
 
-    // Every plane of every source: its first position in image 0, and planes from one image to the next.
+    // Every plane of every source: its position 0 in image 0, and planes from one image to the next.
     let planes: Vec<(*const Wide, usize)> = sources
         .iter()
         .flat_map(|source| {
@@ -342,6 +359,10 @@ pub fn convolve(
             (0..source.planes() / grid.phases()).map(move |p| (first.wrapping_add(p * step), source.planes()))
         })
         .collect();
+    let places = |n: usize| -> Vec<Term> {
+        let place = |&(first, step): &(*const Wide, usize)| first.wrapping_add(n * step * grid.positions());
+        planes.iter().map(|plane| Term { input: place(plane), weights: 0 }).collect()
+    };
     let terms = |n: usize, phase: usize| -> Vec<Term> {
         let signed = |v: usize| isize::try_from(v).expect("buffers fit in memory");
         let place = |(i, (plane, tap)): (usize, (usize, Tap))| {
@@ -352,11 +373,14 @@ pub fn convolve(
         };
         terms(geometry, planes.len(), phase).into_iter().enumerate().map(place).collect()
     };
-    let phases: Vec<Vec<Vec<Term>>> =
-        (0..out.n).map(|n| (0..spread * spread).map(|phase| terms(n, phase)).collect()).collect();
+    let by_squares = !weights.parts.is_empty();
+    let phases_of = |n: usize| -> Vec<Vec<Term>> {
+        if by_squares { vec![places(n)] } else { (0..spread * spread).map(|phase| terms(n, phase)).collect() }
+    };
+    let phases: Vec<Vec<Vec<Term>>> = (0..out.n).map(phases_of).collect();
     // Bands of rows keep every thread busy and their input in the second-level cache.
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
-    let band = grid.h.div_ceil(bands);
+    let band = grid.h.div_ceil(bands).next_multiple_of(if by_squares { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
     let (target, step) = match output {
         Output::F32(view) => {
@@ -391,20 +415,25 @@ pub fn convolve(
         let y0 = task % bands * band;
         let rows = (y0, grid.h.min(y0 + band));
         let n = task / bands;
+        let band = Band {
+            engine,
+            grid,
+            weights,
+            scale: &scale,
+            bias: &bias,
+            epilogue,
+            phases: &phases[n],
+            out,
+            target,
+            n,
+            rows,
+        };
         engine.ready(|| {
-            tier.run(Band {
-                engine,
-                grid,
-                weights,
-                scale: &scale,
-                bias: &bias,
-                epilogue,
-                phases: &phases[n],
-                out,
-                target,
-                n,
-                rows,
-            });
+            if by_squares {
+                tier.run(Squares { band, parts: &weights.parts });
+            } else {
+                tier.run(band);
+            }
         });
     });
 }
@@ -426,19 +455,20 @@ enum Target {
 }
 
 /// The work of one task: some rows of all output planes of one image.
-struct Band<'a> {
-    engine: Engine,
-    grid: Grid,
-    weights: &'a Weights,
+pub(super) struct Band<'a> {
+    pub engine: Engine,
+    pub grid: Grid,
+    pub weights: &'a Weights,
     /// Of sums, a block an output plane.
     scale: &'a [Block],
     bias: &'a [Block],
     epilogue: Epilogue,
-    phases: &'a [Vec<Term>],
-    out: Shape,
+    /// The terms of each phase; those of the planes as they are where squares are computed.
+    pub phases: &'a [Vec<Term>],
+    pub out: Shape,
     target: Target,
     n: usize,
-    rows: (usize, usize),
+    pub rows: (usize, usize),
 }
 
 impl Kernel for Band<'_> {
@@ -448,7 +478,7 @@ impl Kernel for Band<'_> {
         let (first, end) = (grid.row(self.rows.0), grid.row(self.rows.1 - 1) + grid.w);
         let phase_rows = self.phases[0].len() * LANES;
         let plane_rows = self.phases.len() * phase_rows;
-        let mut sums = Sums([[Block::default(); CHUNK]; 2]);
+        let mut sums = Sums::default();
         for plane in (0..self.out.planes()).step_by(2) {
             let outputs = (self.out.planes() - plane).min(2);
             for (phase, terms) in self.phases.iter().enumerate() {
@@ -482,8 +512,11 @@ impl Kernel for Band<'_> {
 
 impl Band<'_> {
     /// Finishes the sums of positions `from..end` and stores those that are pixels.
+    ///
+    /// # Safety
+    /// The processor has the instructions of `S`; no other task writes these rows.
     #[inline(always)]
-    unsafe fn store<S: Simd>(
+    pub unsafe fn store<S: Simd>(
         &self,
         sums: &Sums,
         (plane, outputs): (usize, usize),

@@ -4,7 +4,11 @@ use std::{fmt, sync::OnceLock};
 
 use half::bf16;
 
-use super::{Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide};
+use super::{
+    Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide,
+    winograd::{self, PATCH, SIDE},
+};
+use crate::kernels::conv::Geometry;
 
 /// A way to multiply narrow matrices that this processor has.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -107,10 +111,18 @@ impl Engine {
         false
     }
 
-    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels.
-    pub fn adds_in_16_bits(self) -> bool {
+    /// Whether it has convolutions of 8 bits of a geometry by squares of outputs ([`winograd`]) rather than tap by tap.
+    pub(super) fn prefers_squares(self, geometry: Geometry) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return self.0 == Unit::Avx2;
+        return self.0 == Unit::Avx2 && geometry == Geometry::Same(3);
+        #[cfg(not(target_arch = "x86_64"))]
+        false
+    }
+
+    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels, in a convolution of a geometry.
+    pub fn adds_in_16_bits(self, geometry: Geometry) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return self.0 == Unit::Avx2 && !self.prefers_squares(geometry);
         #[cfg(not(target_arch = "x86_64"))]
         false
     }
@@ -167,6 +179,80 @@ impl Engine {
                 }
                 _ => portable::multiply(format, terms, position, weights, (outputs, plane), sums),
             }
+        }
+    }
+
+    /// 16 channels of 8 bits of the patches of `squares` squares side by side, at the 36 points of [`winograd`]: `patch` is where
+    /// each row of the first begins, `points` where the first point of the first square goes. Squares follow one another, and points lie `stride`
+    /// squares apart, a [`Wide`] each.
+    ///
+    /// # Safety
+    /// All of them can be read and written.
+    pub(super) unsafe fn evaluate(
+        self,
+        patch: [*const u8; PATCH],
+        squares: usize,
+        points: *mut u8,
+        stride: usize,
+    ) {
+        // SAFETY: the caller's promise; an engine is only made after its instructions were detected.
+        unsafe {
+            #[cfg(target_arch = "x86_64")]
+            if self.0 != Unit::Portable {
+                return avx2::evaluate(patch, squares, points, stride);
+            }
+            portable::evaluate(patch, squares, points, stride);
+        }
+    }
+
+    /// `products[o][square] = sum over parts of points[part][square] * weights[o][part]` at one point, for `outputs` (1 or 2) output
+    /// planes whose weights lie `plane` rows apart. `groups` tell how many groups of rows each part needs; the other
+    /// weights are zero.
+    ///
+    /// # Safety
+    /// Parts, and output planes' products, lie [`winograd::SQUARES`] values apart, and all of them can be read and written.
+    pub(super) unsafe fn multiply_points(
+        self,
+        groups: &[u8],
+        points: *const Wide,
+        weights: *const Wide,
+        (outputs, plane): (usize, usize),
+        squares: usize,
+        products: *mut Wide,
+    ) {
+        // SAFETY: as in `evaluate`.
+        unsafe {
+            for o in 0..outputs {
+                let (weights, products) = (weights.add(o * plane), products.add(o * winograd::SQUARES));
+                #[cfg(target_arch = "x86_64")]
+                if self.0 != Unit::Portable {
+                    avx2::multiply_points(groups, points, weights, squares, products);
+                    continue;
+                }
+                portable::multiply_points(groups, points, weights, squares, products);
+            }
+        }
+    }
+
+    /// The sums of a square for one output plane, from its products at the points, which lie `stride` values apart: row `y` of the
+    /// square goes to `sums[y]`, from `column` on.
+    ///
+    /// # Safety
+    /// All of them can be read.
+    pub(super) unsafe fn interpolate(
+        self,
+        products: *const Wide,
+        stride: usize,
+        sums: &mut [Sums; SIDE],
+        (output, column): (usize, usize),
+    ) {
+        // SAFETY: as in `evaluate`.
+        unsafe {
+            #[cfg(target_arch = "x86_64")]
+            if self.0 != Unit::Portable {
+                return avx2::interpolate(products, stride, sums, (output, column));
+            }
+            portable::interpolate(products, stride, sums, (output, column));
         }
     }
 
@@ -263,7 +349,12 @@ fn is_intel() -> bool {
 
 /// Plain loops: the oracle of the other engines.
 mod portable {
-    use super::*;
+    use std::num::Wrapping;
+
+    use super::{
+        winograd::{NINTH, POWERS, Ring, SQUARES},
+        *,
+    };
 
     pub unsafe fn multiply(
         format: Format,
@@ -304,6 +395,94 @@ mod portable {
                     Format::Bf16 => real,
                     Format::Int8(_) => whole.map(|v| v as f32),
                 };
+            }
+        }
+    }
+
+    macro_rules! ring {
+        ($number:ty) => {
+            impl Ring for Wrapping<$number> {
+                unsafe fn plus(self, other: Self) -> Self {
+                    self + other
+                }
+                unsafe fn minus(self, other: Self) -> Self {
+                    self - other
+                }
+                unsafe fn twice(self) -> Self {
+                    self << 1
+                }
+            }
+        };
+    }
+    ring!(i16);
+    ring!(i32);
+
+    pub unsafe fn evaluate(patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
+        for (square, lane) in (0..squares).flat_map(|square| (0..LANES).map(move |lane| (square, lane))) {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let columns: [[Wrapping<i16>; PATCH]; PATCH] = std::array::from_fn(|x| {
+                    let at = (SIDE * square + x) * size_of::<Wide>() + lane;
+                    winograd::evaluate(patch.map(|row| Wrapping(i16::from(*row.add(at)))))
+                });
+                for y in 0..PATCH {
+                    let row = winograd::evaluate(columns.map(|column| column[y]));
+                    for (x, value) in row.into_iter().enumerate() {
+                        let at = ((PATCH * y + x) * stride + square) * size_of::<Wide>() + 2 * lane;
+                        points.add(at).cast::<i16>().write(value.0);
+                    }
+                }
+            }
+        }
+    }
+
+    pub unsafe fn multiply_points(
+        groups: &[u8],
+        points: *const Wide,
+        weights: *const Wide,
+        squares: usize,
+        products: *mut Wide,
+    ) {
+        for square in 0..squares {
+            let mut sums = [0i32; LANES];
+            for part in 0..groups.len() {
+                // SAFETY: the caller's promise.
+                let (x, w) = unsafe {
+                    let w = std::slice::from_raw_parts(weights.add(part * LANES), LANES);
+                    (&*points.add(part * SQUARES + square), w)
+                };
+                for (channel, l) in (0..WIDE).flat_map(|channel| (0..LANES).map(move |l| (channel, l))) {
+                    let number = |wide: &Wide, i: usize| i32::from(wide.i16(i));
+                    let product = number(x, channel) * number(&w[channel / 2], 2 * l + channel % 2);
+                    sums[l] = sums[l].wrapping_add(product);
+                }
+            }
+            // SAFETY: the caller's promise.
+            unsafe { products.add(square).cast::<[i32; LANES]>().write(sums) };
+        }
+    }
+
+    pub unsafe fn interpolate(
+        products: *const Wide,
+        stride: usize,
+        sums: &mut [Sums; SIDE],
+        (output, column): (usize, usize),
+    ) {
+        for lane in 0..LANES {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let lines: [[Wrapping<i32>; SIDE]; PATCH] = std::array::from_fn(|x| {
+                    winograd::interpolate(std::array::from_fn(|y| {
+                        Wrapping(*products.add((PATCH * y + x) * stride).cast::<i32>().add(lane))
+                    }))
+                });
+                for (y, sums) in sums.iter_mut().enumerate() {
+                    let row = winograd::interpolate(lines.map(|line| line[y]));
+                    for (x, value) in row.into_iter().enumerate() {
+                        let value = value.0.wrapping_mul(NINTH.cast_signed()) >> (POWERS[y] + POWERS[x]);
+                        sums.0[output][column + x].0[lane] = value as f32;
+                    }
+                }
             }
         }
     }
@@ -369,10 +548,16 @@ mod portable {
 mod avx2 {
     use std::arch::x86_64::*;
 
-    use super::{CHUNK, GROUP, LANES, Sums, Term, WORD, Wide};
+    use super::{
+        CHUNK, GROUP, LANES, Sums, Term, WORD, Wide,
+        winograd::{self, NINTH, PATCH, POWERS, Ring, SIDE, SQUARES},
+    };
 
     /// Positions whose sums stay in registers, two for each.
     const TILE: usize = 4;
+
+    /// Squares whose products stay in registers, two for each.
+    const STRIP: usize = 4;
 
     /// Lanes of a register.
     const HALF: usize = LANES / 2;
@@ -476,6 +661,161 @@ mod avx2 {
             }
         }
         const { assert!(CHUNK.is_multiple_of(TILE)) };
+    }
+
+    /// 16 numbers of 16 bits.
+    #[derive(Clone, Copy)]
+    struct Halves(__m256i);
+
+    impl Ring for Halves {
+        #[inline(always)]
+        unsafe fn plus(self, other: Self) -> Self {
+            // SAFETY: the caller's promise, here and below.
+            unsafe { Self(_mm256_add_epi16(self.0, other.0)) }
+        }
+        #[inline(always)]
+        unsafe fn minus(self, other: Self) -> Self {
+            // SAFETY: as above.
+            unsafe { Self(_mm256_sub_epi16(self.0, other.0)) }
+        }
+        #[inline(always)]
+        unsafe fn twice(self) -> Self {
+            // SAFETY: as above.
+            unsafe { Self(_mm256_add_epi16(self.0, self.0)) }
+        }
+    }
+
+    /// 8 of 32 bits.
+    #[derive(Clone, Copy)]
+    struct Wholes(__m256i);
+
+    impl Ring for Wholes {
+        #[inline(always)]
+        unsafe fn plus(self, other: Self) -> Self {
+            // SAFETY: as above.
+            unsafe { Self(_mm256_add_epi32(self.0, other.0)) }
+        }
+        #[inline(always)]
+        unsafe fn minus(self, other: Self) -> Self {
+            // SAFETY: as above.
+            unsafe { Self(_mm256_sub_epi32(self.0, other.0)) }
+        }
+        #[inline(always)]
+        unsafe fn twice(self) -> Self {
+            // SAFETY: as above.
+            unsafe { Self(_mm256_add_epi32(self.0, self.0)) }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub unsafe fn evaluate(patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
+        let nothing = Halves(_mm256_setzero_si256());
+        // Columns of a patch at the points, the last two of which are the next patch's first.
+        let mut columns = [[nothing; PATCH]; PATCH];
+        for square in 0..squares {
+            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that as points.
+            unsafe {
+                for x in if square == 0 { 0 } else { PATCH - SIDE }..PATCH {
+                    let mut column = [nothing; PATCH];
+                    for y in 0..PATCH {
+                        let bytes = patch[y].add((SIDE * square + x) * size_of::<Wide>());
+                        column[y] = Halves(_mm256_cvtepu8_epi16(_mm_load_si128(bytes.cast())));
+                    }
+                    columns[x] = winograd::evaluate(column);
+                }
+                for y in 0..PATCH {
+                    let mut row = [nothing; PATCH];
+                    for x in 0..PATCH {
+                        row[x] = columns[x][y];
+                    }
+                    let row = winograd::evaluate(row);
+                    for x in 0..PATCH {
+                        let at = ((PATCH * y + x) * stride + square) * size_of::<Wide>();
+                        _mm256_store_si256(points.add(at).cast(), row[x].0);
+                    }
+                }
+            }
+            columns.copy_within(SIDE.., 0);
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub unsafe fn multiply_points(
+        groups: &[u8],
+        points: *const Wide,
+        weights: *const Wide,
+        squares: usize,
+        products: *mut Wide,
+    ) {
+        for first in (0..squares).step_by(STRIP) {
+            // SAFETY: the caller's promise; a value is two registers.
+            unsafe {
+                let mut acc = [[_mm256_setzero_si256(); 2]; STRIP];
+                for (part, &groups) in groups.iter().enumerate() {
+                    let mut x = points.add(part * SQUARES + first).cast::<u8>();
+                    let mut w = weights.add(part * LANES).cast::<__m256i>();
+                    for _ in 0..groups {
+                        for row in 0..GROUP {
+                            let [low, high] = [0, 1].map(|half| _mm256_load_si256(w.add(2 * row + half)));
+                            for (p, acc) in acc.iter_mut().enumerate() {
+                                let x = x.add(p * size_of::<Wide>() + WORD * row);
+                                let x = _mm256_set1_epi32(x.cast::<i32>().read_unaligned());
+                                acc[0] = _mm256_add_epi32(acc[0], _mm256_madd_epi16(x, low));
+                                acc[1] = _mm256_add_epi32(acc[1], _mm256_madd_epi16(x, high));
+                            }
+                        }
+                        (x, w) = (x.add(WORD * GROUP), w.add(2 * GROUP));
+                    }
+                }
+                for (p, acc) in acc.iter().enumerate() {
+                    let to = products.add(first + p).cast::<__m256i>();
+                    _mm256_store_si256(to, acc[0]);
+                    _mm256_store_si256(to.add(1), acc[1]);
+                }
+            }
+        }
+        const { assert!(SQUARES.is_multiple_of(STRIP)) };
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub unsafe fn interpolate(
+        products: *const Wide,
+        stride: usize,
+        sums: &mut [Sums; SIDE],
+        (output, column): (usize, usize),
+    ) {
+        let nothing = Wholes(_mm256_setzero_si256());
+        let ninth = _mm256_set1_epi32(NINTH.cast_signed());
+        for half in 0..2 {
+            let mut lines = [[nothing; SIDE]; PATCH];
+            for x in 0..PATCH {
+                let mut line = [nothing; PATCH];
+                // SAFETY: the caller's promise; half a value is a register.
+                unsafe {
+                    for y in 0..PATCH {
+                        let product = products.add((PATCH * y + x) * stride).cast::<__m256i>();
+                        line[y] = Wholes(_mm256_load_si256(product.add(half)));
+                    }
+                    lines[x] = winograd::interpolate(line);
+                }
+            }
+            for (y, sums) in sums.iter_mut().enumerate() {
+                let mut row = [nothing; PATCH];
+                for x in 0..PATCH {
+                    row[x] = lines[x][y];
+                }
+                // SAFETY: the instructions are this function's; half a block is a register.
+                unsafe {
+                    let row = winograd::interpolate(row);
+                    for x in 0..SIDE {
+                        let power = _mm_cvtsi32_si128((POWERS[y] + POWERS[x]).cast_signed());
+                        let sum = _mm256_sra_epi32(_mm256_mullo_epi32(row[x].0, ninth), power);
+                        let to = &mut sums.0[output][column + x].0[half * HALF..];
+                        _mm256_store_ps(to.as_mut_ptr(), _mm256_cvtepi32_ps(sum));
+                    }
+                }
+            }
+        }
     }
 }
 

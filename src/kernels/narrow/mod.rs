@@ -4,7 +4,8 @@
 //!
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
-//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones.
+//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones. Where products are
+//! dear, 3x3 convolutions go by squares of outputs, with fewer of them (`winograd.rs`).
 //!
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.
@@ -12,6 +13,7 @@
 pub mod conv;
 mod engine;
 pub mod weight_grad;
+mod winograd;
 
 pub use engine::Engine;
 
@@ -117,6 +119,11 @@ impl Wide {
         bf16::from_ne_bytes([self.0[2 * i], self.0[2 * i + 1]])
     }
 
+    /// Value `i` of 16 bits with a sign.
+    fn i16(&self, i: usize) -> i16 {
+        i16::from_ne_bytes([self.0[2 * i], self.0[2 * i + 1]])
+    }
+
     /// Sets value `i` in bfloat16.
     fn set_bf16(&mut self, i: usize, value: bf16) {
         self.0[2 * i..][..2].copy_from_slice(&value.to_ne_bytes());
@@ -140,6 +147,12 @@ unsafe impl Send for Term {}
 /// The sums of a chunk for two output planes.
 #[repr(C, align(64))]
 struct Sums([[Block; CHUNK]; 2]);
+
+impl Default for Sums {
+    fn default() -> Self {
+        Self([[Block::default(); CHUNK]; 2])
+    }
+}
 
 /// Free memory of operands.
 static FREE: Pool<Wide> = Pool::new();
