@@ -9,6 +9,7 @@ use demc::kernels::{
     pool::{max_pool, max_pool_gradient},
     simd::Tier,
     weight_grad::{bias_gradient, weight_gradient},
+    winograd,
 };
 use proptest::prelude::*;
 
@@ -79,12 +80,14 @@ fn assert_close(got: &[f32], want: &[f64], what: &str) {
 #[derive(Clone, Copy, Debug)]
 enum Arithmetic {
     F32(Tier),
+    /// As that, but 3x3 convolutions by squares of outputs.
+    Squares(Tier),
     Bf16(Engine),
 }
 
 impl Arithmetic {
     fn available() -> Vec<Self> {
-        let tiers = Tier::available().into_iter().map(Self::F32);
+        let tiers = Tier::available().into_iter().flat_map(|tier| [Self::F32(tier), Self::Squares(tier)]);
         tiers.chain(Engine::available().into_iter().map(Self::Bf16)).collect()
     }
 
@@ -103,14 +106,20 @@ impl Arithmetic {
             _ => geometry,
         };
         match self {
-            Self::F32(tier) => {
+            Self::F32(tier) | Self::Squares(tier) => {
                 let len = match direction {
                     Direction::Forward => packed_len(inputs, outputs, geometry),
                     Direction::Backward => packed_len(&[outputs], inputs[source], geometry),
                 };
                 let mut packed = vec![Block::default(); len];
                 pack(weights, inputs, outputs, geometry, direction, source, &mut packed);
-                convolve(tier, sources, &packed, bias, used, epilogue, output);
+                if matches!(self, Self::Squares(_)) && used == Geometry::Same(3) {
+                    let planes = sources.iter().map(|s| s.shape.planes()).sum();
+                    let weights = winograd::transform(tier, &packed, planes);
+                    winograd::convolve(tier, sources, &weights, bias, epilogue, output);
+                } else {
+                    convolve(tier, sources, &packed, bias, used, epilogue, output);
+                }
             }
             Self::Bf16(engine) => {
                 let packed =
@@ -153,7 +162,7 @@ impl Arithmetic {
 
     fn weight_gradient(self, x: View, g: View, geometry: Geometry, place: (usize, usize), dw: &mut [f32]) {
         match self {
-            Self::F32(tier) => weight_gradient(tier, x, g, geometry, place, dw),
+            Self::F32(tier) | Self::Squares(tier) => weight_gradient(tier, x, g, geometry, place, dw),
             Self::Bf16(engine) => {
                 let channels = narrow::weight_grad::Channels::new(engine, x);
                 let pairs = narrow::weight_grad::Pairs::new(engine, g, geometry);
@@ -254,7 +263,7 @@ proptest! {
     #[test]
     fn layers_match_the_textbook_sum_on_every_tier(
         geometry in geometry(),
-        n in 1usize..3, c in 1usize..40, outputs in 1usize..50, h in 1usize..9, w in 1usize..33,
+        n in 1usize..3, c in 1usize..40, outputs in 1usize..50, h in 1usize..9, w in 1usize..56,
         split in 0usize..40, seed in any::<u64>(),
     ) {
         let shape = Shape { pad: 2, ..Shape::new(n, c, h, w) };
@@ -387,7 +396,7 @@ proptest! {
     #[test]
     fn eight_bits_equal_the_textbook_sum(
         (n, c, outputs) in (1usize..3, 1usize..150, 1usize..70),
-        (h, w) in (1usize..7, 1usize..40),
+        (h, w) in (1usize..7, 1usize..80),
         split in 0usize..150,
         geometry in prop::sample::select(vec![Geometry::Same(1), Geometry::Same(3), Geometry::Transposed]),
         seed in any::<u64>(),

@@ -28,6 +28,7 @@ pub mod redivide;
 pub mod simd;
 pub mod vectorised;
 pub mod weight_grad;
+pub mod winograd;
 
 use plane::Plane;
 

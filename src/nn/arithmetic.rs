@@ -12,7 +12,7 @@ use crate::kernels::{
     layout::from_blocked_shuffled,
     narrow::{self, Engine, Format, Operand, Steps},
     simd::Tier,
-    weight_grad,
+    weight_grad, winograd,
 };
 
 /// What the factors of a convolution are rounded to; sums are always f32, or exact.
@@ -81,6 +81,35 @@ impl Arithmetic {
                 let forward = Direction::Forward;
                 Packed::Narrow(narrow::conv::Weights::pack(weights, inputs, *outputs, *geometry, forward, 0))
             }
+        }
+    }
+
+    /// Whether a convolution in f32 of frames of so many columns goes by squares of outputs in training.
+    fn by_squares(&self, width: usize) -> bool {
+        self.precision == Precision::F32 && self.geometry == Geometry::Same(3) && winograd::serves(width)
+    }
+
+    /// [`Arithmetic::forward`] in training, as fast as it can be: other ways to cut a frame round its sums otherwise.
+    pub(super) fn forward_taped(
+        &self,
+        sources: &[&Data],
+        weights: &Packed,
+        bias: &[Block],
+        relu: bool,
+        shape: Shape,
+    ) -> Data {
+        match weights {
+            Packed::F32(weights) if self.by_squares(shape.w) => {
+                let mut output = Buffer::new(shape);
+                let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
+                let planes = views.iter().map(|v| v.shape.planes()).sum();
+                let epilogue = Epilogue { relu, accumulate: false };
+                let tier = Tier::detect();
+                let weights = winograd::transform(tier, weights, planes);
+                winograd::convolve(tier, &views, &weights, bias, epilogue, output.view_mut());
+                Data::F32(output)
+            }
+            _ => self.forward(sources, weights, bias, relu, (shape, None)),
         }
     }
 
@@ -204,7 +233,13 @@ impl Arithmetic {
                     let mut packed =
                         vec![Block::default(); conv::packed_len(&[*outputs], inputs[index], *geometry)];
                     conv::pack(weights, inputs, *outputs, *geometry, Direction::Backward, index, &mut packed);
-                    conv::convolve(Tier::detect(), &[gradient], &packed, &zero, back, epilogue, into);
+                    let tier = Tier::detect();
+                    if self.by_squares(gradient.shape.w) {
+                        let weights = winograd::transform(tier, &packed, gradient.shape.planes());
+                        winograd::convolve(tier, &[gradient], &weights, &zero, epilogue, into);
+                    } else {
+                        conv::convolve(tier, &[gradient], &packed, &zero, back, epilogue, into);
+                    }
                 }
                 Some(operand) => {
                     let packed = narrow::conv::Weights::pack(

@@ -78,4 +78,5 @@ pub fn clear() {
     memory::clear();
     crate::kernels::narrow::clear();
     crate::kernels::weight_grad::clear();
+    crate::kernels::winograd::clear();
 }

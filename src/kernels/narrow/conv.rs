@@ -12,13 +12,14 @@ use rayon::prelude::*;
 use super::{
     CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Steps, Sums, Term, WEIGHT_STEPS, WORD,
     Wide,
-    winograd::{self, FITTING_SUM, Part, SIDE, Squares},
+    winograd::{self, FITTING_SUM, Part, Squares},
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{Direction, Epilogue, Geometry, weight_index},
     layout::{Finish, Unpacked},
     simd::{Kernel, Simd, Tier},
+    winograd::SIDE,
 };
 
 /// One tap of one output phase: the phase of the input it reads, its offset there, and its place in the
@@ -179,7 +180,7 @@ impl Weights {
             let mut excess = 0.0;
             for (of_channel, steps) in of_output.chunks_exact_mut(taps).zip(&channels) {
                 of_channel.iter_mut().for_each(|value| *value /= step);
-                phases.iter().for_each(|taps| round(in_16_bits, taps, of_channel));
+                phases.iter().for_each(|taps| round(taps, of_channel));
                 excess += of_channel.iter().sum::<f32>() * f32::from(steps.zero);
             }
             (step, -excess * step)
@@ -281,17 +282,15 @@ fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
-/// Rounds some taps of a channel's weights, which count steps. Where those are coarse, what one tap loses the next makes good, as
-/// neighbouring pixels differ little.
-fn round(in_16_bits: bool, taps: &[Tap], weights: &mut [f32]) {
+/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as neighbouring pixels differ
+/// little.
+fn round(taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
         let wanted = weights[tap.index] + lost;
         let rounded = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
         weights[tap.index] = rounded;
-        if in_16_bits {
-            lost = wanted - rounded;
-        }
+        lost = wanted - rounded;
     }
 }
 

@@ -4,11 +4,11 @@ use std::{fmt, sync::OnceLock};
 
 use half::bf16;
 
-use super::{
-    Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide,
-    winograd::{self, PATCH, SIDE},
+use super::{Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide, winograd::SQUARES};
+use crate::kernels::{
+    conv::Geometry,
+    winograd::{PATCH, SIDE},
 };
-use crate::kernels::conv::Geometry;
 
 /// A way to multiply narrow matrices that this processor has.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -111,7 +111,7 @@ impl Engine {
         false
     }
 
-    /// Whether it has convolutions of 8 bits of a geometry by squares of outputs ([`winograd`]) rather than tap by tap.
+    /// Whether it has convolutions of 8 bits of a geometry by squares of outputs ([`super::winograd`]) rather than tap by tap.
     pub(super) fn prefers_squares(self, geometry: Geometry) -> bool {
         #[cfg(target_arch = "x86_64")]
         return self.0 == Unit::Avx2 && geometry == Geometry::Same(3);
@@ -182,7 +182,7 @@ impl Engine {
         }
     }
 
-    /// 16 channels of 8 bits of the patches of `squares` squares side by side, at the 36 points of [`winograd`]: `patch` is where
+    /// 16 channels of 8 bits of the patches of `squares` squares side by side, at the 36 points of [`super::winograd`]: `patch` is where
     /// each row of the first begins, `points` where the first point of the first square goes. Squares follow one another, and points lie `stride`
     /// squares apart, a [`Wide`] each.
     ///
@@ -210,7 +210,7 @@ impl Engine {
     /// weights are zero.
     ///
     /// # Safety
-    /// Parts, and output planes' products, lie [`winograd::SQUARES`] values apart, and all of them can be read and written.
+    /// Parts, and output planes' products, lie [`SQUARES`] values apart, and all of them can be read and written.
     pub(super) unsafe fn multiply_points(
         self,
         groups: &[u8],
@@ -223,7 +223,7 @@ impl Engine {
         // SAFETY: as in `evaluate`.
         unsafe {
             for o in 0..outputs {
-                let (weights, products) = (weights.add(o * plane), products.add(o * winograd::SQUARES));
+                let (weights, products) = (weights.add(o * plane), products.add(o * SQUARES));
                 #[cfg(target_arch = "x86_64")]
                 if self.0 != Unit::Portable {
                     avx2::multiply_points(groups, points, weights, squares, products);
@@ -351,9 +351,10 @@ fn is_intel() -> bool {
 mod portable {
     use std::num::Wrapping;
 
-    use super::{
-        winograd::{NINTH, POWERS, Ring, SQUARES},
-        *,
+    use super::*;
+    use crate::kernels::{
+        narrow::winograd::NINTH,
+        winograd::{self, POWERS},
     };
 
     pub unsafe fn multiply(
@@ -398,24 +399,6 @@ mod portable {
             }
         }
     }
-
-    macro_rules! ring {
-        ($number:ty) => {
-            impl Ring for Wrapping<$number> {
-                unsafe fn plus(self, other: Self) -> Self {
-                    self + other
-                }
-                unsafe fn minus(self, other: Self) -> Self {
-                    self - other
-                }
-                unsafe fn twice(self) -> Self {
-                    self << 1
-                }
-            }
-        };
-    }
-    ring!(i16);
-    ring!(i32);
 
     pub unsafe fn evaluate(patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
         for (square, lane) in (0..squares).flat_map(|square| (0..LANES).map(move |lane| (square, lane))) {
@@ -548,9 +531,10 @@ mod portable {
 mod avx2 {
     use std::arch::x86_64::*;
 
-    use super::{
-        CHUNK, GROUP, LANES, Sums, Term, WORD, Wide,
-        winograd::{self, NINTH, PATCH, POWERS, Ring, SIDE, SQUARES},
+    use super::{CHUNK, GROUP, LANES, PATCH, SIDE, SQUARES, Sums, Term, WORD, Wide};
+    use crate::kernels::{
+        narrow::winograd::NINTH,
+        winograd::{self, POWERS, Ring},
     };
 
     /// Positions whose sums stay in registers, two for each.

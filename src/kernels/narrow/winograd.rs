@@ -1,113 +1,29 @@
-//! 3x3 convolutions in 8 bits by squares of 4x4 outputs, with a quarter of the multiplications, to the same bits as tap by tap.
+//! 3x3 convolutions in 8 bits by squares of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as tap by tap.
 //!
-//! A square `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a kernel `g`, where `*`
-//! multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin and Gray 2016, F(4x4, 3x3); the
-//! points are 0, 1, -1, 2, -2 and infinity).
-//!
-//! `G` and `A` have fractions, whose rounding would depend on where a square begins. Whole numbers modulo 2^32 do without:
-//! rows of `G` are taken times 24, 6, 6, 24, 24, 6, which leaves weights of 8 bits within 16, and what `A` then makes of sums is 9 x 2^k times the
-//! output. Nine has an inverse modulo 2^32, and a shift takes the rest away. So nothing but an output times 2^k has to fit
-//! into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last row or column may be anything.
+//! Fractions would be rounded, and what comes out would depend on where a square begins. Whole numbers modulo 2^32 do without: weights
+//! at the points take 16 bits, and sums of their products make 9 x 2^k times the output. Nine has an inverse modulo 2^32, and a shift takes the
+//! rest away. So nothing but an output times 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last
+//! row or column may be anything.
+
+use std::num::Wrapping;
 
 use rayon::prelude::*;
 
 use super::{CHUNK, LANES, Sums, WIDE, WORD, Wide, allocate, conv::Band};
-use crate::kernels::simd::{Kernel, Simd};
-
-/// Outputs along a side of a square, inputs along that of its patch, and numbers that stand for either between the two transforms.
-pub const SIDE: usize = 4;
-pub const PATCH: usize = SIDE + 2;
-const POINTS: usize = PATCH * PATCH;
+use crate::kernels::{
+    simd::{Kernel, Simd},
+    winograd::{PATCH, POINTS, SIDE, evaluate_kernel},
+};
 
 /// Squares side by side that are transformed, multiplied and transformed back together: what they need meanwhile stays in the second-level cache.
 pub const SQUARES: usize = 16;
 
-/// What an output is multiplied by in either direction besides 3, as a power of two.
-pub const POWERS: [u32; SIDE] = [3, 2, 1, 1];
-
 /// The inverse of 9 modulo 2^32.
 pub const NINTH: u32 = 0x38e3_8e39;
 
-/// What the weights of an output may add up to at most, in steps, those of either sign for themselves: 2^6 times that times the largest activation
-/// fits into 32 bits.
-pub const FITTING_SUM: f32 = 131_000.0;
-
-/// Numbers that wrap around.
-pub trait Ring: Copy {
-    /// `self + other`.
-    ///
-    /// # Safety
-    /// Here and below: the processor has the instructions of the implementing type.
-    unsafe fn plus(self, other: Self) -> Self;
-    /// `self - other`.
-    ///
-    /// # Safety
-    /// See [`Ring::plus`].
-    unsafe fn minus(self, other: Self) -> Self;
-    /// `2 self`.
-    ///
-    /// # Safety
-    /// See [`Ring::plus`].
-    unsafe fn twice(self) -> Self;
-}
-
-/// `B d`: a line of a patch at the six points.
-///
-/// # Safety
-/// See [`Ring::plus`].
-#[inline(always)]
-pub unsafe fn evaluate<R: Ring>(d: [R; PATCH]) -> [R; PATCH] {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let even = d[4].minus(d[2]);
-        let odd = d[3].minus(d[1]).twice();
-        [
-            d[0].minus(d[2]).twice().twice().plus(even),
-            d[3].plus(d[4]).minus(d[1].plus(d[2]).twice().twice()),
-            d[4].minus(d[3]).plus(d[1].minus(d[2]).twice().twice()),
-            even.plus(odd),
-            even.minus(odd),
-            d[5].minus(d[3]).minus(odd.twice()),
-        ]
-    }
-}
-
-/// `A m`: a line of a square, times 3 x 2^[`POWERS`].
-///
-/// # Safety
-/// See [`Ring::plus`].
-#[inline(always)]
-pub unsafe fn interpolate<R: Ring>(m: [R; PATCH]) -> [R; SIDE] {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let [near_even, near_odd] = [m[1].plus(m[2]), m[1].minus(m[2])];
-        let [far_even, far_odd] = [m[3].plus(m[4]), m[3].minus(m[4])];
-        [
-            m[0].plus(near_even.twice().twice()).plus(far_even),
-            near_odd.twice().plus(far_odd),
-            near_even.plus(far_even),
-            near_odd.plus(far_odd.twice()).plus(m[5]),
-        ]
-    }
-}
-
-/// `G g`: a line of a kernel at the six points, times 24, 6, 6, 24, 24 and 6.
-fn evaluate_weights(g: [i16; 3]) -> [i16; PATCH] {
-    let [even, odd] = [g[0] + g[2], g[1]];
-    let far = g[0] + 4 * g[2];
-    [6 * g[0], -even - odd, odd - even, far + 2 * odd, far - 2 * odd, 6 * g[2]]
-}
-
-/// A kernel at all points, row by row.
-fn evaluate_kernel(kernel: [i16; 9]) -> [i16; POINTS] {
-    let columns: [[i16; PATCH]; 3] =
-        std::array::from_fn(|x| evaluate_weights(std::array::from_fn(|y| kernel[3 * y + x])));
-    let mut points = [0; POINTS];
-    for (y, points) in points.as_chunks_mut::<PATCH>().0.iter_mut().enumerate() {
-        *points = evaluate_weights(std::array::from_fn(|x| columns[x][y]));
-    }
-    points
-}
+/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before rounding them adds one step
+/// to each at most: 2^6 times that times the largest activation fits into 32 bits.
+pub const FITTING_SUM: f32 = 130_000.0;
 
 /// Up to 32 channels of a source, half a [`Wide`] of it, which take all of one between the transforms.
 #[derive(Clone, Copy, Debug)]
@@ -149,8 +65,10 @@ pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i1
         for (p, part) in parts.iter().enumerate() {
             for l in 0..(outputs - plane * LANES).min(LANES) {
                 for i in 0..part.count {
-                    let points = evaluate_kernel(kernel(plane * LANES + l, part.first + i));
-                    for (point, value) in points.into_iter().enumerate() {
+                    let kernel = kernel(plane * LANES + l, part.first + i).map(Wrapping);
+                    // SAFETY: numbers of Rust's own want no instructions.
+                    let points = unsafe { evaluate_kernel(kernel) };
+                    for (point, Wrapping(value)) in points.into_iter().enumerate() {
                         let row = &mut rows[(point * parts.len() + p) * LANES + i / 2];
                         row.0[WORD * l + 2 * (i % 2)..][..2].copy_from_slice(&value.to_ne_bytes());
                     }
