@@ -84,36 +84,8 @@ impl Arithmetic {
         }
     }
 
-    /// Whether a convolution in f32 of frames of so many columns goes by squares of outputs in training.
-    fn by_squares(&self, width: usize) -> bool {
-        self.precision == Precision::F32 && self.geometry == Geometry::Same(3) && winograd::serves(width)
-    }
-
-    /// [`Arithmetic::forward`] in training, as fast as it can be: other ways to cut a frame round its sums otherwise.
-    pub(super) fn forward_taped(
-        &self,
-        sources: &[&Data],
-        weights: &Packed,
-        bias: &[Block],
-        relu: bool,
-        shape: Shape,
-    ) -> Data {
-        match weights {
-            Packed::F32(weights) if self.by_squares(shape.w) => {
-                let mut output = Buffer::new(shape);
-                let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
-                let planes = views.iter().map(|v| v.shape.planes()).sum();
-                let epilogue = Epilogue { relu, accumulate: false };
-                let tier = Tier::detect();
-                let weights = winograd::transform(tier, weights, planes);
-                winograd::convolve(tier, &views, &weights, bias, epilogue, output.view_mut());
-                Data::F32(output)
-            }
-            _ => self.forward(sources, weights, bias, relu, (shape, None)),
-        }
-    }
-
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, rounded to a format or not.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, rounded to a format or not. `taped` is
+    /// for training.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
@@ -121,6 +93,7 @@ impl Arithmetic {
         bias: &[Block],
         relu: bool,
         (shape, format): (Shape, Option<Format>),
+        taped: bool,
     ) -> Data {
         let epilogue = Epilogue { relu, accumulate: false };
         let engine = Engine::detect();
@@ -128,8 +101,8 @@ impl Arithmetic {
             Packed::F32(weights) => {
                 let mut output = Buffer::new(shape);
                 let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
-                let (tier, geometry) = (Tier::detect(), self.geometry);
-                conv::convolve(tier, &views, weights, bias, geometry, epilogue, output.view_mut());
+                let convolve = if taped { convolve_taped } else { conv::convolve };
+                convolve(Tier::detect(), &views, weights, bias, self.geometry, epilogue, output.view_mut());
                 match format {
                     Some(Format::Int8(steps)) => Data::Narrow(Operand::quantize(output.view(), steps)),
                     _ => Data::F32(output),
@@ -165,7 +138,7 @@ impl Arithmetic {
         let mut values = plane_buffer(shape.n * shape.c * shape.h * shape.w);
         match weights {
             Packed::F32(_) => {
-                let blocked = self.forward(sources, weights, bias, false, (shape, None));
+                let blocked = self.forward(sources, weights, bias, false, (shape, None), false);
                 from_blocked_shuffled(blocked.view(), 0, factor, &mut values);
             }
             Packed::Narrow(weights) => {
@@ -233,13 +206,7 @@ impl Arithmetic {
                     let mut packed =
                         vec![Block::default(); conv::packed_len(&[*outputs], inputs[index], *geometry)];
                     conv::pack(weights, inputs, *outputs, *geometry, Direction::Backward, index, &mut packed);
-                    let tier = Tier::detect();
-                    if self.by_squares(gradient.shape.w) {
-                        let weights = winograd::transform(tier, &packed, gradient.shape.planes());
-                        winograd::convolve(tier, &[gradient], &weights, &zero, epilogue, into);
-                    } else {
-                        conv::convolve(tier, &[gradient], &packed, &zero, back, epilogue, into);
-                    }
+                    convolve_taped(Tier::detect(), &[gradient], &packed, &zero, back, epilogue, into);
                 }
                 Some(operand) => {
                     let packed = narrow::conv::Weights::pack(
@@ -255,6 +222,26 @@ impl Arithmetic {
                 }
             }
         }
+    }
+}
+
+/// [`conv::convolve`] in training: by squares of outputs where that is faster, though sums are then rounded otherwise where a frame is
+/// cut otherwise.
+fn convolve_taped(
+    tier: Tier,
+    sources: &[View],
+    weights: &[Block],
+    bias: &[Block],
+    geometry: Geometry,
+    epilogue: Epilogue,
+    output: ViewMut,
+) {
+    if geometry == Geometry::Same(3) && winograd::serves(output.shape.w) {
+        let planes = sources.iter().map(|source| source.shape.planes()).sum();
+        let weights = winograd::transform(tier, weights, planes);
+        winograd::convolve(tier, sources, &weights, bias, epilogue, output);
+    } else {
+        conv::convolve(tier, sources, weights, bias, geometry, epilogue, output);
     }
 }
 

@@ -257,11 +257,8 @@ impl Conv {
             Precision::Bf16 => Some(Format::Bf16),
             Precision::Int8 => Some(Format::Int8(self.steps())),
         };
-        let output = if T::OWNS_TAPE {
-            self.arithmetic.forward_taped(&data, &weights, &bias, self.relu, shape_out)
-        } else {
-            self.arithmetic.forward(&data, &weights, &bias, self.relu, (shape_out, format))
-        };
+        let made = (shape_out, format);
+        let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, made, T::OWNS_TAPE);
 
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();

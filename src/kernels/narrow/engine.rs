@@ -651,45 +651,33 @@ mod avx2 {
     #[derive(Clone, Copy)]
     struct Halves(__m256i);
 
-    impl Ring for Halves {
-        #[inline(always)]
-        unsafe fn plus(self, other: Self) -> Self {
-            // SAFETY: the caller's promise, here and below.
-            unsafe { Self(_mm256_add_epi16(self.0, other.0)) }
-        }
-        #[inline(always)]
-        unsafe fn minus(self, other: Self) -> Self {
-            // SAFETY: as above.
-            unsafe { Self(_mm256_sub_epi16(self.0, other.0)) }
-        }
-        #[inline(always)]
-        unsafe fn twice(self) -> Self {
-            // SAFETY: as above.
-            unsafe { Self(_mm256_add_epi16(self.0, self.0)) }
-        }
-    }
-
     /// 8 of 32 bits.
     #[derive(Clone, Copy)]
     struct Wholes(__m256i);
 
-    impl Ring for Wholes {
-        #[inline(always)]
-        unsafe fn plus(self, other: Self) -> Self {
-            // SAFETY: as above.
-            unsafe { Self(_mm256_add_epi32(self.0, other.0)) }
-        }
-        #[inline(always)]
-        unsafe fn minus(self, other: Self) -> Self {
-            // SAFETY: as above.
-            unsafe { Self(_mm256_sub_epi32(self.0, other.0)) }
-        }
-        #[inline(always)]
-        unsafe fn twice(self) -> Self {
-            // SAFETY: as above.
-            unsafe { Self(_mm256_add_epi32(self.0, self.0)) }
-        }
+    macro_rules! ring {
+        ($numbers:ident, $add:ident, $subtract:ident) => {
+            impl Ring for $numbers {
+                #[inline(always)]
+                unsafe fn plus(self, other: Self) -> Self {
+                    // SAFETY: the caller's promise, here and below.
+                    unsafe { Self($add(self.0, other.0)) }
+                }
+                #[inline(always)]
+                unsafe fn minus(self, other: Self) -> Self {
+                    // SAFETY: as above.
+                    unsafe { Self($subtract(self.0, other.0)) }
+                }
+                #[inline(always)]
+                unsafe fn twice(self) -> Self {
+                    // SAFETY: as above.
+                    unsafe { Self($add(self.0, self.0)) }
+                }
+            }
+        };
     }
+    ring!(Halves, _mm256_add_epi16, _mm256_sub_epi16);
+    ring!(Wholes, _mm256_add_epi32, _mm256_sub_epi32);
 
     #[target_feature(enable = "avx2")]
     pub unsafe fn evaluate(patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
