@@ -27,7 +27,7 @@ use crate::{
         vectorised::{self, CHUNK, Vectorised},
     },
     passes::{Pass, PassSet},
-    planes::{Planes, mirror_beyond, mirrored},
+    planes::Planes,
 };
 
 /// The exponent of the paper's Eq. 4.
@@ -140,11 +140,13 @@ pub fn guide_rows(
     Ok(part)
 }
 
-/// What is made of a frame for a network with a prefilter before the network reads it.
+/// What is made of a frame before a network with a prefilter reads it.
 #[derive(Clone, Debug)]
 pub struct Refined {
     /// The denoised albedo, (3, H, W).
     pub albedo: Planes,
+    /// The denoised normal, (3, H, W), which the network itself does not read.
+    pub normal: Planes,
     /// What normals tell of the light, (1, H, W). See [`Shading`].
     pub shading: Planes,
 }
@@ -152,48 +154,46 @@ pub struct Refined {
 impl Refined {
     /// Grown to (width, height), as [`Planes::padded_to`] does.
     pub fn padded_to(self, size: (usize, usize)) -> Self {
-        Self { albedo: self.albedo.padded_to(size), shading: self.shading.padded_to(size) }
+        let Self { albedo, normal, shading } = self;
+        let [albedo, normal, shading] = [albedo, normal, shading].map(|planes| planes.padded_to(size));
+        Self { albedo, normal, shading }
     }
 }
 
 /// The built-in models' inputs, in this order:
-/// irradiance-like radiance, exposed and divided by albedo (3, H, W); that albedo (3, H, W); the
-/// radiance encoder's input, the logarithm of the first (3, H, W); the guide encoder's, albedo and
-/// camera-space normal (6, H, W). With a `refined` albedo, that is the one meant; the logarithm of what radiance
-/// is divided by over what the noisy albedo would make of that comes next (3, H, W), and its mean over the colours is another
-/// channel of the guide encoder's; the shading is the last (1, H, W). The scale is the inverse of the exposure, that of the
-/// whole frame, of which `passes` may be some rows.
+/// irradiance-like radiance, exposed and divided by the refined albedo (3, H, W); that albedo (3, H, W); the radiance
+/// encoder's input, the logarithm of the first (3, H, W); the guide encoder's, that albedo, the camera-space normal as rendered,
+/// whose noise tells of the radiance's, and the mean over the colours of what comes next (7, H, W): the logarithm of what radiance
+/// is divided by over what the noisy albedo would make of that (3, H, W); the shading (1, H, W); the refined normal, for the refit
+/// (3, H, W). The scale is the inverse of the exposure, that of the whole frame, of which `passes` may be some rows.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guides(passes: &PassSet, refined: Option<Refined>, exposure: f32, needed_by: &str) -> Result<Inputs> {
+pub fn guides(passes: &PassSet, refined: Refined, exposure: f32, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
-    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let noisy_normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+    let Refined { albedo: clean, normal, shading } = refined;
     let unwritten = |channels: usize| Planes::unwritten(channels, passes.width, passes.height);
-    let mut guide = unwritten(if refined.is_some() { 7 } else { 6 });
+    let mut guide = unwritten(7);
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
     let (directions, mean) = rest.split_at_mut(noisy.data.len());
     let [mut albedo, mut irradiance, mut encoded] = [(); 3].map(|()| unwritten(3));
-    let clean = refined.as_ref().map_or(noisy, |refined| &refined.albedo);
     let read = clean.data.par_chunks(CHUNK).zip(radiance.data.par_chunks(CHUNK));
     let written = colours.par_chunks_mut(CHUNK).zip(albedo.data.par_chunks_mut(CHUNK));
     let lit = irradiance.data.par_chunks_mut(CHUNK).zip(encoded.data.par_chunks_mut(CHUNK));
     read.zip(written).zip(lit).for_each(|(((clean, radiance), (colours, albedo)), (irradiance, encoded))| {
         vectorised::run(Divide { clean, radiance, exposure, colours, albedo, irradiance, encoded });
     });
-    map(&normal.data, directions, unit);
-    let further = refined.map(|Refined { albedo: mut ratio, shading }| {
-        let divisors = albedo.data.par_chunks(CHUNK).zip(noisy.data.par_chunks(CHUNK));
-        ratio.data.par_chunks_mut(CHUNK).zip(divisors).for_each(|(ratio, (clean, noisy))| {
-            vectorised::run(Compare { clean, noisy, ratio });
-        });
-        let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
-        mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
-        [ratio, shading]
+    map(&noisy_normal.data, directions, unit);
+    let mut ratio = clean;
+    let divisors = albedo.data.par_chunks(CHUNK).zip(noisy.data.par_chunks(CHUNK));
+    ratio.data.par_chunks_mut(CHUNK).zip(divisors).for_each(|(ratio, (clean, noisy))| {
+        vectorised::run(Compare { clean, noisy, ratio });
     });
-    let planes =
-        [irradiance, albedo, encoded, guide].into_iter().chain(further.into_iter().flatten()).collect();
+    let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
+    mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
+    let planes = vec![irradiance, albedo, encoded, guide, ratio, shading, normal];
     Ok(Inputs { planes, scale: exposure.recip() })
 }
 
@@ -277,35 +277,68 @@ fn divisor(albedo: f32) -> f32 {
     texture(albedo) + ALBEDO_FLOOR
 }
 
-/// Rows of a frame, grown to (width, height) as [`Planes::padded_to`] does, whose albedo stands in the place of radiance, as
-/// bright as radiance is later divided by, lit evenly (its own albedo is 1): what a prefilter denoises.
+/// What a normal is multiplied by among a prefilter's targets: an error of it then counts as much as one of an albedo of
+/// a few tenths, and the less the longer an axis is.
+const NORMAL_SCALE: f32 = 0.1;
+
+/// A prefilter's inputs, each (3, H, W): what radiance would be divided by, exposed; the normal, as much smaller as
+/// [`guide_targets`] has it, exposed alike; the radiance encoder's input, the logarithm of the first; and the guide encoder's, the
+/// normal. The scale is the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn albedo_as_radiance(
-    passes: &PassSet,
-    rows: Range<usize>,
-    size: (usize, usize),
-    needed_by: &str,
-) -> Result<PassSet> {
-    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let lit = Planes::from_rows(3, size, |c, y, row| {
-        let y = rows.start + mirrored(y, rows.len());
-        let albedo = &albedo.channel(c)[y * passes.width..][..passes.width];
-        row.iter_mut().zip(albedo).for_each(|(lit, a)| *lit = divisor(*a));
-        mirror_beyond(row, passes.width);
-    });
-    let white = Planes::from_rows(3, size, |_, _, row| row.fill(1.0));
-    let mut frame = passes.padded_rows(&[Pass::DenoisingNormal], rows, size);
-    frame.insert(Pass::Combined, lit);
-    frame.insert(Pass::DenoisingAlbedo, white);
-    Ok(frame)
+pub fn noisy_guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
+    let targets = guide_targets(passes, needed_by)?;
+    let n = targets.data.len() / 2;
+    let unwritten = || Planes::unwritten(3, passes.width, passes.height);
+    let [mut light, mut normal, mut encoded, mut direction] = [(); 4].map(|()| unwritten());
+    map(&targets.data[..n], &mut light.data, |v| v * exposure);
+    map(&targets.data[n..], &mut normal.data, |v| v * exposure);
+    map(&targets.data[n..], &mut direction.data, |v| v / NORMAL_SCALE);
+    let rows = encoded.data.par_chunks_mut(CHUNK).zip(light.data.par_chunks(CHUNK));
+    rows.for_each(|(encoded, light)| vectorised::run(Encode { light, encoded }));
+    Ok(Inputs { planes: vec![light, normal, encoded, direction], scale: exposure.recip() })
 }
 
-/// The albedo again from what was made of [`albedo_as_radiance`].
-pub fn radiance_as_albedo(mut radiance: Planes) -> Planes {
-    radiance.data.par_iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
-    radiance
+/// Transfers light.
+struct Encode<'a> {
+    light: &'a [f32],
+    encoded: &'a mut [f32],
+}
+
+impl Vectorised for Encode<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let transfer = LogTransfer::new(STEEPNESS);
+        self.encoded.iter_mut().zip(self.light).for_each(|(encoded, light)| *encoded = transfer.of(*light));
+    }
+}
+
+/// What a prefilter is to make of a frame whose guides have little noise: what radiance is divided by, and a tenth of the normal,
+/// (6, H, W).
+///
+/// # Errors
+/// A pass is missing.
+pub fn guide_targets(passes: &PassSet, needed_by: &str) -> Result<Planes> {
+    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+    let mut targets = Planes::unwritten(6, passes.width, passes.height);
+    let (light, direction) = targets.data.split_at_mut(albedo.data.len());
+    map(&albedo.data, light, divisor);
+    map(&normal.data, direction, |axis| unit(axis) * NORMAL_SCALE);
+    Ok(targets)
+}
+
+/// The normal again from what a prefilter made of it.
+pub fn normal_of_target(mut normal: Planes) -> Planes {
+    normal.data.par_iter_mut().for_each(|v| *v = unit(*v / NORMAL_SCALE));
+    normal
+}
+
+/// The albedo again from what a prefilter made of it.
+pub fn albedo_of_target(mut albedo: Planes) -> Planes {
+    albedo.data.par_iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
+    albedo
 }
 
 /// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
@@ -314,7 +347,7 @@ pub fn exposure(radiance: &Planes) -> f32 {
     log_average_exposure(radiance, |v| v.max(0.0))
 }
 
-/// [`exposure`] of the radiance in [`albedo_as_radiance`].
+/// [`exposure`] of what [`guide_targets`] makes of an albedo.
 pub fn albedo_exposure(albedo: &Planes) -> f32 {
     log_average_exposure(albedo, divisor)
 }

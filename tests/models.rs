@@ -95,7 +95,9 @@ fn every_network_takes_every_size_from_one_pixel_up() {
         let network = models::build(&config, 1);
         for (width, height) in [(1, 1), (3, 1), (1, 7), (33, 17)] {
             let image = network.infer(&random_passes(width, height, 4), None).expect("all passes are there");
-            assert_eq!((image.channels, image.width, image.height), (3, width, height), "{name}");
+            // A prefilter denoises albedo and normal.
+            let channels = if name == "prefilter" { 6 } else { 3 };
+            assert_eq!((image.channels, image.width, image.height), (channels, width, height), "{name}");
             assert_eq!(image.non_finite(), 0, "{name} at {width}x{height}");
         }
     }
@@ -122,10 +124,11 @@ fn tiles_give_the_same_bits_as_the_whole_frame() {
 
 #[test]
 fn bands_give_the_same_bits_as_the_whole_frame() {
-    let plain = Config { prefilter: vec![], widths: vec![40, 20, 33, 8], ..trainable("demc-s") };
-    let prefiltered = Config { prefilter: vec![9, 16, 8, 8], ..plain.clone() };
+    let widths = vec![40, 20, 33, 8];
+    let prefilter = Config { widths: widths.clone(), ..trainable("prefilter") };
+    let prefiltered = Config { prefilter: vec![9, 16, 8, 8], widths, ..trainable("demc-s") };
     // What a refit sees ends where the frame does, and not where a network's padding does.
-    for (config, (width, height)) in [(plain, (70, 731)), (prefiltered, (80, 736))] {
+    for (config, (width, height)) in [(prefilter, (70, 731)), (prefiltered, (80, 736))] {
         let passes = random_passes(width, height, 12);
         let mut network = models::build(&config, 3);
         for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
@@ -140,7 +143,8 @@ fn bands_give_the_same_bits_as_the_whole_frame() {
             let inputs = network.inputs(&passes).expect("all passes are there").padded(network.multiple());
             let (w, h) = (inputs.planes[0].width, inputs.planes[0].height);
             let whole = network.forward(&stack(std::slice::from_ref(&inputs)), &mut Stats::Running).as_vec();
-            let mut whole = Planes::from_vec(3, w, h, whole).window((0, 0), (width, height));
+            let channels = whole.len() / (w * h);
+            let mut whole = Planes::from_vec(channels, w, h, whole).window((0, 0), (width, height));
             whole.data.iter_mut().for_each(|v| *v *= inputs.scale);
             network.freeze();
             for rows in [Some(1), Some(48), Some(300), None] {
@@ -153,34 +157,41 @@ fn bands_give_the_same_bits_as_the_whole_frame() {
 
 #[test]
 fn a_prefilter_does_what_its_network_does_alone() {
-    let own = Config { prefilter: vec![], widths: vec![9, 16, 8, 8], ..trainable("demc-s") };
-    let config = Config { widths: vec![8, 20, 8, 8], prefilter: own.widths.clone(), ..own.clone() };
+    let own = Config { widths: vec![9, 16, 8, 8], ..trainable("prefilter") };
+    let config = Config { widths: vec![8, 20, 8, 8], prefilter: own.widths.clone(), ..trainable("demc-s") };
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let mut alone = models::build(&own, 5);
-    weights_file::write(&path("albedo.safetensors"), &mut *alone, &facts()).unwrap();
-    assert_eq!(weights_file::prefilter_widths(&path("albedo.safetensors")).unwrap(), own.widths);
+    weights_file::write(&path("guides.safetensors"), &mut *alone, &facts()).unwrap();
+    assert_eq!(weights_file::prefilter_widths(&path("guides.safetensors")).unwrap(), own.widths);
     let mut network = models::build(&config, 6);
     let set = |network: &mut dyn Network, file: &str| {
         weights_file::set_prefilter(network, &std::fs::read(path(file)).unwrap(), &path(file))
     };
-    set(&mut *network, "albedo.safetensors").unwrap();
+    set(&mut *network, "guides.safetensors").unwrap();
     assert!(network.params().iter().all(|p| p.trainable != p.name.starts_with("prefilter.")));
 
     let passes = random_passes(50, 90, 4);
-    let lit =
-        features::albedo_as_radiance(&passes, 0..passes.height, (passes.width, passes.height), "the test")
-            .unwrap();
-    let clean = features::radiance_as_albedo(alone.infer(&lit, None).unwrap());
+    let guides = alone.infer(&passes, None).unwrap();
+    let (light, direction) = guides.data.split_at(guides.data.len() / 2);
+    let [light, direction] =
+        [light, direction].map(|half| Planes::from_vec(3, passes.width, passes.height, half.to_vec()));
+    let (clean, straight) = (features::albedo_of_target(light), features::normal_of_target(direction));
     assert_ne!(Some(&clean), passes.get(Pass::DenoisingAlbedo));
+    assert_ne!(Some(&straight), passes.get(Pass::DenoisingNormal));
     assert!(clean.data.iter().all(|a| (0.0..=1.0).contains(a)));
     let Inputs { planes, scale } = network.inputs(&passes).unwrap();
-    let [irradiance, albedo, _, _, ratio, shading] = &planes[..] else { panic!("{} inputs", planes.len()) };
+    let [irradiance, albedo, _, _, ratio, shading, normal] = &planes[..] else {
+        panic!("{} inputs", planes.len())
+    };
     let fit = Shading::of(&passes, scale.recip(), "the test").unwrap();
     assert_eq!(*shading, fit.rows(&passes, 0..passes.height, "the test").unwrap());
     // The file holds halves of what the network alone holds.
     for (a, b) in albedo.data.iter().zip(&clean.data) {
         assert!((a - (b + 0.05)).abs() <= 2e-3, "{a} of {b}");
+    }
+    for (a, b) in normal.data.iter().zip(&straight.data) {
+        assert!((a - b).abs() <= 1e-2, "{a} of {b}");
     }
     // What is divided by the clean albedo, and what that would be divided by the noisy one.
     let [radiance, noisy] =
@@ -200,8 +211,8 @@ fn a_prefilter_does_what_its_network_does_alone() {
         assert!(a.values().iter().zip(b.values()).all(|(a, b)| (a - b).abs() < 1e-3), "{}", a.name);
     }
     let mut wider = models::build(&Config { prefilter: vec![9, 16, 8, 16], ..config }, 7);
-    let error = set(&mut *wider, "albedo.safetensors").unwrap_err().to_string();
-    assert!(error.contains("albedo.safetensors") && error.contains("of shape"), "{error}");
+    let error = set(&mut *wider, "guides.safetensors").unwrap_err().to_string();
+    assert!(error.contains("guides.safetensors") && error.contains("of shape"), "{error}");
 }
 
 #[test]
@@ -326,7 +337,7 @@ fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-m").expect("it is trainable").1;
     let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
-    assert_eq!(planes.len(), 6);
+    assert_eq!(planes.len(), 7);
     // The gains of four pixels follow their kernels, confidences, masks and corners.
     const GAINS: std::ops::Range<usize> = 60..72;
     for (logit, gain) in [(0.0, 1.0), (-50.0, (-2.0f32).exp()), (50.0, 2.0f32.exp())] {
@@ -369,7 +380,7 @@ fn facts() -> Facts {
 
 #[test]
 fn a_wider_network_begins_as_the_narrower_one() {
-    let config = |widths: [usize; 4]| Config::new(Architecture::Pyramid, &widths);
+    let config = |widths: [usize; 4]| Config::new(Architecture::Prefilter, &widths);
     let (narrow, wide) = (config([3, 5, 4, 6]), config([4, 5, 9, 17]));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("narrow.safetensors");

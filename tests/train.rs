@@ -288,3 +288,53 @@ fn a_method_without_weights_says_how_to_get_them() {
     denoise.args(["denoise", &input, "--out", "/nonexistent", "--model", "kpcn-combined"]);
     run(&mut denoise).code(2).stderr(predicate::str::contains("demc train --model kpcn-combined"));
 }
+
+#[test]
+fn a_prefilter_learns_from_references_that_keep_their_guides_and_serves_other_networks() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("prefilter");
+    let says = predicate::str::contains;
+    run(&mut train_with("prefilter", "64", &dir.path().join("refused"), 4))
+        .code(1)
+        .stderr(says("s0000_room_ref.exr").and(says("Denoising Albedo")));
+
+    // The frames themselves hold both guides: what is learned from them is to change nothing.
+    let pairs = ["s0000_room", "s0010_outdoor"].map(|scene| {
+        let folder = dir.path().join(scene);
+        fs::create_dir(&folder).expect("a folder");
+        let frame = format!("{}/tests/data/{scene}_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+        for name in ["0004spp", "ref"] {
+            fs::copy(&frame, folder.join(format!("{scene}_{name}.exr"))).expect("a copy");
+        }
+        folder
+    });
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args([
+        "train",
+        "--model",
+        "prefilter",
+        "--widths",
+        "8,8,8,8",
+        "--loss",
+        "geomean",
+        "--optimizer",
+        "muon",
+    ]);
+    command.args(["--batch", "2", "--patch", "64", "--steps", "60", "--every", "30", "--lr", "1e-2:1e-3"]);
+    command.arg("--data").arg(&pairs[0]).arg("--val").arg(&pairs[1]).arg("--out").arg(&out);
+    run(&mut command).success();
+    let rows = log(&out);
+    let error =
+        |row: usize| rows[row].split(',').nth(3).and_then(|cell| cell.parse::<f64>().ok()).expect("RelMSE");
+    assert!(error(2) < 0.8 * error(1), "{rows:?}");
+
+    let weights = out.join("best.safetensors");
+    let network = dir.path().join("network");
+    run(train(&network, 4).arg("--prefilter").arg(&weights)).success();
+    let config = weights_file::config(&network.join("best.safetensors")).expect("weights");
+    assert_eq!(config.prefilter, [8; 4]);
+    let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
+    let mut denoise = Command::new(cargo_bin("demc"));
+    denoise.args(["denoise", &input, "--model"]).arg(&weights).arg("--out").arg(dir.path().join("images"));
+    run(&mut denoise).failure().stderr(says("best.safetensors").and(says("--prefilter")));
+}

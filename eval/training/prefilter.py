@@ -13,7 +13,7 @@ def main():
     """Entry point of the script."""
     source, target = sys.argv[1:]
     facts, tensors = weights.read(source)
-    facts["network"]["widths"] = facts["network"].pop("prefilter")
+    facts["network"] = {"architecture": "prefilter", "widths": facts["network"]["prefilter"]}
     facts.pop("ranges", None)
     own = {name.removeprefix(PREFILTER): tensor for name, tensor in tensors.items() if name.startswith(PREFILTER)}
     weights.write(target, facts, own)

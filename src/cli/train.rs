@@ -84,9 +84,9 @@ pub struct Args {
     /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
-    /// Weights that denoise the albedo first: a file of `demc train` on albedo in the place of radiance
-    /// (eval/training/albedo_pairs.py), or of a network with a prefilter, or none; without it the built-in ones
-    #[arg(long, value_name = "FILE|none")]
+    /// Weights that denoise albedo and normal first: a file of `demc train --model prefilter`, or of a network that has a
+    /// prefilter; without it those of --init, or the built-in ones
+    #[arg(long)]
     prefilter: Option<PathBuf>,
     /// Go on from the run folder's checkpoint, with its config.json
     #[arg(long)]
@@ -95,9 +95,6 @@ pub struct Args {
     #[arg(long)]
     threads: Option<usize>,
 }
-
-/// What stands for no prefilter at all.
-const NO_PREFILTER: &str = "none";
 
 /// One scene in this many is held out for validation.
 const HOLD_OUT: u64 = 10;
@@ -181,11 +178,8 @@ impl Args {
         if let Some(widths) = &self.widths {
             network.widths = models::widths(network.architecture, widths);
         }
-        let prefilter = self.prefilter.clone().filter(|path| path != Path::new(NO_PREFILTER));
-        match &prefilter {
-            Some(path) => network.prefilter = weights_file::prefilter_widths(path)?,
-            None if self.prefilter.is_some() => network.prefilter.clear(),
-            None => {}
+        if let Some(path) = &self.prefilter {
+            network.prefilter = weights_file::prefilter_widths(path)?;
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
         let multiple = models::build(&network, 0).multiple();
@@ -251,7 +245,7 @@ impl Args {
             every: self.every,
             seed: self.seed,
             init: self.init.clone(),
-            prefilter,
+            prefilter: self.prefilter.clone(),
         })
     }
 }

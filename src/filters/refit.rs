@@ -1,8 +1,8 @@
 //! What guides and samples still tell of a frame that a network has denoised.
 //!
 //! A network blurs some of the texture that the albedo did not account for, and leaves blotches on even walls. Both show
-//! against the guides: around every pixel, two planes are fitted over the axes of the normal and the logarithms of the clean
-//! albedo. One is fitted to the noisy radiance over the denoised, whose hundreds of samples tell what slopes were missed, as
+//! against the guides: around every pixel, two planes are fitted over the axes of the normal and the logarithms of the
+//! albedo, both clean. One is fitted to the noisy radiance over the denoised, whose hundreds of samples tell what slopes were missed, as
 //! regression over features does (Bitterli et al. 2016). The other is fitted to the logarithm of what was denoised, which gives way
 //! to it where it varies little besides: a guided filter (He et al. 2013) that has its own image for a guide as well.
 
@@ -44,10 +44,10 @@ const MOMENTS: usize = KNOWN * (KNOWN + 1) / 2 + TARGETS * (KNOWN + 1);
 const KEPT: usize = KNOWN + 1;
 
 /// Added to the variances of an axis and of a logarithm: how much of a guide is noise, or too little to tell of anything.
-const GUIDE_NOISE: [f32; GUIDES] = [3e-5, 3e-5, 3e-5, 2e-4, 2e-4, 2e-4];
+const GUIDE_NOISE: [f32; GUIDES] = [1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4];
 
 /// Deviation of the slopes that are there to be found in the samples: those that noise alone may explain shrink below it.
-const SLOPE: f32 = 0.35;
+const SLOPE: f32 = 0.5;
 
 /// Deviation of the blotches that a network leaves: what varies less beside the guides gives way to them.
 const BLOTCHES: f32 = 0.09;
@@ -82,7 +82,7 @@ const LEAST_LEVEL: f32 = 0.3;
 pub struct Guides<'a> {
     /// Columns and rows.
     pub size: (usize, usize),
-    /// Axes of the normal, (3, H, W).
+    /// Axes of the normal without its noise, and as many rows of it as of the albedo, (3, R, W).
     pub normal: &'a [f32],
     /// What radiance is divided by, the albedo without its noise: rows from `first` on, as many as there are, (3, R, W).
     pub albedo: &'a [f32],
@@ -100,18 +100,18 @@ pub enum Samples<'a> {
 }
 
 impl Guides<'_> {
-    /// Row `y` of three planes.
+    /// Row `y` of three planes of all rows.
     #[inline(always)]
     fn row<'p>(&self, planes: &'p [f32], y: usize) -> [&'p [f32]; 3] {
         let (width, height) = self.size;
         [0, 1, 2].map(|c| &planes[(c * height + y) * width..][..width])
     }
 
-    /// Row `y` of the albedo.
+    /// Row `y` of a guide.
     #[inline(always)]
-    fn albedo_row(&self, y: usize) -> [&[f32]; 3] {
-        let (width, plane) = (self.size.0, self.albedo.len() / 3);
-        [0, 1, 2].map(|c| &self.albedo[c * plane + (y - self.first) * width..][..width])
+    fn guide_row<'p>(&self, guide: &'p [f32], y: usize) -> [&'p [f32]; 3] {
+        let (width, plane) = (self.size.0, guide.len() / 3);
+        [0, 1, 2].map(|c| &guide[c * plane + (y - self.first) * width..][..width])
     }
 }
 
@@ -275,33 +275,20 @@ impl Pixels {
             weight: line(1, 0.0),
             light: line(1, 0.0),
             albedo: line(3, 1.0),
-            spare: line(2, 0.0),
+            spare: line(1, 0.0),
         }
     }
 
     /// Reads what is known of row `y`: how much its pixels count, their guides, and the logarithm of what is denoised, the first
-    /// target. A normal is the mean of the 3x3 around a pixel: at 4 samples its noise would show.
+    /// target.
     #[inline(always)]
     fn read(&mut self, guides: Guides, image: [&[f32]; 3], y: usize) {
         let len = SQUARE * self.squares;
         let width = guides.size.0;
-        let near = [y.saturating_sub(1), y, (y + 1).min(guides.size.1 - 1)];
-        let [above, row, below] = near.map(|y| guides.row(guides.normal, y));
-        let (column, mean) = self.spare.split_at_mut(len);
-        let (column, mean) = (&mut column[..width], &mut mean[..width]);
-        for c in 0..3 {
-            let read = row[c].iter().zip(above[c].iter().zip(below[c]));
-            for (v, (row, (above, below))) in column.iter_mut().zip(read) {
-                *v = 0.25 * (unit(*above) + unit(*below)) + 0.5 * unit(*row);
-            }
-            mean[0] = 0.75 * column[0] + 0.25 * column[1.min(width - 1)];
-            mean[width - 1] = 0.75 * column[width - 1] + 0.25 * column[width.saturating_sub(2)];
-            for (mean, near) in mean.iter_mut().skip(1).zip(column.windows(3)) {
-                *mean = 0.25 * (near[0] + near[2]) + 0.5 * near[1];
-            }
-            part(mean, self.squares, &mut self.known[(1 + c) * len..][..len]);
+        for (c, row) in guides.guide_row(guides.normal, y).into_iter().enumerate() {
+            part(row, self.squares, &mut self.known[(1 + c) * len..][..len]);
         }
-        for (c, row) in guides.albedo_row(y).into_iter().enumerate() {
+        for (c, row) in guides.guide_row(guides.albedo, y).into_iter().enumerate() {
             let albedo = &mut self.albedo[c * len..][..len];
             part(row, self.squares, albedo);
             let logarithms = &mut self.known[(4 + c) * len..][..len];
@@ -351,12 +338,6 @@ impl Pixels {
             *target = ((*target * (1.0 / 3.0) + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
         }
     }
-}
-
-/// An axis of a normal, which is no longer than 1.
-#[inline(always)]
-fn unit(axis: f32) -> f32 {
-    axis.clamp(-1.0, 1.0)
 }
 
 /// Parts a row of pixels as [`Pixels`] has them. What lies beyond the row keeps its value.
@@ -739,13 +720,13 @@ mod tests {
         for step in [1, 7, 16] {
             let (mut image, mut refit) = (frame.image.clone(), Refit::new(SIZE));
             for rows in (0..SIZE.1).step_by(step).map(|y| (y + step).min(SIZE.1)) {
-                // Only the albedo of rows that are under way is there.
+                // Only guides of rows that are under way are there.
                 let first = refit.done();
-                let part: Vec<f32> = (0..3)
-                    .flat_map(|c| &frame.albedo[c * PIXELS + first * SIZE.0..c * PIXELS + rows * SIZE.0])
-                    .copied()
-                    .collect();
-                let guides = Guides { albedo: &part, first, ..frame.guides() };
+                let [normal, albedo] = [&frame.normal, &frame.albedo].map(|guide| -> Vec<f32> {
+                    let rows = |c: usize| c * PIXELS + first * SIZE.0..c * PIXELS + rows * SIZE.0;
+                    (0..3).flat_map(|c| &guide[rows(c)]).copied().collect()
+                });
+                let guides = Guides { size: SIZE, normal: &normal, albedo: &albedo, first };
                 let samples = Samples::Rendered(&frame.samples, 1.5);
                 refit.advance(guides, &mut image, samples, rows, |v, factor| *v *= factor);
                 assert!(refit.moments.1.len() <= 4 + step.div_ceil(SQUARE), "{}", refit.moments.1.len());

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{
     Denoiser,
-    network::Network,
+    network::{Architecture, Network},
     weights_file::{self, Metadata},
 };
 use crate::{
@@ -63,6 +63,12 @@ impl Learned {
     /// See [`weights_file::read`].
     pub fn from_file(path: &Path) -> Result<Self> {
         let (network, metadata) = weights_file::read(path)?;
+        if metadata.network.architecture == Architecture::Prefilter {
+            return Err(Error::invalid(
+                path,
+                "denoises albedo and normal for other networks, not radiance; give it to `demc train --prefilter`",
+            ));
+        }
         Ok(Self { name: path.display().to_string(), network, turned: false, metadata })
     }
 

@@ -145,20 +145,22 @@ pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
     }
 }
 
-/// Widths of the built-in models' prefilter.
-const PREFILTER: [usize; pyramid::LEVELS] = [16, 24, 32, 40];
+/// Widths of the prefilters of `demc-s` and `demc-m`.
+const SMALL_PREFILTER: [usize; pyramid::LEVELS] = [16, 24, 32, 40];
+const PREFILTER: [usize; pyramid::LEVELS] = [32, 48, 48, 48];
 
 /// Names of the networks that can be trained, and the configuration each begins with.
 pub fn trainable() -> Vec<(&'static str, Config)> {
     let paper = |architecture| Config::new(architecture, &widths(architecture, &PAPER_NARROW));
-    let pyramid = |widths: [usize; pyramid::LEVELS]| Config {
-        prefilter: PREFILTER.into(),
+    let pyramid = |widths: [usize; pyramid::LEVELS], prefilter: [usize; pyramid::LEVELS]| Config {
+        prefilter: prefilter.into(),
         ..Config::new(Architecture::Pyramid, &widths)
     };
     let kpcn = |architecture| Config::new(architecture, &[32]);
     vec![
-        ("demc-s", pyramid([16, 48, 64, 64])),
-        ("demc-m", pyramid([80, 96, 96, 112])),
+        ("demc-s", pyramid([16, 48, 64, 64], SMALL_PREFILTER)),
+        ("demc-m", pyramid([80, 96, 96, 112], PREFILTER)),
+        ("prefilter", Config::new(Architecture::Prefilter, &PREFILTER)),
         ("demc", paper(Architecture::Demc)),
         ("demc-nofusion", paper(Architecture::DemcNofusion)),
         ("semc", paper(Architecture::Semc)),
@@ -168,10 +170,12 @@ pub fn trainable() -> Vec<(&'static str, Config)> {
     ]
 }
 
-/// Those that come without weights.
+/// Those that come without weights; a prefilter is no method by itself.
 pub fn untrained() -> impl Iterator<Item = (&'static str, Config)> {
     let is_built_in = |name| learned::BUILT_IN.iter().any(|(built_in, _)| *built_in == name);
-    trainable().into_iter().filter(move |(name, _)| !is_built_in(*name))
+    let methods =
+        trainable().into_iter().filter(|(_, config)| config.architecture != Architecture::Prefilter);
+    methods.filter(move |(name, _)| !is_built_in(*name))
 }
 
 /// Whether a configuration describes a network that [`build`] can make.
@@ -180,17 +184,19 @@ pub fn untrained() -> impl Iterator<Item = (&'static str, Config)> {
 /// Says what is wrong with it.
 pub fn check(config: &Config) -> Result<(), String> {
     let levels = match config.architecture {
-        Architecture::Pyramid => pyramid::LEVELS,
+        Architecture::Pyramid | Architecture::Prefilter => pyramid::LEVELS,
         Architecture::Kpcn | Architecture::KpcnCombined | Architecture::Lbf => 1,
         Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => demc::PAPER_WIDTHS.len(),
     };
     if config.widths.len() != levels {
         return Err(format!("{} widths, but the network takes {levels}", config.widths.len()));
     }
-    if !config.prefilter.is_empty()
-        && (config.architecture != Architecture::Pyramid || config.prefilter.len() != levels)
-    {
-        return Err("only built-in networks have a prefilter, of as many widths".into());
+    let of_prefilter = if config.architecture == Architecture::Pyramid { levels } else { 0 };
+    if config.prefilter.len() != of_prefilter {
+        return Err(format!(
+            "a prefilter of {} widths, but the network takes {of_prefilter}",
+            config.prefilter.len()
+        ));
     }
     if let Some(width) = config.widths.iter().chain(&config.prefilter).find(|w| !(1..=4096).contains(*w)) {
         return Err(format!("width {width} is out of range; use 1 to 4096"));
@@ -207,7 +213,7 @@ pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
         Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => {
             Box::new(demc::Demc::new(config.architecture, &config.widths, seed))
         }
-        Architecture::Pyramid => Box::new(pyramid::Pyramid::new(config, seed)),
+        Architecture::Pyramid | Architecture::Prefilter => Box::new(pyramid::Pyramid::new(config, seed)),
         Architecture::Kpcn | Architecture::KpcnCombined => Box::new(kpcn::Kpcn::new(config, seed)),
         Architecture::Lbf => Box::new(lbf::Lbf::new(config, seed)),
     }

@@ -22,7 +22,7 @@ pub struct Config {
     pub architecture: Architecture,
     /// Channels at each level, finest first.
     pub widths: Vec<usize>,
-    /// Those of a built-in network's prefilter, which denoises the albedo first; none where it has none.
+    /// Those of a built-in network's prefilter, which denoises albedo and normal first; other networks have none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub prefilter: Vec<usize>,
 }
@@ -57,6 +57,8 @@ pub enum Architecture {
     Semc,
     /// The built-in kernel-predicting dual encoder.
     Pyramid,
+    /// The same design, which denoises albedo and normal for it.
+    Prefilter,
     /// KPCN with its two streams, diffuse and specular.
     Kpcn,
     /// KPCN with a single stream over Combined.
@@ -116,6 +118,19 @@ pub trait Network: Send + Sync {
 
     /// Rows and columns must be multiples of this.
     fn multiple(&self) -> usize;
+
+    /// The passes of a reference that [`Network::target`] takes.
+    fn targets(&self) -> &'static [Pass] {
+        &[Pass::Combined]
+    }
+
+    /// What it should make of a frame, by its reference: radiance, (3, H, W).
+    ///
+    /// # Errors
+    /// A pass is missing.
+    fn target(&self, reference: &PassSet) -> Result<Planes> {
+        Ok(reference.require(Pass::Combined, "training")?.clone())
+    }
 
     /// Its inputs from a frame's passes.
     ///

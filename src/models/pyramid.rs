@@ -12,25 +12,24 @@
 //! that they average. So each colour of each pixel gets a bounded gain last, which scales with the input as well.
 //!
 //! Noise in the albedo (depth of field, 4 spp edges) is removed before: the built-in networks read it from a
-//! prefilter, a small network of the same kind, which was trained to denoise albedo in the place of radiance and is not
-//! trained any further. The samples that made an albedo noisy made the radiance noisy alike, though, and their quotient
-//! is free of that noise: so each pixel says how far it is to be divided by the noisy albedo, not by the clean one.
+//! prefilter, a small network of the same kind, which was trained by itself and is not trained any further. Its kernels filter
+//! the normal alike, for the [refit](crate::filters::refit) that comes last. The samples that made an albedo noisy made the
+//! radiance noisy alike, though, and their quotient is free of that noise: so each pixel says how far it is to be divided by the
+//! noisy albedo, not by the clean one. Normals are read as noisy as they are for the same reason.
 //!
 //! What normals alone show, such as a moulding, is often thinner than any kernel that is wide enough to average its noise. A fit
 //! of light over normals ([`Shading`]) finds it; each pixel says how far its gain is to follow that.
 
 mod bands;
 
-use std::ops::Range;
-
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Batch, Config, Network, Stacked, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, duplicate};
 use crate::{
     Result,
     features::{
-        GUIDE_PASSES, Inputs, Refined, Shading, albedo_as_radiance, exposure, guide_rows, guides,
-        radiance_as_albedo,
+        GUIDE_PASSES, Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows,
+        guide_targets, guides, noisy_guides, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{blend::CORNERS, memory::PlaneBuffer, narrow::Steps},
@@ -46,8 +45,8 @@ pub const LEVELS: usize = 4;
 const KERNEL: usize = 5;
 const FULL_KERNEL: usize = 3;
 
-/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where there is a
-/// prefilter, which albedo to divide by, and how far to follow the shading.
+/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, but for a prefilter, which
+/// albedo to divide by, and how far to follow the shading.
 const GAINS: usize = 3;
 const DIVISOR: usize = 1;
 const SHADE: usize = 1;
@@ -61,6 +60,9 @@ const HEAD_GAIN: f32 = 0.3;
 /// What the names of a prefilter's layers begin with.
 pub const PREFILTER: &str = "prefilter.";
 
+/// The passes that a prefilter denoises.
+const PREFILTERED_PASSES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+
 /// Who asks for passes, in messages.
 const NEEDED_BY: &str = "this model";
 
@@ -68,17 +70,17 @@ const NEEDED_BY: &str = "this model";
 /// beyond which brightness decides on no kernel; and all that albedo and normals are.
 const INPUT_STEPS: [Steps; 2] = [Steps::to(3.0), Steps::within(1.0)];
 
-/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth; and what the latter has
-/// besides where there is a prefilter.
+/// Channels of the radiance encoder's and of the guide encoder's input, before space to depth: albedo, normal, and how noisy the
+/// albedo was; and of a prefilter's, the normal alone.
 const RADIANCE_CHANNELS: usize = 3;
-const GUIDE_CHANNELS: usize = 6;
-const RATIO_CHANNELS: usize = 1;
+const GUIDE_CHANNELS: usize = 7;
+const NORMAL_CHANNELS: usize = 3;
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]
 pub struct Pyramid {
     config: Config,
-    /// Denoises the albedo.
+    /// Denoises albedo and normal; itself it has none.
     prefilter: Option<Box<Pyramid>>,
     encoders: [Encoder; 2],
     /// Coarsest level first.
@@ -131,12 +133,19 @@ struct Prediction<T> {
 struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     gain: Field<T>,
-    /// Where there is a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading is
+    /// But for a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading is
     /// multiplied by before it is added to all gains' logits, both (N, 1, H, W).
     refined: Option<(Field<T>, Field<T>)>,
 }
 
-impl<T> Prediction<T> {
+impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
+    /// The same once more, with empty tapes.
+    fn fork(&self) -> Self {
+        let Self { kernel, confidence, mask, corners } = self;
+        let [kernel, confidence, mask, corners] = [kernel, confidence, mask, corners].map(Field::fork);
+        Self { kernel, confidence, mask, corners }
+    }
+
     /// Parts what a level's head says, k x k kernels first: `planes(first, count)` are some of its planes.
     fn split(k: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> Self {
         let taps = k * k;
@@ -208,8 +217,8 @@ impl Pyramid {
     pub fn new(config: &Config, seed: u64) -> Self {
         let rng = &mut Rng::new(seed, 0);
         let mut network = Self::named("", config.clone(), rng);
-        if !config.prefilter.is_empty() {
-            let own = Config::new(config.architecture, &config.prefilter);
+        if !network.denoises_guides() {
+            let own = Config::new(Architecture::Prefilter, &config.prefilter);
             let mut prefilter = Self::named(PREFILTER, own, rng);
             prefilter.params().into_iter().for_each(|param| param.trainable = false);
             network.prefilter = Some(Box::new(prefilter));
@@ -221,13 +230,13 @@ impl Pyramid {
     fn named(prefix: &str, config: Config, rng: &mut Rng) -> Self {
         let widths = &config.widths;
         assert_eq!(widths.len(), LEVELS, "one width a level");
-        let (ratios, finish) = match config.prefilter[..] {
-            [] => (0, GAINS),
-            _ => (RATIO_CHANNELS, GAINS + DIVISOR + SHADE),
+        let (guides, finish) = match config.architecture {
+            Architecture::Prefilter => (NORMAL_CHANNELS, GAINS),
+            _ => (GUIDE_CHANNELS, GAINS + DIVISOR + SHADE),
         };
         let encoders = [
             Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, &format!("{prefix}encoder.guide"), GUIDE_CHANNELS + ratios, widths),
+            Encoder::new(rng, &format!("{prefix}encoder.guide"), guides, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
         let decoder = (0..LEVELS).rev().map(|level| {
@@ -259,32 +268,14 @@ impl Pyramid {
         }
     }
 
-    /// The denoised albedo of a frame, (3, H, W), where there is a prefilter.
-    fn prefiltered(&self, passes: &PassSet) -> Result<Option<Planes>> {
-        let Some(prefilter) = &self.prefilter else { return Ok(None) };
-        let size = (passes.width, passes.height);
-        let lit = albedo_as_radiance(passes, 0..size.1, size, NEEDED_BY)?;
-        let albedo = bands::infer(prefilter, &lit, None)?;
-        Ok(Some(radiance_as_albedo(albedo)))
-    }
-
-    /// Rows of a frame as the network reads them, grown to (width, height). There are no fireflies in an albedo.
-    fn rows(
-        &self,
-        passes: &PassSet,
-        rows: Range<usize>,
-        size: (usize, usize),
-        exposure: f32,
-    ) -> Result<PassSet> {
-        if self.full.name().starts_with(PREFILTER) {
-            return Ok(passes.padded_rows(self.passes(), rows, size));
-        }
-        guide_rows(passes, rows, size, exposure, NEEDED_BY)
+    /// Whether it is a prefilter, which denoises albedo and normal, not radiance.
+    fn denoises_guides(&self) -> bool {
+        self.config.architecture == Architecture::Prefilter
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
-        let [irradiance, albedo, radiance_input, guide_input, refined @ ..] = &batch[..] else {
-            unreachable!("`inputs` makes four planes and, with a prefilter, two more")
+        let [image_input, second, radiance_input, guide_input, refined @ ..] = &batch[..] else {
+            unreachable!("`inputs` makes four planes, and but for a prefilter three more")
         };
         let field =
             |(shape, values): &Stacked| Field::<T>::input((shape.n, shape.c, shape.h, shape.w), values);
@@ -307,48 +298,20 @@ impl Pyramid {
         let count = full.shape().c / 4;
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, Finish { mut gain, refined: predicted }) =
-            Prediction::split_full(count, planes_of(full, 2));
+        let (finest, Finish { gain, refined: predicted }) = Prediction::split_full(count, planes_of(full, 2));
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(|head| Prediction::split(KERNEL, planes_of(head, 1))));
 
-        // The radiance pyramid, finest level first; then, from the coarsest up, each level is blended with what
-        // filtering made of the one below, and filtered.
-        let mut image = field(irradiance);
-        if let ([ratio, shading], Some((divisor, shade))) = (refined, predicted) {
-            image = image.redivide(field(ratio), divisor);
-            gain = gain.plus_product(field(shading), shade);
-        }
-        let mut pyramid = Vec::with_capacity(levels.len());
-        let last = levels.len() - 1;
-        for (level, predicted) in levels.into_iter().enumerate() {
-            let below = (level < last).then(|| image.fork().reduce(predicted.confidence.fork()));
-            pyramid.push((image, predicted));
-            match below {
-                Some(below) => image = below,
-                None => break,
-            }
-        }
-        let mut below: Option<Field<T>> = None;
-        loop {
-            let (noisy, predicted) = pyramid.pop().expect("there are levels");
-            let Prediction { kernel, confidence, mask, corners } = predicted;
-            let blended = match below.take() {
-                None => noisy,
-                // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
-                Some(below) => noisy.blend(below, mask, corners),
-            };
-            let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
-            if pyramid.is_empty() {
-                let image = filtered.product(field(albedo)).amplify(gain);
-                if self.prefilter.is_none() {
-                    return image.into_images();
-                }
-                let factors = factors(image.values(), irradiance, guide_input, albedo);
-                return image.product(field(&factors)).into_images();
-            }
-            below = Some(filtered);
-        }
+        let image = field(image_input);
+        let ([ratio, shading, normal], Some((divisor, shade))) = (refined, predicted) else {
+            let normal = filter_levels(field(second), levels.iter().map(Prediction::fork).collect());
+            return filter_levels(image, levels).amplify(gain).beside(normal).into_images();
+        };
+        let image = image.redivide(field(ratio), divisor);
+        let gain = gain.plus_product(field(shading), shade);
+        let image = filter_levels(image, levels).product(field(second)).amplify(gain);
+        let factors = factors(image.values(), image_input, normal, second);
+        image.product(field(&factors)).into_images()
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.
@@ -367,15 +330,45 @@ impl Pyramid {
     }
 }
 
+/// Filters an image, (N, 3, H, W), by what is predicted for every level of its pyramid, full resolution first: from the coarsest
+/// up, each level is blended with what filtering made of the one below, and filtered.
+fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(mut image: Field<T>, levels: Vec<Prediction<T>>) -> Field<T> {
+    let mut pyramid = Vec::with_capacity(levels.len());
+    let last = levels.len() - 1;
+    for (level, predicted) in levels.into_iter().enumerate() {
+        let below = (level < last).then(|| image.fork().reduce(predicted.confidence.fork()));
+        pyramid.push((image, predicted));
+        match below {
+            Some(below) => image = below,
+            None => break,
+        }
+    }
+    let mut below: Option<Field<T>> = None;
+    loop {
+        let (noisy, predicted) = pyramid.pop().expect("there are levels");
+        let Prediction { kernel, confidence, mask, corners } = predicted;
+        let blended = match below.take() {
+            None => noisy,
+            // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
+            Some(below) => noisy.blend(below, mask, corners),
+        };
+        let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
+        if pyramid.is_empty() {
+            return filtered;
+        }
+        below = Some(filtered);
+    }
+}
+
 /// What a refit multiplies denoised images by, (N, 3, H, W).
-fn factors(image: &[f32], irradiance: &Stacked, guide: &Stacked, albedo: &Stacked) -> Stacked {
+fn factors(image: &[f32], irradiance: &Stacked, normal: &Stacked, albedo: &Stacked) -> Stacked {
     let (shape, pixels) = (irradiance.0, irradiance.0.h * irradiance.0.w);
     let size = (shape.w, shape.h);
     let mut factors = PlaneBuffer::from(image.to_vec());
     for (n, image) in factors.chunks_exact_mut(3 * pixels).enumerate() {
         let of_image = 3 * n * pixels..3 * (n + 1) * pixels;
-        let normal = &guide.1[(n * guide.0.c + 3) * pixels..][..3 * pixels];
-        let guides = Guides { size, normal, albedo: &albedo.1[of_image.clone()], first: 0 };
+        let [normal, albedo] = [normal, albedo].map(|guide| &guide.1[of_image.clone()]);
+        let guides = Guides { size, normal, albedo, first: 0 };
         let samples = Samples::Divided(&irradiance.1[of_image]);
         Refit::new(size).advance(guides, image, samples, shape.h, |value, factor| *value = factor);
     }
@@ -388,7 +381,18 @@ impl Network for Pyramid {
     }
 
     fn passes(&self) -> &'static [Pass] {
-        &GUIDE_PASSES
+        if self.denoises_guides() { &PREFILTERED_PASSES } else { &GUIDE_PASSES }
+    }
+
+    fn targets(&self) -> &'static [Pass] {
+        if self.denoises_guides() { &PREFILTERED_PASSES } else { &[Pass::Combined] }
+    }
+
+    fn target(&self, reference: &PassSet) -> Result<Planes> {
+        if self.denoises_guides() {
+            return guide_targets(reference, NEEDED_BY);
+        }
+        Ok(reference.require(Pass::Combined, NEEDED_BY)?.clone())
     }
 
     fn multiple(&self) -> usize {
@@ -396,17 +400,17 @@ impl Network for Pyramid {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
+        let Some(prefilter) = &self.prefilter else {
+            let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
+            return noisy_guides(passes, exposure, NEEDED_BY);
+        };
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
         let (rows, size) = (0..passes.height, (passes.width, passes.height));
-        let refined = match self.prefiltered(passes)? {
-            Some(albedo) => {
-                let shading =
-                    Shading::of(passes, exposure, NEEDED_BY)?.rows(passes, rows.clone(), NEEDED_BY)?;
-                Some(Refined { albedo, shading })
-            }
-            None => None,
-        };
-        guides(&self.rows(passes, rows, size, exposure)?, refined, exposure, NEEDED_BY)
+        let [albedo, normal] = bands::infer_guides(prefilter, passes, None)?;
+        let (albedo, normal) = (albedo_of_target(albedo), normal_of_target(normal));
+        let shading = Shading::of(passes, exposure, NEEDED_BY)?.rows(passes, rows.clone(), NEEDED_BY)?;
+        let refined = Refined { albedo, normal, shading };
+        guides(&guide_rows(passes, rows, size, exposure, NEEDED_BY)?, refined, exposure, NEEDED_BY)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {
@@ -486,6 +490,13 @@ impl Network for Pyramid {
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        if self.denoises_guides() {
+            let guides = bands::infer_guides(self, passes, tile)?;
+            let rows = |c: usize, y: usize, row: &mut [f32]| {
+                row.copy_from_slice(&guides[c / 3].channel(c % 3)[y * passes.width..][..passes.width]);
+            };
+            return Ok(Planes::from_rows(6, (passes.width, passes.height), rows));
+        }
         bands::infer(self, passes, tile)
     }
 

@@ -137,13 +137,14 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
 /// As [`read`], or it is no network that can prefilter.
 pub fn prefilter_widths(path: &Path) -> Result<Vec<usize>> {
     let Config { architecture, widths, prefilter } = config(path)?;
-    if architecture != Architecture::Pyramid {
-        return Err(Error::invalid(
+    match architecture {
+        Architecture::Prefilter => Ok(widths),
+        Architecture::Pyramid => Ok(prefilter),
+        _ => Err(Error::invalid(
             path,
-            "cannot prefilter; take weights of demc-s or narrower, trained on albedo",
-        ));
+            "cannot prefilter; take weights of `demc train --model prefilter`, or of a network that has one",
+        )),
     }
-    Ok(if prefilter.is_empty() { widths } else { prefilter })
 }
 
 /// Gives a network the prefilter that the bytes of a weights file hold; `path` is for messages.
@@ -152,7 +153,7 @@ pub fn prefilter_widths(path: &Path) -> Result<Vec<usize>> {
 /// As [`read`], or it is not what [`prefilter_widths`] says.
 pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Result<()> {
     let (_, tensors) = metadata(bytes, path)?;
-    // A network trained on albedo is a prefilter under its own names.
+    // A prefilter by itself has no prefix to its names.
     let within = tensors.iter().any(|t| t.name.starts_with(PREFILTER));
     for param in network.params() {
         let Some(name) = param.name.strip_prefix(PREFILTER) else { continue };
@@ -170,7 +171,15 @@ pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Re
 /// # Errors
 /// As [`read`].
 pub fn config(path: &Path) -> Result<Config> {
-    Ok(metadata(&std::fs::read(path).map_err(Error::io("read", path))?, path)?.0.network)
+    parse_config(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+}
+
+/// The configuration of the network that the bytes of a weights file hold; `path` is for messages.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse_config(bytes: &[u8], path: &Path) -> Result<Config> {
+    Ok(metadata(bytes, path)?.0.network)
 }
 
 /// The metadata and the tensors of a weights file.

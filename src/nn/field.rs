@@ -290,6 +290,33 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
+    /// Its channels and then those of another field of the same size: (N, C, H, W) and (N, D, H, W) -> (N, C + D, H, W)
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn beside(self, other: Self) -> Self {
+        let ((images, c, h, w), (_, d, ..)) = (self.extent(), other.extent());
+        assert_eq!(other.extent(), (images, d, h, w));
+        let (a, b) = (self.saved, other.saved);
+        let parts = (0..images).flat_map(|n| [a.values.image(n), b.values.image(n)]);
+        let output = parts.collect::<Vec<_>>().concat().into();
+        let (mut field, out) = Self::output((images, c + d, h, w), output, self.tape.merge(other.tape));
+        if T::OWNS_TAPE {
+            field.tape.add_backward_op(move |_| {
+                let Some(gradient) = out.take() else { return Ok(()) };
+                for (into, from) in [(&a, 0..c * h * w), (&b, c * h * w..(c + d) * h * w)] {
+                    into.accumulate(|into| {
+                        let images = gradient.chunks((c + d) * h * w).map(|image| &image[from.clone()]);
+                        let into = into.into_iter().flatten();
+                        into.zip(images.flatten()).for_each(|(sum, g)| *sum += g);
+                    });
+                }
+                Ok(())
+            });
+        }
+        field
+    }
+
     /// Every channel, (N, C, H, W), plus the product of two fields (N, 1, H, W).
     ///
     /// # Panics

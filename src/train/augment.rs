@@ -51,7 +51,7 @@ impl Augment {
     /// If the sample is not square and a quarter turn is asked for.
     pub fn apply(&self, sample: &mut Sample) {
         sample.passes = self.passes(&sample.passes);
-        sample.reference = self.pass(Pass::Combined, &sample.reference);
+        sample.reference = self.passes(&sample.reference);
         sample.raw_reference = sample.raw_reference.take().map(|raw| self.pass(Pass::Combined, &raw));
     }
 

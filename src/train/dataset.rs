@@ -32,20 +32,20 @@ struct Stored {
     width: usize,
     height: usize,
     passes: Vec<(Pass, Vec<f16>)>,
-    reference: Vec<f16>,
+    reference: Vec<(Pass, Vec<f16>)>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
     raw_reference: Option<Vec<f16>>,
     /// See [`pairing::warning`].
     warning: Option<String>,
 }
 
-/// A crop: noisy passes and the reference radiance.
+/// A crop: noisy passes and the reference.
 #[derive(Clone, Debug)]
 pub struct Sample {
     /// The noisy passes.
     pub passes: PassSet,
-    /// The reference, (3, H, W).
-    pub reference: Planes,
+    /// The reference's passes.
+    pub reference: PassSet,
     /// The reference before it was denoised, (3, H, W), where that was asked for and is known: noisy,
     /// but right on average.
     pub raw_reference: Option<Planes>,
@@ -58,8 +58,8 @@ fn to_half(values: &[f32]) -> Vec<f16> {
 }
 
 impl Dataset {
-    /// Decodes of every pair the passes that must be there and those that may, and, if `raw_references`, what
-    /// the references were before they were denoised. Frames smaller than `least` in either direction are an
+    /// Decodes of every pair the passes that must be there and those that may, the `targets` of its reference, and, if
+    /// `raw_references`, what the references were before they were denoised. Frames smaller than `least` in either direction are an
     /// error, since no crop fits them.
     ///
     /// # Errors
@@ -67,12 +67,13 @@ impl Dataset {
     pub fn load(
         pairs: &[Pair],
         passes: (&[Pass], &[Pass]),
+        targets: &[Pass],
         raw_references: bool,
         least: usize,
     ) -> Result<Self> {
         let frames: Vec<Stored> = pairs
             .par_iter()
-            .map(|pair| Stored::load(pair, passes, raw_references, least))
+            .map(|pair| Stored::load(pair, passes, targets, raw_references, least))
             .collect::<Result<_>>()?;
         Ok(Self::of(frames))
     }
@@ -131,7 +132,8 @@ impl Dataset {
         let mut sample = stored.crop(x, y, side, side);
         if let seeds @ [_, ..] = self.seeds[index].as_slice() {
             let other = &self.frames[seeds[rng.below(seeds.len())]];
-            sample.passes = mixed(&sample.passes, &other.passes((x, y), (side, side)), rng);
+            let other = other.passes(&other.passes, (x, y), (side, side));
+            sample.passes = mixed(&sample.passes, &other, rng);
         }
         Augment::draw(rng).apply(&mut sample);
         sample
@@ -178,6 +180,7 @@ impl Stored {
     fn load(
         pair: &Pair,
         (needed, optional): (&[Pass], &[Pass]),
+        targets: &[Pass],
         raw_references: bool,
         least: usize,
     ) -> Result<Self> {
@@ -189,7 +192,9 @@ impl Stored {
         noisy.sanitize();
         let mut reference = passes::load(&pair.reference, None)?;
         reference.sanitize();
-        let target = reference.require(Pass::Combined, "training")?;
+        for &pass in targets {
+            reference.require(pass, "training")?;
+        }
         if (reference.width, reference.height) != (noisy.width, noisy.height) {
             return Err(Error::invalid(
                 &pair.noisy,
@@ -214,20 +219,24 @@ impl Stored {
         }
         let raw_reference =
             reference.get(Pass::NoisyImage).filter(|_| raw_references).map(|raw| to_half(&raw.data));
-        let kept = noisy.iter().filter(|(p, _)| needed.contains(p) || optional.contains(p));
+        let kept = |passes: &PassSet, wanted: &[&[Pass]]| -> Vec<(Pass, Vec<f16>)> {
+            let wanted = |pass: &Pass| wanted.iter().any(|passes| passes.contains(pass));
+            passes.iter().filter(|(p, _)| wanted(p)).map(|(p, planes)| (p, to_half(&planes.data))).collect()
+        };
+        let radiance = [&noisy, &reference].map(|passes| passes.get(Pass::Combined));
+        let warning = match radiance {
+            [Some(noisy), Some(clean)] => pairing::warning(pair.noisy.display(), noisy, clean),
+            _ => None,
+        };
         Ok(Self {
             pair: pair.clone(),
             view_layer: noisy.view_layer.clone(),
             width: noisy.width,
             height: noisy.height,
-            passes: kept.map(|(pass, planes)| (pass, to_half(&planes.data))).collect(),
-            reference: to_half(&target.data),
+            passes: kept(&noisy, &[needed, optional]),
+            reference: kept(&reference, &[targets]),
             raw_reference,
-            warning: pairing::warning(
-                pair.noisy.display(),
-                noisy.require(Pass::Combined, "training")?,
-                target,
-            ),
+            warning,
         })
     }
 
@@ -237,18 +246,23 @@ impl Stored {
     }
 
     fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Sample {
-        let cut = |data: &[f16]| self.cut(data, 3, (x, y), (width, height));
+        let (at, size) = ((x, y), (width, height));
         Sample {
-            passes: self.passes((x, y), (width, height)),
-            reference: cut(&self.reference),
-            raw_reference: self.raw_reference.as_deref().map(cut),
+            passes: self.passes(&self.passes, at, size),
+            reference: self.passes(&self.reference, at, size),
+            raw_reference: self.raw_reference.as_deref().map(|data| self.cut(data, 3, at, size)),
         }
     }
 
-    /// The noisy passes of a crop.
-    fn passes(&self, at: (usize, usize), (width, height): (usize, usize)) -> PassSet {
+    /// Some passes of a crop.
+    fn passes(
+        &self,
+        all: &[(Pass, Vec<f16>)],
+        at: (usize, usize),
+        (width, height): (usize, usize),
+    ) -> PassSet {
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
-        for (pass, data) in &self.passes {
+        for (pass, data) in all {
             passes.insert(*pass, self.cut(data, pass.channels(), at, (width, height)));
         }
         passes
@@ -293,7 +307,7 @@ mod tests {
             width: side,
             height: side,
             passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
-            reference: plane(3),
+            reference: vec![(Pass::Combined, plane(3))],
             raw_reference: None,
             warning: None,
         }
@@ -348,7 +362,15 @@ mod tests {
             spp: 4,
             frame: None,
         };
-        let load = |least| Dataset::load(std::slice::from_ref(&pair), (&[Pass::Combined], &[]), false, least);
+        let load = |least| {
+            Dataset::load(
+                std::slice::from_ref(&pair),
+                (&[Pass::Combined], &[]),
+                &[Pass::Combined],
+                false,
+                least,
+            )
+        };
         assert_eq!(load(128).map(|data| data.len()).ok(), Some(1));
         let error = load(144).err().expect("128x128 pixels hold none").to_string();
         assert!(error.contains("s0000_room_0004spp.exr") && error.contains("144x144"), "{error}");

@@ -123,8 +123,9 @@ pub fn run(
     }
     let wanted = (network.passes(), network.optional_passes());
     let least = network.multiple().max(options.loss.least_side());
-    let training = Dataset::load(&options.train, wanted, options.raw_references, least)?;
-    let validation = Dataset::load(&options.validation, wanted, false, 1)?;
+    let targets = network.targets();
+    let training = Dataset::load(&options.train, wanted, targets, options.raw_references, least)?;
+    let validation = Dataset::load(&options.validation, wanted, targets, false, 1)?;
     training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
@@ -177,10 +178,7 @@ pub fn run(
     Ok(())
 }
 
-/// The built-in model whose prefilter others get.
-const PREFILTERED: &str = "demc-m";
-
-/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one.
+/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one of those widths.
 fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
     let wanted = &options.network.prefilter;
     if wanted.is_empty() {
@@ -195,9 +193,12 @@ fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
     {
         return Ok(());
     }
-    let built_in = learned::BUILT_IN.into_iter().find(|(name, _)| *name == PREFILTERED);
-    let (name, bytes) = built_in.expect("it is built in");
-    weights_file::set_prefilter(network, bytes, Path::new(name))
+    for (name, bytes) in learned::BUILT_IN {
+        if weights_file::parse_config(bytes, Path::new(name))?.prefilter == *wanted {
+            return weights_file::set_prefilter(network, bytes, Path::new(name));
+        }
+    }
+    Err(Error::Usage(format!("no built-in prefilter has widths {wanted:?}; name one by --prefilter")))
 }
 
 /// The crops of a step, all of one size and each from its own stream of a seed.
@@ -230,12 +231,18 @@ fn step(
 ) -> Result<(f64, bool)> {
     let inputs: Vec<Inputs> = samples.par_iter().map(|s| network.inputs(&s.passes)).collect::<Result<_>>()?;
     let scales: Vec<f32> = inputs.iter().map(|i| i.scale).collect();
-    let scaled = |planes: fn(&Sample) -> &Planes| -> Vec<f32> {
-        let values = samples.iter().zip(&scales);
-        values.flat_map(|(sample, scale)| planes(sample).data.iter().map(move |v| v / scale)).collect()
+    let scaled = |planes: &[&Planes]| -> Vec<f32> {
+        let values = planes.iter().zip(&scales);
+        values.flat_map(|(planes, scale)| planes.data.iter().map(move |v| v / scale)).collect()
     };
-    let reference = scaled(|sample| &sample.reference);
-    let raw = options.raw_references.then(|| scaled(|s| s.raw_reference.as_ref().unwrap_or(&s.reference)));
+    let targets: Vec<Planes> =
+        samples.par_iter().map(|s| network.target(&s.reference)).collect::<Result<_>>()?;
+    let raw = || {
+        let raw = samples.iter().zip(&targets).map(|(s, target)| s.raw_reference.as_ref().unwrap_or(target));
+        scaled(&raw.collect::<Vec<_>>())
+    };
+    let raw = options.raw_references.then(raw);
+    let reference = scaled(&targets.iter().collect::<Vec<_>>());
     let mut stats = Stats::Batch(Vec::new());
     let image = network.forward_taped(&stack(&inputs), &mut stats);
     let loss = options.loss.of(image, reference, raw, &scales);
@@ -271,12 +278,14 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
     for index in 0..frames.len() {
         let (name, sample) = frames.frame(index);
         let image = network.infer(&sample.passes, None)?;
-        let (image, reference) = (&image, &sample.reference);
+        let (image, reference) = (&image, &network.target(&sample.reference)?);
         if image.non_finite() > 0 {
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
         }
         logs.push(metrics::error::relmse(image, reference).max(f64::MIN_POSITIVE).ln());
-        if let Some(exposure) = metrics::display::exposure(reference) {
+        if reference.channels == 3
+            && let Some(exposure) = metrics::display::exposure(reference)
+        {
             let display = |p| metrics::display::display(p, exposure);
             ssims.extend(metrics::ssim::ssim(&display(image), &display(reference)));
         }

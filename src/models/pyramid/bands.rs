@@ -8,12 +8,12 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, PREFILTERED_PASSES, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
-        Inputs, Refined, Shading, albedo_as_radiance, albedo_exposure, exposure, guides, keep_black,
-        radiance_as_albedo,
+        Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows, guides,
+        keep_black, noisy_guides, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{Shape, blend::Place},
@@ -37,126 +37,176 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
     let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
     let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
     let exposure = exposure(radiance);
-    let multiple = network.multiple();
-    let (width, height) = (passes.width.next_multiple_of(multiple), passes.height.next_multiple_of(multiple));
-    let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
-    // The last rows are mirrored below themselves, so as many come at once as that may take.
-    let is_last = |end: usize| passes.height < end + multiple;
-    let padded =
-        |rows: &Range<usize>| (width, if rows.end == passes.height { height } else { rows.end } - rows.start);
-    let starts = (0..passes.height).step_by(rows).filter(|&y| y == 0 || !is_last(y));
-    let bands = starts.map(|y| y..if is_last(y + rows) { passes.height } else { y + rows });
-    let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+    let cut = Cut::new(network, passes, rows);
     let size = (passes.width, passes.height);
     let mut refit = Refit::new(size);
-    // The albedo of what the refit has under way.
-    let mut divisors = Planes::default();
+    // Normal and albedo of what the refit has under way.
+    let mut clean: [Planes; 2] = Default::default();
     let mut image = Planes::default();
-    let mut write = |first: usize, part: Planes, albedo: Option<Planes>| {
+    let mut write = |first: usize, parts: Vec<Planes>| {
+        let [part, normal, albedo] = parts.try_into().expect("radiance, normal and albedo");
         let end = first + part.height;
-        if part.height == passes.height {
-            image = part;
-        } else {
-            if image.height == 0 {
-                image = Planes::unwritten(3, size.0, size.1);
-            }
-            image.write_rows(first, &part);
+        append(&mut image, size, first, part);
+        let first = refit.done();
+        for (clean, new) in clean.iter_mut().zip([normal, albedo]) {
+            *clean = if clean.height == 0 { new } else { clean.above(&new) };
         }
-        if let Some(albedo) = albedo {
-            let first = refit.done();
-            divisors = match divisors.height {
-                0 => albedo,
-                _ => divisors.above(&albedo),
-            };
-            let guides = Guides { size, normal: &normal.data, albedo: &divisors.data, first };
-            let samples = Samples::Rendered(&radiance.data, exposure);
-            refit.advance(guides, &mut image.data, samples, end, |v, factor| {
-                *v = *v * factor * exposure.recip()
-            });
-            let done = refit.done() - first;
-            divisors = divisors.window((0, done), (size.0, divisors.height - done));
+        let guides = Guides { size, normal: &clean[0].data, albedo: &clean[1].data, first };
+        let samples = Samples::Rendered(&radiance.data, exposure);
+        refit.advance(guides, &mut image.data, samples, end, |v, factor| *v = *v * factor * exposure.recip());
+        let done = refit.done() - first;
+        for clean in &mut clean {
+            *clean = clean.window((0, done), (size.0, clean.height - done));
         }
         Ok(())
     };
-    let mut beauty = Feed::new(network, passes, exposure, rows);
-    if let Some(prefilter) = &network.prefilter {
-        let shading = Shading::of(passes, exposure, NEEDED_BY)?;
-        let mut prefiltered = Feed::new(prefilter, passes, albedo_exposure(albedo), rows);
-        let mut held: Option<Planes> = None;
-        for band in bands {
-            let size = padded(&band);
-            let band = albedo_as_radiance(passes, band, size, NEEDED_BY)?;
-            // What of the albedo is done goes on its way at once, so that nobody keeps a whole frame of it.
-            prefiltered.push(band, None, &mut |first, clean, _| {
-                let end = first + clean.height;
-                let clean = match held.take() {
-                    Some(held) => held.above(&clean),
-                    None => clean,
-                };
-                if end < passes.height && is_last(end) {
-                    held = Some(clean);
-                    return Ok(());
-                }
-                let rows = end - clean.height..end;
-                let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
-                let size = padded(&rows);
-                let refined = Refined { albedo: radiance_as_albedo(clean), shading }.padded_to(size);
-                beauty.push(network.rows(passes, rows, size, exposure)?, Some(refined), &mut write)
-            })?;
-        }
-    } else {
-        for band in bands {
-            let size = padded(&band);
-            beauty.push(network.rows(passes, band, size, exposure)?, None, &mut write)?;
-        }
+    let mut beauty = Feed::new(network, size, cut.rows);
+    let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
+    let mut prefiltered = Feed::new(prefilter, size, cut.rows);
+    let guide_exposure = albedo_exposure(albedo);
+    let shading = Shading::of(passes, exposure, NEEDED_BY)?;
+    let mut held: Option<[Planes; 2]> = None;
+    for band in cut.bands() {
+        let padded = cut.padded(&band);
+        let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
+        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
+        prefiltered.push(noisy_guides(&band, guide_exposure, NEEDED_BY)?, &mut |first, parts| {
+            let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
+            let end = first + clean[0].height;
+            if let Some(held) = held.take() {
+                clean = [0, 1].map(|i| held[i].above(&clean[i]));
+            }
+            if end < passes.height && cut.is_last(end) {
+                held = Some(clean);
+                return Ok(());
+            }
+            let [albedo, normal] = clean;
+            let (albedo, normal) = (albedo_of_target(albedo), normal_of_target(normal));
+            let rows = end - albedo.height..end;
+            let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
+            let padded = cut.padded(&rows);
+            let refined = Refined { albedo, normal, shading }.padded_to(padded);
+            let band = guide_rows(passes, rows, padded, exposure, NEEDED_BY)?;
+            // A refit takes exposed radiance, and scales it last.
+            let inputs = Inputs { scale: 1.0, ..guides(&band, refined, exposure, NEEDED_BY)? };
+            beauty.push(inputs, &mut write)
+        })?;
     }
     keep_black(&mut image, radiance, albedo);
     Ok(image)
 }
 
+/// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them, each (3, H, W).
+///
+/// # Errors
+/// A pass is missing.
+pub fn infer_guides(prefilter: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
+    let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
+    passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+    let cut = Cut::new(prefilter, passes, rows);
+    let size = (passes.width, passes.height);
+    let mut feed = Feed::new(prefilter, size, cut.rows);
+    let mut guides: [Planes; 2] = Default::default();
+    for band in cut.bands() {
+        let padded = cut.padded(&band);
+        let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
+        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, &mut |first, parts| {
+            guides.iter_mut().zip(parts).for_each(|(guide, part)| append(guide, size, first, part));
+            Ok(())
+        })?;
+    }
+    Ok(guides)
+}
+
+/// Writes the next rows of planes that are `size` columns and rows in the end.
+fn append(planes: &mut Planes, size: (usize, usize), first: usize, part: Planes) {
+    if part.height == size.1 {
+        *planes = part;
+        return;
+    }
+    if planes.height == 0 {
+        *planes = Planes::unwritten(part.channels, size.0, size.1);
+    }
+    planes.write_rows(first, &part);
+}
+
+/// How a frame is cut into bands.
+struct Cut {
+    multiple: usize,
+    /// Columns and rows once padded, and rows before.
+    width: usize,
+    height: usize,
+    unpadded: usize,
+    /// Rows of a band.
+    rows: usize,
+}
+
+impl Cut {
+    /// That of a frame; `rows` are those of a band, if the user has an opinion.
+    fn new(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Self {
+        let multiple = network.multiple();
+        let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(multiple));
+        let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
+        Self { multiple, width, height, unpadded: passes.height, rows }
+    }
+
+    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below themselves, so
+    /// as many come at once as that may take.
+    fn is_last(&self, end: usize) -> bool {
+        self.unpadded < end + self.multiple
+    }
+
+    /// The columns and rows to which some rows are padded.
+    fn padded(&self, rows: &Range<usize>) -> (usize, usize) {
+        (self.width, if rows.end == self.unpadded { self.height } else { rows.end } - rows.start)
+    }
+
+    /// The rows of every band.
+    fn bands(&self) -> impl Iterator<Item = Range<usize>> {
+        let starts = (0..self.unpadded).step_by(self.rows).filter(|&y| y == 0 || !self.is_last(y));
+        starts.map(|y| y..if self.is_last(y + self.rows) { self.unpadded } else { y + self.rows })
+    }
+}
+
 /// A frame that comes in band by band and leaves denoised.
 struct Feed<'a> {
     frame: Frame<'a>,
-    exposure: f32,
     /// Columns and rows of the frame.
     size: (usize, usize),
 }
 
 impl<'a> Feed<'a> {
-    fn new(network: &'a Pyramid, passes: &PassSet, exposure: f32, band: usize) -> Self {
-        let size = (passes.width, passes.height);
+    fn new(network: &'a Pyramid, size: (usize, usize), band: usize) -> Self {
         let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band);
-        Self { frame, exposure, size }
+        Self { frame, size }
     }
 
-    /// Takes in the next rows, grown to what the network can halve, and what is refined of them where it has a
-    /// prefilter, and hands out what is denoised with it: its first row, and radiance.
+    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, each (3, R, W), and
+    /// its first row: radiance, in its scale, the normal, and what radiance was divided by; of a prefilter albedo and normal, in
+    /// their scale.
     fn push(
         &mut self,
-        band: PassSet,
-        refined: Option<Refined>,
-        done: &mut dyn FnMut(usize, Planes, Option<Planes>) -> Result<()>,
+        Inputs { planes, scale }: Inputs,
+        done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
     ) -> Result<()> {
-        let refits = refined.is_some();
-        let Inputs { planes, scale } = guides(&band, refined, self.exposure, NEEDED_BY)?;
-        // A refit takes exposed radiance, and scales it last.
-        let scale = if refits { 1.0 } else { scale };
         let (width, height) = self.size;
+        // Normal and albedo of radiance have none.
+        let scales = if self.frame.network.denoises_guides() { [scale; 3] } else { [scale, 1.0, 1.0] };
         let mut result = Ok(());
-        let mut hand_out = |first: usize, field: &Field, albedo: &Field| {
-            let (_, _, h, w) = field.extent();
+        let mut hand_out = |first: usize, fields: &[Field]| {
+            let (_, _, h, w) = fields[0].extent();
             let rows = h.min(height.saturating_sub(first));
             if rows == 0 || result.is_err() {
                 return;
             }
-            let part = |field: &Field, scale: f32| {
+            let part = |(field, scale): (&Field, f32)| {
                 let values = field.values();
                 Planes::from_rows(3, (width, rows), |c, y, into| {
                     let from = &values[(c * h + y) * w..];
                     into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
                 })
             };
-            result = done(first, part(field, scale), refits.then(|| part(albedo, 1.0)));
+            result = done(first, fields.iter().zip(scales).map(part).collect());
         };
         self.frame.push(planes);
         self.frame.advance(&mut hand_out);
@@ -177,7 +227,12 @@ struct Frame<'a> {
     decoder: Vec<Decoded>,
     /// Full resolution first.
     scales: Vec<Scale>,
+    /// The rows that are there, and how many there will be.
+    rows: usize,
+    height: usize,
     albedo: Line<Field>,
+    /// For a refit.
+    normal: Line<Field>,
     /// What was divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is
     /// to divide; rows go to the finest scale's image at once where it does not say.
     quotient: Line<Field>,
@@ -202,19 +257,25 @@ struct Decoded {
     refined: Line<Maps>,
 }
 
-/// A level of the radiance pyramid.
+/// A level of the pyramid.
 struct Scale {
-    image: Line<Field>,
+    /// What is filtered: radiance, or albedo and normal.
+    images: Vec<Filtered>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet blended, and for those not yet filtered.
     masks: VecDeque<(Range<usize>, Field, Field)>,
     kernels: VecDeque<(Range<usize>, Field)>,
-    /// The image, blended with the level below.
+    /// Rows filtered.
+    filtered: usize,
+}
+
+/// A level of an image.
+struct Filtered {
+    image: Line<Field>,
+    /// That blended with the level below.
     blended: Line<Field>,
     /// What the level above takes in.
     smooth: Line<Field>,
-    /// Rows filtered.
-    filtered: usize,
 }
 
 impl<'a> Frame<'a> {
@@ -230,13 +291,17 @@ impl<'a> Frame<'a> {
         };
         let decoded =
             |l| Decoded { up: Line::new(rows(l)), fused: Line::new(rows(l)), refined: Line::new(rows(l)) };
-        let scale = |s: usize| Scale {
+        let filtered = |s: usize| Filtered {
             image: Line::new(height >> s),
+            blended: Line::new(height >> s),
+            smooth: Line::new(height >> s),
+        };
+        let images = if network.denoises_guides() { 2 } else { 1 };
+        let scale = |s: usize| Scale {
+            images: (0..images).map(|_| filtered(s)).collect(),
             confidence: Line::new(height >> s),
             masks: VecDeque::new(),
             kernels: VecDeque::new(),
-            blended: Line::new(height >> s),
-            smooth: Line::new(height >> s),
             filtered: 0,
         };
         Self {
@@ -245,7 +310,10 @@ impl<'a> Frame<'a> {
             encoders: [encoder(), encoder()],
             decoder: (0..LEVELS).map(decoded).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
+            rows: 0,
+            height,
             albedo: Line::new(height),
+            normal: Line::new(height),
             quotient: Line::new(height),
             ratio: Line::new(height),
             shading: Line::new(height),
@@ -256,17 +324,20 @@ impl<'a> Frame<'a> {
     /// Adds the inputs of the next rows.
     fn push(&mut self, inputs: Vec<Planes>) {
         let mut inputs = inputs.into_iter();
-        let mut next = || inputs.next().expect("`guides` makes four planes and, with a prefilter, two more");
+        let mut next = || inputs.next().expect("`guides` makes seven planes, `noisy_guides` four");
         let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
-        let [irradiance, albedo, radiance, guide] = std::array::from_fn(|_| next());
-        if self.network.prefilter.is_some() {
-            self.quotient.push(field(irradiance));
+        let [image, second, radiance, guide] = std::array::from_fn(|_| next());
+        self.rows += image.height;
+        if let [first, normal] = &mut self.scales[0].images[..] {
+            first.image.push(field(image));
+            normal.image.push(field(second));
+        } else {
+            self.quotient.push(field(image));
+            self.albedo.push(field(second));
             self.ratio.push(field(next()));
             self.shading.push(field(next()));
-        } else {
-            self.scales[0].image.push(field(irradiance));
+            self.normal.push(field(next()));
         }
-        self.albedo.push(field(albedo));
         let layers = self.network.encoders.iter().map(|encoder| &encoder.levels[0][0]);
         for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip([radiance, guide]) {
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
@@ -276,17 +347,17 @@ impl<'a> Frame<'a> {
 
     /// Whether all inputs are there.
     fn is_whole(&self) -> bool {
-        self.albedo.end() == self.albedo.total()
+        self.rows == self.height
     }
 
     /// Whether everything is computed.
     fn is_done(&self) -> bool {
-        self.scales[0].filtered == self.albedo.total()
+        self.scales[0].filtered == self.height
     }
 
     /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
-    /// first row, radiance, and the albedo.
-    fn advance(&mut self, done: &mut impl FnMut(usize, &Field, &Field)) {
+    /// first row, and see [`Feed::push`].
+    fn advance(&mut self, done: &mut impl FnMut(usize, &[Field])) {
         self.encode();
         self.decode();
         self.reduce();
@@ -345,7 +416,7 @@ impl<'a> Frame<'a> {
                 let rows = 2 * rows.start..2 * rows.end;
                 if let Some((divisor, shade)) = refined {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
-                    self.scales[0].image.push(quotient.redivide(ratio, divisor));
+                    self.scales[0].images[0].image.push(quotient.redivide(ratio, divisor));
                     gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
                 }
                 self.gains.push_back(gain);
@@ -354,55 +425,72 @@ impl<'a> Frame<'a> {
         }
     }
 
-    /// Builds the radiance pyramid.
+    /// Builds the pyramid.
     fn reduce(&mut self) {
         for scale in 0..LEVELS {
             let [fine, coarse] = &mut self.scales[scale..scale + 2] else { unreachable!("two scales") };
-            let (from, to) = (coarse.image.end(), fine.image.end().min(fine.confidence.end()) / 2);
-            if from < to {
-                let rows = 2 * from..2 * to;
-                coarse.image.push(fine.image.rows(rows.clone()).reduce(fine.confidence.rows(rows)));
+            let trust = &fine.confidence;
+            for (fine, coarse) in fine.images.iter().zip(&mut coarse.images) {
+                let (from, to) = (coarse.image.end(), fine.image.end().min(trust.end()) / 2);
+                if from < to {
+                    let rows = 2 * from..2 * to;
+                    coarse.image.push(fine.image.rows(rows.clone()).reduce(trust.rows(rows)));
+                }
             }
         }
     }
 
-    /// Blends the image with what the scale below became.
+    /// Blends the images with what the scale below became.
     fn blend(&mut self, scale: usize) {
         let (finer, coarser) = self.scales.split_at_mut(scale + 1);
-        let Scale { image, masks, blended, .. } = &mut finer[scale];
-        let Some(below) = coarser.first().map(|c| &c.smooth) else { return };
+        let Scale { images, masks, .. } = &mut finer[scale];
+        let Some(below) = coarser.first().map(|c| &c.images) else { return };
         while let Some((rows, _, _)) = masks.front() {
-            if image.end() < rows.end || 2 * below.settled(1) < rows.end {
+            let are_there = |(fine, below): (&Filtered, &Filtered)| {
+                rows.end <= fine.image.end() && rows.end <= 2 * below.smooth.settled(1)
+            };
+            if !images.iter().zip(below).all(are_there) {
                 break;
             }
             let (rows, mask, corners) = masks.pop_front().expect("there is one");
-            let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
-            let place = Place { first: rows.start, total: image.total(), coarse: near.start };
-            blended.push(image.rows(rows).blend_rows(place, &below.rows(near), &mask, &corners));
+            for (Filtered { image, blended, .. }, below) in images.iter_mut().zip(below) {
+                let below = &below.smooth;
+                let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
+                let place = Place { first: rows.start, total: image.total(), coarse: near.start };
+                blended.push(image.rows(rows.clone()).blend_rows(place, &below.rows(near), &mask, &corners));
+            }
         }
     }
 
-    /// Filters the image; at full resolution, hands out what becomes of it.
-    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &Field, &Field)) {
+    /// Filters the images; at full resolution, hands out what becomes of them.
+    fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
         let (k, reach) = (kernel_of(scale), kernel_of(scale) / 2);
-        let Scale { image, confidence, kernels, blended, smooth, filtered, .. } = &mut self.scales[scale];
-        let source = if scale == LEVELS { &*image } else { &*blended };
+        let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
         while let Some((rows, _)) = kernels.front() {
-            if source.settled(reach).min(confidence.settled(reach)) < rows.end {
+            let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
+            if settled.expect("something is filtered").min(confidence.settled(reach)) < rows.end {
                 break;
             }
             let (rows, kernel) = kernels.pop_front().expect("there is one");
-            let (near, inside) = around(&rows, reach, source.total());
-            let (source, trust) = (source.rows(near.clone()), confidence.rows(near));
-            let output = source.filter_rows(inside, k, &kernel, &trust);
+            let (near, inside) = around(&rows, reach, confidence.total());
+            let trust = confidence.rows(near.clone());
+            let mut outputs = images
+                .iter()
+                .map(|image| image.source(scale).rows(near.clone()).filter_rows(inside, k, &kernel, &trust));
             *filtered = rows.end;
             if scale > 0 {
-                smooth.push(output);
+                let outputs: Vec<Field> = outputs.collect();
+                images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let albedo = self.albedo.rows(rows.clone());
-            done(rows.start, &output.product(albedo.fork()).amplify(gain), &albedo);
+            let image = outputs.next().expect("something is filtered");
+            if let Some(normal) = outputs.next() {
+                done(rows.start, &[image.amplify(gain), normal]);
+                continue;
+            }
+            let [normal, albedo] = [&self.normal, &self.albedo].map(|line| line.rows(rows.clone()));
+            done(rows.start, &[image.product(albedo.fork()).amplify(gain), normal, albedo]);
         }
     }
 
@@ -424,19 +512,34 @@ impl<'a> Frame<'a> {
             refined.forget(above.min(refined.end()).saturating_sub(1));
         }
         for scale in 0..=LEVELS {
-            let reduced = self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.image.end());
-            let above = scale.checked_sub(1).map_or(0, |above| self.scales[above].blended.end() / 2);
-            let Scale { image, confidence, blended, smooth, filtered, .. } = &mut self.scales[scale];
+            // Of several images all are as far on.
+            let reduced =
+                self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.images[0].image.end());
+            let above =
+                scale.checked_sub(1).map_or(0, |above| self.scales[above].images[0].blended.end() / 2);
+            let Scale { images, confidence, filtered, .. } = &mut self.scales[scale];
             let reach = filtered.saturating_sub(kernel_of(scale) / 2);
-            image.forget(reach.min(reduced));
             confidence.forget(reach.min(reduced));
-            blended.forget(reach);
-            smooth.forget(above.saturating_sub(1));
+            for Filtered { image, blended, smooth } in images {
+                image.forget(reach.min(reduced));
+                blended.forget(reach);
+                smooth.forget(above.saturating_sub(1));
+            }
         }
-        self.quotient.forget(self.scales[0].image.end());
-        self.ratio.forget(self.scales[0].image.end());
-        self.shading.forget(self.scales[0].image.end());
-        self.albedo.forget(self.scales[0].filtered);
+        let Scale { images, filtered, .. } = &self.scales[0];
+        let divided = images[0].image.end();
+        self.quotient.forget(divided);
+        self.ratio.forget(divided);
+        self.shading.forget(divided);
+        self.albedo.forget(*filtered);
+        self.normal.forget(*filtered);
+    }
+}
+
+impl Filtered {
+    /// What the kernels of a scale filter: the coarsest has nothing to be blended with.
+    fn source(&self, scale: usize) -> &Line<Field> {
+        if scale == LEVELS { &self.image } else { &self.blended }
     }
 }
 
