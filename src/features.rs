@@ -288,16 +288,16 @@ const NORMAL_SCALE: f32 = 0.1;
 /// # Errors
 /// A pass is missing.
 pub fn noisy_guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
-    let targets = guide_targets(passes, needed_by)?;
-    let n = targets.data.len() / 2;
+    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
     let unwritten = || Planes::unwritten(3, passes.width, passes.height);
-    let [mut light, mut normal, mut encoded, mut direction] = [(); 4].map(|()| unwritten());
-    map(&targets.data[..n], &mut light.data, |v| v * exposure);
-    map(&targets.data[n..], &mut normal.data, |v| v * exposure);
-    map(&targets.data[n..], &mut direction.data, |v| v / NORMAL_SCALE);
+    let [mut light, mut small, mut encoded, mut direction] = [(); 4].map(|()| unwritten());
+    map(&albedo.data, &mut light.data, |a| divisor(a) * exposure);
+    map(&normal.data, &mut small.data, |axis| unit(axis) * (NORMAL_SCALE * exposure));
+    map(&normal.data, &mut direction.data, unit);
     let rows = encoded.data.par_chunks_mut(CHUNK).zip(light.data.par_chunks(CHUNK));
     rows.for_each(|(encoded, light)| vectorised::run(Encode { light, encoded }));
-    Ok(Inputs { planes: vec![light, normal, encoded, direction], scale: exposure.recip() })
+    Ok(Inputs { planes: vec![light, small, encoded, direction], scale: exposure.recip() })
 }
 
 /// Transfers light.

@@ -192,17 +192,44 @@ impl<'a> Filter<'a> {
     /// # Panics
     /// If lengths do not fit the size.
     pub fn apply(self, tier: Tier, output: &mut [f32], total: &mut [f32]) {
+        self.apply_to_all(tier, [self.image], [output], total);
+    }
+
+    /// [`Filter::apply`] to several images of the same size alike, of which [`Filter::image`] is but one.
+    ///
+    /// # Panics
+    /// As [`Filter::apply`].
+    pub fn apply_to_all<const N: usize>(
+        self,
+        tier: Tier,
+        images: [&'a [f32]; N],
+        outputs: [&mut [f32]; N],
+        total: &mut [f32],
+    ) {
         self.check();
         let (n, w) = (self.filtered(), self.size.w);
-        assert_eq!((output.len(), total.len()), (3 * n, n));
+        assert_eq!(total.len(), n);
+        assert!(images.iter().all(|image| image.len() == self.image.len()));
+        assert!(outputs.iter().all(|output| output.len() == 3 * n));
         // Equal trust is no change of any exponent.
         let equal = vec![0.0; if self.confidence.is_none() { w } else { 0 }];
-        each_row(w, output, total, |y, output, total| {
+        let mut planes = outputs.map(|output| {
+            let (red, rest) = output.split_at_mut(n);
+            let (green, blue) = rest.split_at_mut(n);
+            [red, green, blue].map(|plane| plane.chunks_mut(w))
+        });
+        let mut next_row = || {
+            planes
+                .each_mut()
+                .map(|planes| planes.each_mut().map(|rows| rows.next().expect("as many as of the total")))
+        };
+        let rows: Vec<_> = total.chunks_mut(w).map(|total| (next_row(), total)).collect();
+        rows.into_par_iter().enumerate().for_each(|(y, (output, total))| {
             let line = |values: &'a [f32], row: usize| &values[row * w..][..w];
             let taps = self.taps(y).into_iter().map(|(tap, row, dx)| Tap {
                 logits: line(self.logits, tap * (n / w) + y),
                 confidence: self.confidence.map_or(&equal[..], |trust| line(trust, row)),
-                image: std::array::from_fn(|c| line(self.image, c * self.size.h + row)),
+                images: images.map(|image| std::array::from_fn(|c| line(image, c * self.size.h + row))),
                 dx,
             });
             tier.run(Forward { taps: taps.collect(), reach: self.k / 2, output, total });
@@ -233,22 +260,22 @@ impl<'a> Filter<'a> {
 }
 
 /// One tap of a row: the rows that it reads, and how far to the right.
-struct Tap<'a> {
+struct Tap<'a, const N: usize> {
     logits: &'a [f32],
     confidence: &'a [f32],
-    image: [&'a [f32]; 3],
+    images: [[&'a [f32]; 3]; N],
     dx: isize,
 }
 
-struct Forward<'a> {
-    taps: Vec<Tap<'a>>,
+struct Forward<'a, const N: usize> {
+    taps: Vec<Tap<'a, N>>,
     /// Columns to either side that a tap reaches.
     reach: usize,
-    output: [&'a mut [f32]; 3],
+    output: [[&'a mut [f32]; 3]; N],
     total: &'a mut [f32],
 }
 
-impl Kernel for Forward<'_> {
+impl<const N: usize> Kernel for Forward<'_, N> {
     #[inline(always)]
     unsafe fn run<S: Simd>(mut self) {
         let w = self.total.len();
@@ -265,7 +292,7 @@ impl Kernel for Forward<'_> {
     }
 }
 
-impl Forward<'_> {
+impl<const N: usize> Forward<'_, N> {
     /// Filters 16 pixels of the row from column `x` on, or those there are.
     ///
     /// # Safety
@@ -279,25 +306,25 @@ impl Forward<'_> {
             for tap in &self.taps {
                 largest = S::max(tap.exponents::<S, INNER>(x), largest);
             }
-            let (mut sums, mut total) = ([S::splat(0.0); 3], S::splat(0.0));
+            let (mut sums, mut total) = ([[S::splat(0.0); 3]; N], S::splat(0.0));
             for tap in &self.taps {
                 let exponents = tap.exponents::<S, INNER>(x);
                 let weights = S::exp(S::fma(largest, S::splat(-1.0), exponents));
                 total = S::add(total, weights);
-                for (sum, row) in sums.iter_mut().zip(tap.image) {
+                for (sum, row) in sums.as_flattened_mut().iter_mut().zip(tap.images.as_flattened()) {
                     let values = some_columns::<S, INNER>(row, x as isize + tap.dx, 0.0);
                     *sum = S::fma(values, weights, *sum);
                 }
             }
-            for (out, sum) in self.output.iter_mut().zip(sums) {
-                S::write_first(out[x..].as_mut_ptr(), count, S::div(sum, total));
+            for (out, sum) in self.output.as_flattened_mut().iter_mut().zip(sums.as_flattened()) {
+                S::write_first(out[x..].as_mut_ptr(), count, S::div(*sum, total));
             }
             S::write_first(self.total[x..].as_mut_ptr(), count, total);
         }
     }
 }
 
-impl Tap<'_> {
+impl<const N: usize> Tap<'_, N> {
     /// The exponents of 16 pixels from column `x` on; no weight where there is no neighbour.
     ///
     /// # Safety

@@ -100,14 +100,18 @@ impl Learned {
 
     /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a square as before, so
     /// a column or row is added at what becomes the beginning; fireflies are tamed before it mirrors them, since two would be
-    /// company for each other.
-    fn second_look(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    /// company for each other. The clean guides are those of the first look.
+    fn second_look(&self, passes: &PassSet, guides: &PassSet, tile: Option<usize>) -> Result<Planes> {
         let size = (passes.width, passes.height);
+        let odd = (size.0 | 1, size.1 | 1);
         let exposure = exposure(passes.require(Pass::Combined, TURNED)?);
-        let odd = guide_rows(passes, 0..size.1, (size.0 | 1, size.1 | 1), exposure, TURNED)?;
-        let turned = HALF_TURN.passes(&odd);
-        drop(odd);
-        let image = self.network.infer(&turned, tile)?.turned();
+        let turned = HALF_TURN.passes(&guide_rows(passes, 0..size.1, odd, exposure, TURNED)?);
+        let guides = HALF_TURN.passes(&guides.padded_rows(
+            &[Pass::DenoisingAlbedo, Pass::DenoisingNormal],
+            0..size.1,
+            odd,
+        ));
+        let image = self.network.infer_with(&turned, &guides, tile)?.turned();
         Ok(image.window((0, 0), size))
     }
 
@@ -139,12 +143,14 @@ impl Denoiser for Learned {
     }
 
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        let mut image = self.network.infer(passes, tile)?;
-        if self.turned {
-            let second = self.second_look(passes, tile)?;
-            let values = image.data.iter_mut().zip(&second.data);
-            values.for_each(|(first, second)| *first = 0.5 * (*first + second));
+        if !self.turned {
+            return self.network.infer(passes, tile);
         }
+        let guides = self.network.clean_guides(passes)?.expect("what looks twice has a prefilter");
+        let mut image = self.network.infer_with(passes, &guides, tile)?;
+        let second = self.second_look(passes, &guides, tile)?;
+        let values = image.data.iter_mut().zip(&second.data);
+        values.for_each(|(first, second)| *first = 0.5 * (*first + second));
         Ok(image)
     }
 }

@@ -183,6 +183,22 @@ pub trait Network: Send + Sync {
         run_tiled(self, passes, tile)
     }
 
+    /// The passes of a frame that it denoises before radiance, denoised; none if there are none.
+    ///
+    /// # Errors
+    /// A pass is missing.
+    fn clean_guides(&self, _: &PassSet) -> Result<Option<PassSet>> {
+        Ok(None)
+    }
+
+    /// [`Network::infer`] where [`Network::clean_guides`] are known.
+    ///
+    /// # Errors
+    /// As [`Network::infer`].
+    fn infer_with(&self, passes: &PassSet, _: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        self.infer(passes, tile)
+    }
+
     /// A copy with its own parameters.
     fn duplicate(&self) -> Box<dyn Network>;
 }

@@ -475,8 +475,9 @@ impl Network for Pyramid {
             .convolution_levels()
             .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
             .sum();
-        // Three channels and the sum of weights, at every pyramid level.
-        let taps = |level: usize| (4 * kernel_of(level).pow(2)) as f64 / 4f64.powi(level as i32);
+        // Three channels of each image and the sum of weights, at every pyramid level.
+        let images = if self.denoises_guides() { 2 } else { 1 };
+        let taps = |level: usize| (4 * images * kernel_of(level).pow(2)) as f64 / 4f64.powi(level as i32);
         let filters: f64 = (0..=LEVELS).map(taps).sum();
         let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
         convolutions + filters + prefilter
@@ -497,7 +498,20 @@ impl Network for Pyramid {
             };
             return Ok(Planes::from_rows(6, (passes.width, passes.height), rows));
         }
-        bands::infer(self, passes, tile)
+        bands::infer(self, passes, None, tile)
+    }
+
+    fn clean_guides(&self, passes: &PassSet) -> Result<Option<PassSet>> {
+        let Some(prefilter) = &self.prefilter else { return Ok(None) };
+        let [albedo, normal] = bands::infer_guides(prefilter, passes, None)?;
+        let mut guides = passes.rows(&[], 0..passes.height);
+        guides.insert(Pass::DenoisingAlbedo, albedo_of_target(albedo));
+        guides.insert(Pass::DenoisingNormal, normal_of_target(normal));
+        Ok(Some(guides))
+    }
+
+    fn infer_with(&self, passes: &PassSet, guides: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        bands::infer(self, passes, Some(guides), tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

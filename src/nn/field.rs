@@ -515,16 +515,24 @@ impl Field<NoneTape> {
         Self { saved: Saved { values, gradient: None }, tape: NoneTape }
     }
 
-    /// [`Field::filter`] of some rows of the one image that the field holds more rows of: `logits` are of
+    /// [`Field::filter`], all alike, of some rows of fields that hold more rows of one image each: `logits` are of
     /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
-    pub fn filter_rows(&self, rows: (usize, usize), k: usize, logits: &Self, confidence: &Self) -> Self {
-        let (_, _, _, w) = self.extent();
+    pub fn filter_rows<const N: usize>(
+        fields: [&Self; N],
+        rows: (usize, usize),
+        k: usize,
+        logits: &Self,
+        confidence: &Self,
+    ) -> [Self; N] {
+        let (_, _, _, w) = confidence.extent();
         let h = rows.1 - rows.0;
         let values = |field: &Self| field.saved.values.clone();
-        let problem = (values(self), values(logits), Some(values(confidence)));
-        let (mut output, mut total) = (plane_buffer(3 * h * w), plane_buffer(h * w));
-        filter_of(&problem, 0, k, rows).apply(Tier::detect(), &mut output, &mut total);
-        Self::from_buffer((1, 3, h, w), output)
+        let problem = (values(fields[0]), values(logits), Some(values(confidence)));
+        let (mut outputs, mut total) = (fields.map(|_| plane_buffer(3 * h * w)), plane_buffer(h * w));
+        let filter = filter_of(&problem, 0, k, rows);
+        let into = outputs.each_mut().map(|output| &mut output[..]);
+        filter.apply_to_all(Tier::detect(), fields.map(Self::values), into, &mut total);
+        outputs.map(|output| Self::from_buffer((1, 3, h, w), output))
     }
 
     /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)

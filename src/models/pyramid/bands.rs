@@ -12,8 +12,8 @@ use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, PREFILTERED_PASSES, Pred
 use crate::{
     Result,
     features::{
-        Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows, guides,
-        keep_black, noisy_guides, normal_of_target,
+        self, Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows, keep_black,
+        noisy_guides, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{Shape, blend::Place},
@@ -29,11 +29,17 @@ type Field = crate::nn::Field<NoneTape>;
 /// Pixels of a band: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
 const BAND_PIXELS: usize = 9 << 14;
 
-/// Denoised radiance of a frame, (3, H, W). `rows` are those of a band, if the user has an opinion.
+/// Denoised radiance of a frame, (3, H, W). `guides` are its clean albedo and normal, where they are known; `rows` those of a
+/// band, if the user has an opinion.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<Planes> {
+pub fn infer(
+    network: &Pyramid,
+    passes: &PassSet,
+    guides: Option<&PassSet>,
+    rows: Option<usize>,
+) -> Result<Planes> {
     let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
     let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
     let exposure = exposure(radiance);
@@ -61,36 +67,46 @@ pub fn infer(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result
         Ok(())
     };
     let mut beauty = Feed::new(network, size, cut.rows);
-    let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
-    let mut prefiltered = Feed::new(prefilter, size, cut.rows);
-    let guide_exposure = albedo_exposure(albedo);
     let shading = Shading::of(passes, exposure, NEEDED_BY)?;
-    let mut held: Option<[Planes; 2]> = None;
-    for band in cut.bands() {
-        let padded = cut.padded(&band);
-        let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
-        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
-        prefiltered.push(noisy_guides(&band, guide_exposure, NEEDED_BY)?, &mut |first, parts| {
-            let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
-            let end = first + clean[0].height;
-            if let Some(held) = held.take() {
-                clean = [0, 1].map(|i| held[i].above(&clean[i]));
-            }
-            if end < passes.height && cut.is_last(end) {
-                held = Some(clean);
-                return Ok(());
-            }
-            let [albedo, normal] = clean;
-            let (albedo, normal) = (albedo_of_target(albedo), normal_of_target(normal));
-            let rows = end - albedo.height..end;
-            let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
-            let padded = cut.padded(&rows);
-            let refined = Refined { albedo, normal, shading }.padded_to(padded);
-            let band = guide_rows(passes, rows, padded, exposure, NEEDED_BY)?;
-            // A refit takes exposed radiance, and scales it last.
-            let inputs = Inputs { scale: 1.0, ..guides(&band, refined, exposure, NEEDED_BY)? };
-            beauty.push(inputs, &mut write)
-        })?;
+    let mut feed = |rows: Range<usize>, [albedo, normal]: [Planes; 2]| {
+        let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
+        let padded = cut.padded(&rows);
+        let refined = Refined { albedo, normal, shading }.padded_to(padded);
+        let band = guide_rows(passes, rows, padded, exposure, NEEDED_BY)?;
+        // A refit takes exposed radiance, and scales it last.
+        let inputs = Inputs { scale: 1.0, ..features::guides(&band, refined, exposure, NEEDED_BY)? };
+        beauty.push(inputs, &mut write)
+    };
+    if let Some(guides) = guides {
+        for band in cut.bands() {
+            let [albedo, normal] = PREFILTERED_PASSES.map(|pass| guides.require(pass, NEEDED_BY));
+            let part = |planes: &Planes| planes.window((0, band.start), (size.0, band.len()));
+            feed(band.clone(), [part(albedo?), part(normal?)])?;
+        }
+    } else {
+        let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
+        let mut prefiltered = Feed::new(prefilter, size, cut.rows);
+        let guide_exposure = albedo_exposure(albedo);
+        let mut held: Option<[Planes; 2]> = None;
+        for band in cut.bands() {
+            let padded = cut.padded(&band);
+            let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
+            // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
+            prefiltered.push(noisy_guides(&band, guide_exposure, NEEDED_BY)?, &mut |first, parts| {
+                let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
+                let end = first + clean[0].height;
+                if let Some(held) = held.take() {
+                    clean = [0, 1].map(|i| held[i].above(&clean[i]));
+                }
+                if end < passes.height && cut.is_last(end) {
+                    held = Some(clean);
+                    return Ok(());
+                }
+                let [albedo, normal] = clean;
+                let rows = end - albedo.height..end;
+                feed(rows, [albedo_of_target(albedo), normal_of_target(normal)])
+            })?;
+        }
     }
     keep_black(&mut image, radiance, albedo);
     Ok(image)
@@ -474,16 +490,19 @@ impl<'a> Frame<'a> {
             let (rows, kernel) = kernels.pop_front().expect("there is one");
             let (near, inside) = around(&rows, reach, confidence.total());
             let trust = confidence.rows(near.clone());
-            let mut outputs = images
-                .iter()
-                .map(|image| image.source(scale).rows(near.clone()).filter_rows(inside, k, &kernel, &trust));
+            let sources: Vec<Field> =
+                images.iter().map(|image| image.source(scale).rows(near.clone())).collect();
+            let outputs = match &sources[..] {
+                [image, normal] => Field::filter_rows([image, normal], inside, k, &kernel, &trust).into(),
+                images => Vec::from(Field::filter_rows([&images[0]], inside, k, &kernel, &trust)),
+            };
             *filtered = rows.end;
             if scale > 0 {
-                let outputs: Vec<Field> = outputs.collect();
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
+            let mut outputs = outputs.into_iter();
             let image = outputs.next().expect("something is filtered");
             if let Some(normal) = outputs.next() {
                 done(rows.start, &[image.amplify(gain), normal]);
