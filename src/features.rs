@@ -107,6 +107,9 @@ fn z_score(channel: &mut [f32]) {
 /// The passes of the built-in models' inputs: what Blender's "Denoising Data" switch stores.
 pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo];
 
+/// Those of them that a prefilter denoises.
+pub const PREFILTERED_PASSES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
 const ALBEDO_FLOOR: f32 = 0.05;
 
@@ -135,7 +138,7 @@ pub fn guide_rows(
 ) -> Result<PassSet> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let tamed = tame_fireflies(radiance, rows.clone(), size, MIDDLE_GREY as f32 / exposure);
-    let mut part = passes.padded_rows(&[Pass::DenoisingNormal, Pass::DenoisingAlbedo], rows, size);
+    let mut part = passes.padded_rows(&PREFILTERED_PASSES, rows, size);
     part.insert(Pass::Combined, tamed);
     Ok(part)
 }

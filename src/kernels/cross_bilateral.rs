@@ -65,7 +65,9 @@ impl CrossBilateral<'_> {
         self.check();
         let (n, w) = (self.size.pixels(), self.size.w);
         assert_eq!((output.len(), total.len()), (3 * n, n));
-        each_row(w, output, total, |y, output, total| tier.run(Forward { filter: &self, y, output, total }));
+        each_row(w, [output], total, |y, [output], total| {
+            tier.run(Forward { filter: &self, y, output, total })
+        });
     }
 
     /// Adds to `into` (2 + groups, H, W) what the output's gradient (3, H, W) sends back to the

@@ -93,20 +93,27 @@ fn columns(w: usize, dx: isize) -> (usize, usize) {
     ((-dx).max(0) as usize, (w as isize - dx.max(0)) as usize)
 }
 
-/// Runs `work(row, its red, green and blue, its sums)` on every row of `w` pixels of `output` (3, H, W) and
+/// Runs `work(row, its red, green and blue in each output, its sums)` on every row of `w` pixels of `outputs`, each (3, H, W), and
 /// `total` (1, H, W).
-pub(super) fn each_row(
+pub(super) fn each_row<const N: usize>(
     w: usize,
-    output: &mut [f32],
+    outputs: [&mut [f32]; N],
     total: &mut [f32],
-    work: impl Fn(usize, [&mut [f32]; 3], &mut [f32]) + Sync,
+    work: impl Fn(usize, [[&mut [f32]; 3]; N], &mut [f32]) + Sync,
 ) {
-    let (r, rest) = output.split_at_mut(total.len());
-    let (g, b) = rest.split_at_mut(total.len());
-    let rows = r.par_chunks_mut(w).zip(g.par_chunks_mut(w)).zip(b.par_chunks_mut(w));
-    rows.zip(total.par_chunks_mut(w))
-        .enumerate()
-        .for_each(|(y, (((r, g), b), total))| work(y, [r, g, b], total));
+    let n = total.len();
+    let mut planes = outputs.map(|output| {
+        let (red, rest) = output.split_at_mut(n);
+        let (green, blue) = rest.split_at_mut(n);
+        [red, green, blue].map(|plane| plane.chunks_mut(w))
+    });
+    let mut next_row = || {
+        planes
+            .each_mut()
+            .map(|planes| planes.each_mut().map(|rows| rows.next().expect("as many as of the total")))
+    };
+    let rows: Vec<_> = total.chunks_mut(w).map(|total| (next_row(), total)).collect();
+    rows.into_par_iter().enumerate().for_each(|(y, (outputs, total))| work(y, outputs, total));
 }
 
 impl<'a> Filter<'a> {
@@ -213,18 +220,7 @@ impl<'a> Filter<'a> {
         assert!(outputs.iter().all(|output| output.len() == 3 * n));
         // Equal trust is no change of any exponent.
         let equal = vec![0.0; if self.confidence.is_none() { w } else { 0 }];
-        let mut planes = outputs.map(|output| {
-            let (red, rest) = output.split_at_mut(n);
-            let (green, blue) = rest.split_at_mut(n);
-            [red, green, blue].map(|plane| plane.chunks_mut(w))
-        });
-        let mut next_row = || {
-            planes
-                .each_mut()
-                .map(|planes| planes.each_mut().map(|rows| rows.next().expect("as many as of the total")))
-        };
-        let rows: Vec<_> = total.chunks_mut(w).map(|total| (next_row(), total)).collect();
-        rows.into_par_iter().enumerate().for_each(|(y, (output, total))| {
+        each_row(w, outputs, total, |y, output, total| {
             let line = |values: &'a [f32], row: usize| &values[row * w..][..w];
             let taps = self.taps(y).into_iter().map(|(tap, row, dx)| Tap {
                 logits: line(self.logits, tap * (n / w) + y),
@@ -424,7 +420,9 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
     );
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
     let rows = [image, confidence];
-    each_row(w, output, total, |y, output, total| vectorised::run(Squares { size, y, rows, output, total }));
+    each_row(w, [output], total, |y, [output], total| {
+        vectorised::run(Squares { size, y, rows, output, total })
+    });
 }
 
 /// One row of what [`reduce`] makes.

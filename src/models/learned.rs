@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    features::{exposure, guide_rows},
+    features::{PREFILTERED_PASSES, exposure, guide_rows},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -106,11 +106,7 @@ impl Learned {
         let odd = (size.0 | 1, size.1 | 1);
         let exposure = exposure(passes.require(Pass::Combined, TURNED)?);
         let turned = HALF_TURN.passes(&guide_rows(passes, 0..size.1, odd, exposure, TURNED)?);
-        let guides = HALF_TURN.passes(&guides.padded_rows(
-            &[Pass::DenoisingAlbedo, Pass::DenoisingNormal],
-            0..size.1,
-            odd,
-        ));
+        let guides = HALF_TURN.passes(&guides.padded_rows(&PREFILTERED_PASSES, 0..size.1, odd));
         let image = self.network.infer_with(&turned, &guides, tile)?.turned();
         Ok(image.window((0, 0), size))
     }

@@ -28,8 +28,8 @@ use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, dupli
 use crate::{
     Result,
     features::{
-        GUIDE_PASSES, Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows,
-        guide_targets, guides, noisy_guides, normal_of_target,
+        GUIDE_PASSES, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target,
+        exposure, guide_rows, guide_targets, guides, noisy_guides, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{blend::CORNERS, memory::PlaneBuffer, narrow::Steps},
@@ -59,9 +59,6 @@ const HEAD_GAIN: f32 = 0.3;
 
 /// What the names of a prefilter's layers begin with.
 pub const PREFILTER: &str = "prefilter.";
-
-/// The passes that a prefilter denoises.
-const PREFILTERED_PASSES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 
 /// Who asks for passes, in messages.
 const NEEDED_BY: &str = "this model";
@@ -400,14 +397,14 @@ impl Network for Pyramid {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
-        let Some(prefilter) = &self.prefilter else {
+        let Some(mut clean) = self.clean_guides(passes)? else {
             let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
             return noisy_guides(passes, exposure, NEEDED_BY);
         };
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
         let (rows, size) = (0..passes.height, (passes.width, passes.height));
-        let [albedo, normal] = bands::infer_guides(prefilter, passes, None)?;
-        let (albedo, normal) = (albedo_of_target(albedo), normal_of_target(normal));
+        let mut take = |pass| clean.remove(pass).expect("a clean guide");
+        let (albedo, normal) = (take(Pass::DenoisingAlbedo), take(Pass::DenoisingNormal));
         let shading = Shading::of(passes, exposure, NEEDED_BY)?.rows(passes, rows.clone(), NEEDED_BY)?;
         let refined = Refined { albedo, normal, shading };
         guides(&guide_rows(passes, rows, size, exposure, NEEDED_BY)?, refined, exposure, NEEDED_BY)

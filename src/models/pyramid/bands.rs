@@ -8,12 +8,12 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, PREFILTERED_PASSES, Prediction, Pyramid, kernel_of};
+use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
 use crate::{
     Result,
     features::{
-        self, Inputs, Refined, Shading, albedo_exposure, albedo_of_target, exposure, guide_rows, keep_black,
-        noisy_guides, normal_of_target,
+        self, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
+        guide_rows, keep_black, noisy_guides, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{Shape, blend::Place},
@@ -85,28 +85,22 @@ pub fn infer(
         }
     } else {
         let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
-        let mut prefiltered = Feed::new(prefilter, size, cut.rows);
-        let guide_exposure = albedo_exposure(albedo);
         let mut held: Option<[Planes; 2]> = None;
-        for band in cut.bands() {
-            let padded = cut.padded(&band);
-            let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
-            // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
-            prefiltered.push(noisy_guides(&band, guide_exposure, NEEDED_BY)?, &mut |first, parts| {
-                let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
-                let end = first + clean[0].height;
-                if let Some(held) = held.take() {
-                    clean = [0, 1].map(|i| held[i].above(&clean[i]));
-                }
-                if end < passes.height && cut.is_last(end) {
-                    held = Some(clean);
-                    return Ok(());
-                }
-                let [albedo, normal] = clean;
-                let rows = end - albedo.height..end;
-                feed(rows, [albedo_of_target(albedo), normal_of_target(normal)])
-            })?;
-        }
+        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
+        prefilter_bands(prefilter, passes, &cut, &mut |first, parts| {
+            let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
+            let end = first + clean[0].height;
+            if let Some(held) = held.take() {
+                clean = [0, 1].map(|i| held[i].above(&clean[i]));
+            }
+            if end < passes.height && cut.is_last(end) {
+                held = Some(clean);
+                return Ok(());
+            }
+            let [albedo, normal] = clean;
+            let rows = end - albedo.height..end;
+            feed(rows, [albedo_of_target(albedo), normal_of_target(normal)])
+        })?;
     }
     keep_black(&mut image, radiance, albedo);
     Ok(image)
@@ -117,21 +111,31 @@ pub fn infer(
 /// # Errors
 /// A pass is missing.
 pub fn infer_guides(prefilter: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
+    let size = (passes.width, passes.height);
+    let mut guides: [Planes; 2] = Default::default();
+    prefilter_bands(prefilter, passes, &Cut::new(prefilter, passes, rows), &mut |first, parts| {
+        guides.iter_mut().zip(parts).for_each(|(guide, part)| append(guide, size, first, part));
+        Ok(())
+    })?;
+    Ok(guides)
+}
+
+/// Denoises a frame's guides and hands out what is done of them, as [`Feed::push`] does.
+fn prefilter_bands(
+    prefilter: &Pyramid,
+    passes: &PassSet,
+    cut: &Cut,
+    done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
+) -> Result<()> {
     let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
     passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
-    let cut = Cut::new(prefilter, passes, rows);
-    let size = (passes.width, passes.height);
-    let mut feed = Feed::new(prefilter, size, cut.rows);
-    let mut guides: [Planes; 2] = Default::default();
+    let mut feed = Feed::new(prefilter, (passes.width, passes.height), cut.rows);
     for band in cut.bands() {
         let padded = cut.padded(&band);
         let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
-        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, &mut |first, parts| {
-            guides.iter_mut().zip(parts).for_each(|(guide, part)| append(guide, size, first, part));
-            Ok(())
-        })?;
+        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, done)?;
     }
-    Ok(guides)
+    Ok(())
 }
 
 /// Writes the next rows of planes that are `size` columns and rows in the end.
@@ -243,14 +247,11 @@ struct Frame<'a> {
     decoder: Vec<Decoded>,
     /// Full resolution first.
     scales: Vec<Scale>,
-    /// The rows that are there, and how many there will be.
-    rows: usize,
-    height: usize,
     albedo: Line<Field>,
     /// For a refit.
     normal: Line<Field>,
     /// What was divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is
-    /// to divide; rows go to the finest scale's image at once where it does not say.
+    /// to divide.
     quotient: Line<Field>,
     ratio: Line<Field>,
     /// What normals tell of the light, until the network says how far to follow it.
@@ -326,8 +327,6 @@ impl<'a> Frame<'a> {
             encoders: [encoder(), encoder()],
             decoder: (0..LEVELS).map(decoded).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
-            rows: 0,
-            height,
             albedo: Line::new(height),
             normal: Line::new(height),
             quotient: Line::new(height),
@@ -343,7 +342,6 @@ impl<'a> Frame<'a> {
         let mut next = || inputs.next().expect("`guides` makes seven planes, `noisy_guides` four");
         let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
         let [image, second, radiance, guide] = std::array::from_fn(|_| next());
-        self.rows += image.height;
         if let [first, normal] = &mut self.scales[0].images[..] {
             first.image.push(field(image));
             normal.image.push(field(second));
@@ -363,12 +361,12 @@ impl<'a> Frame<'a> {
 
     /// Whether all inputs are there.
     fn is_whole(&self) -> bool {
-        self.rows == self.height
+        self.encoders[0][0].input.end() == self.encoders[0][0].input.total()
     }
 
     /// Whether everything is computed.
     fn is_done(&self) -> bool {
-        self.scales[0].filtered == self.height
+        self.scales[0].filtered == self.scales[0].confidence.total()
     }
 
     /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
