@@ -338,18 +338,19 @@ fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 7);
-    // The gains of four pixels follow their kernels, confidences, masks and corners.
-    const GAINS: std::ops::Range<usize> = 60..72;
+    // The gains of four pixels follow their kernels, of 9 pixels, a prefilter's of 25, confidences, masks and corners.
+    let gains = |taps: usize| 4 * (taps + 6)..4 * (taps + 9);
     for (logit, gain) in [(0.0, 1.0), (-50.0, (-2.0f32).exp()), (50.0, 2.0f32.exp())] {
         for param in network.params() {
             let each = param.shape.iter().skip(1).product::<usize>();
-            let value = match param.name.as_str() {
-                "head.full.weight" | "prefilter.head.full.weight" | "prefilter.head.full.bias" => 0.0,
-                "head.full.bias" => logit,
+            let (gains, value) = match param.name.as_str() {
+                "prefilter.head.full.weight" | "prefilter.head.full.bias" => (gains(25), 0.0),
+                "head.full.weight" => (gains(9), 0.0),
+                "head.full.bias" => (gains(9), logit),
                 _ => continue,
             };
             let mut values = param.values();
-            values[GAINS.start * each..GAINS.end * each].fill(value);
+            values[gains.start * each..gains.end * each].fill(value);
             param.set(&values);
         }
         let image = network.infer(&passes, None).expect("all passes are there");

@@ -41,7 +41,8 @@ use crate::{
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
 pub const LEVELS: usize = 4;
 
-/// Rows and columns of the radiance kernels below full resolution, and at it.
+/// Rows and columns of kernels, and of the radiance kernels at full resolution: what is as thin as a pixel there, texture and
+/// edges, was divided away with the guides, whose own kernels need more than nine pixels to average along it.
 const KERNEL: usize = 5;
 const FULL_KERNEL: usize = 3;
 
@@ -103,20 +104,20 @@ struct Level {
     refine: Conv,
 }
 
-/// Rows and columns of the kernels of a level of the radiance pyramid, 0 the finest.
-const fn kernel_of(level: usize) -> usize {
-    if level == 0 { FULL_KERNEL } else { KERNEL }
+/// Rows and columns of the kernels of a level of the pyramid that is filtered, 0 the finest.
+const fn kernel_of(architecture: Architecture, level: usize) -> usize {
+    if level == 0 && !matches!(architecture, Architecture::Prefilter) { FULL_KERNEL } else { KERNEL }
 }
 
-/// Channels of that level's head for one pixel: kernel, confidence, the mask that blends the level below, and the
+/// Channels of a level's head for one pixel: k x k kernel, confidence, the mask that blends the level below, and the
 /// corners from which that is upsampled.
-const fn head_of(level: usize) -> usize {
-    kernel_of(level).pow(2) + 2 + CORNERS
+const fn head_of(k: usize) -> usize {
+    k * k + 2 + CORNERS
 }
 
 /// What a head says of one level of the radiance pyramid.
 struct Prediction<T> {
-    /// Logits of the kernels, (N, 25, H, W); (N, 9, H, W) at full resolution.
+    /// Logits of the kernels, (N, 25, H, W); (N, 9, H, W) of radiance at full resolution.
     kernel: Field<T>,
     /// How far each pixel is to be trusted, (N, 1, H, W).
     confidence: Field<T>,
@@ -154,12 +155,16 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
         }
     }
 
-    /// Parts what the head of full resolution says, which has `count` planes.
-    fn split_full(count: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> (Self, Finish<T>) {
-        let prediction = Self::split(FULL_KERNEL, &mut planes);
-        let (divisor, shade) = (head_of(0) + GAINS, head_of(0) + GAINS + DIVISOR);
+    /// Parts what the head of full resolution says, k x k kernels first, which has `count` planes.
+    fn split_full(
+        k: usize,
+        count: usize,
+        mut planes: impl FnMut(usize, usize) -> Field<T>,
+    ) -> (Self, Finish<T>) {
+        let prediction = Self::split(k, &mut planes);
+        let (divisor, shade) = (head_of(k) + GAINS, head_of(k) + GAINS + DIVISOR);
         let refined = (shade < count).then(|| (planes(divisor, DIVISOR), planes(shade, SHADE)));
-        (prediction, Finish { gain: planes(head_of(0), GAINS), refined })
+        (prediction, Finish { gain: planes(head_of(k), GAINS), refined })
     }
 }
 
@@ -236,6 +241,7 @@ impl Pyramid {
             Encoder::new(rng, &format!("{prefix}encoder.guide"), guides, widths),
         ];
         let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
+        let head_width = |level: usize| head_of(kernel_of(config.architecture, level));
         let decoder = (0..LEVELS).rev().map(|level| {
             let (width, skip) = (decoder_width(level), widths[level]);
             let up = (level + 1 < LEVELS).then(|| {
@@ -256,8 +262,10 @@ impl Pyramid {
             Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
         };
         Self {
-            full: head("head.full".into(), decoder_width(0), 4 * (head_of(0) + finish)),
-            heads: (0..LEVELS).map(|l| head(format!("head.{l}"), decoder_width(l), head_of(l + 1))).collect(),
+            full: head("head.full".into(), decoder_width(0), 4 * (head_width(0) + finish)),
+            heads: (0..LEVELS)
+                .map(|l| head(format!("head.{l}"), decoder_width(l), head_width(l + 1)))
+                .collect(),
             config,
             prefilter: None,
             encoders,
@@ -268,6 +276,11 @@ impl Pyramid {
     /// Whether it is a prefilter, which denoises albedo and normal, not radiance.
     fn denoises_guides(&self) -> bool {
         self.config.architecture == Architecture::Prefilter
+    }
+
+    /// Rows and columns of the kernels of a level, 0 the finest.
+    fn kernel(&self, level: usize) -> usize {
+        kernel_of(self.config.architecture, level)
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch) -> Images<T> {
@@ -295,7 +308,8 @@ impl Pyramid {
         let count = full.shape().c / 4;
 
         // What is predicted for every pyramid level, full resolution first.
-        let (finest, Finish { gain, refined: predicted }) = Prediction::split_full(count, planes_of(full, 2));
+        let (finest, Finish { gain, refined: predicted }) =
+            Prediction::split_full(self.kernel(0), count, planes_of(full, 2));
         let mut levels = vec![finest];
         levels.extend(heads.into_iter().rev().map(|head| Prediction::split(KERNEL, planes_of(head, 1))));
 
@@ -349,7 +363,8 @@ fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(mut image: Field<T>, levels: Vec<
             // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
             Some(below) => noisy.blend(below, mask, corners),
         };
-        let filtered = blended.filter(kernel_of(pyramid.len()), kernel, Some(confidence));
+        let k = kernel.extent().1.isqrt();
+        let filtered = blended.filter(k, kernel, Some(confidence));
         if pyramid.is_empty() {
             return filtered;
         }
@@ -474,7 +489,7 @@ impl Network for Pyramid {
             .sum();
         // Three channels of each image and the sum of weights, at every pyramid level.
         let images = if self.denoises_guides() { 2 } else { 1 };
-        let taps = |level: usize| (4 * images * kernel_of(level).pow(2)) as f64 / 4f64.powi(level as i32);
+        let taps = |level: usize| (4 * images * self.kernel(level).pow(2)) as f64 / 4f64.powi(level as i32);
         let filters: f64 = (0..=LEVELS).map(taps).sum();
         let prefilter = self.prefilter.as_ref().map_or(0.0, |prefilter| prefilter.macs_per_pixel());
         convolutions + filters + prefilter
@@ -484,7 +499,7 @@ impl Network for Pyramid {
         // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
         let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
         let prefilter = self.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
-        trunk + (0..=LEVELS).map(|level| (kernel_of(level) / 2 + 1) << level).sum::<usize>() + prefilter
+        trunk + (0..=LEVELS).map(|level| (self.kernel(level) / 2 + 1) << level).sum::<usize>() + prefilter
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {

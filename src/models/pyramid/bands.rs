@@ -8,7 +8,7 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid, kernel_of};
+use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
 use crate::{
     Result,
     features::{
@@ -426,7 +426,7 @@ impl<'a> Frame<'a> {
                 let head = self.network.full.forward_planes(&fine, 2);
                 let planes = |first, count| head.channels(first, count);
                 let (prediction, Finish { mut gain, refined }) =
-                    Prediction::split_full(head.extent().1, planes);
+                    Prediction::split_full(self.network.kernel(0), head.extent().1, planes);
                 let rows = 2 * rows.start..2 * rows.end;
                 if let Some((divisor, shade)) = refined {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
@@ -478,7 +478,8 @@ impl<'a> Frame<'a> {
 
     /// Filters the images; at full resolution, hands out what becomes of them.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
-        let (k, reach) = (kernel_of(scale), kernel_of(scale) / 2);
+        let k = self.network.kernel(scale);
+        let reach = k / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
         while let Some((rows, _)) = kernels.front() {
             let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
@@ -535,7 +536,7 @@ impl<'a> Frame<'a> {
             let above =
                 scale.checked_sub(1).map_or(0, |above| self.scales[above].images[0].blended.end() / 2);
             let Scale { images, confidence, filtered, .. } = &mut self.scales[scale];
-            let reach = filtered.saturating_sub(kernel_of(scale) / 2);
+            let reach = filtered.saturating_sub(self.network.kernel(scale) / 2);
             confidence.forget(reach.min(reduced));
             for Filtered { image, blended, smooth } in images {
                 image.forget(reach.min(reduced));
