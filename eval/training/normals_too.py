@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Makes a prefilter of the albedo alone one that `demc train --model prefilter --init` can begin with: normals_too.py IN OUT
+"""Makes a prefilter of the albedo alone one of albedo and normal, as `demc train --model prefilter` made them up to commit c9eb157:
+normals_too.py IN OUT
 
 IN is what prefilter.py takes out of weights of commit 42b799c and before. Its guide encoder also read an albedo of 1, which now goes
-into the biases. Needs numpy.
+into the biases. For what is trained since, wider_kernels.py comes next. Needs numpy.
 """
 
 import sys
