@@ -23,7 +23,7 @@ pub struct Args {
     /// Method that the summary's ratios refer to [default: the first of --models]
     #[arg(long, value_name = "NAME")]
     baseline: Option<String>,
-    /// Timed runs of each method and scene after one that warms up; their median counts
+    /// Timed runs of each method and scene, each after one that warms up; their median counts
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..))]
     repeats: u16,
     /// Write no comparison sheets

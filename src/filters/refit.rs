@@ -1,7 +1,7 @@
 //! What guides and samples still tell of a frame that a network has denoised.
 //!
 //! A network blurs some of the texture that the albedo did not account for, and leaves blotches on even walls. Both show
-//! against the guides: around every pixel, two planes are fitted over the axes of the normal and the logarithms of the
+//! against the guides: around every pixel, two planes a colour are fitted over the axes of the normal and the logarithms of the
 //! albedo, both clean. One is fitted to the noisy radiance over the denoised, whose hundreds of samples tell what slopes were missed, as
 //! regression over features does (Bitterli et al. 2016). The other is fitted to the logarithm of what was denoised, which gives way
 //! to it where it varies little besides: a guided filter (He et al. 2013) that has its own image for a guide as well.
@@ -32,16 +32,18 @@ const GUIDES: usize = 6;
 /// What is fitted: a constant and the slopes.
 const KNOWN: usize = GUIDES + 1;
 
-/// What is fitted to, of the mean of the colours: the logarithm of what is denoised, and the samples over it.
-const TARGETS: usize = 2;
+const COLOURS: usize = 3;
+
+/// What is fitted to: each colour's logarithm of what is denoised, then each colour's samples over that.
+const TARGETS: usize = 2 * COLOURS;
 
 /// Sums over pixels of the products of every two of the first, a lower triangle row by row; then for each target its products with
 /// those, and its square.
 const MOMENTS: usize = KNOWN * (KNOWN + 1) / 2 + TARGETS * (KNOWN + 1);
 
-/// What is kept of each square: the slopes of its change over the guides, a constant, and the share of its own logarithm that is
-/// taken away.
-const KEPT: usize = KNOWN + 1;
+/// What is kept of each square for each colour: a constant and the slopes of its change over the guides, and over its own logarithm,
+/// of which a share is taken away.
+const KEPT: usize = COLOURS * (KNOWN + 1);
 
 /// Added to the variances of an axis and of a logarithm: how much of a guide is noise, or too little to tell of anything.
 const GUIDE_NOISE: [f32; GUIDES] = [1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4];
@@ -55,7 +57,7 @@ const BLOTCHES: f32 = 0.09;
 /// Variance of the samples over what was denoised from which on blotches are that large: with less noise there is less of them.
 const NOISY: f32 = 0.1;
 
-/// Exposed radiance over albedo (the mean of the colours, as below) that is added to samples and to what is denoised before one is
+/// Exposed radiance over albedo that is added to samples and to what is denoised before one is
 /// divided by the other, and before the latter's logarithm: relative errors of what is darker count less and less.
 const SAMPLE_FLOOR: f32 = 0.3;
 const FLOOR: f32 = 0.007;
@@ -63,8 +65,8 @@ const FLOOR: f32 = 0.007;
 /// A sample is at most this many times what was denoised, as fireflies would decide on slopes all around them.
 const MOST: f32 = 2.0;
 
-/// Exposed radiance over albedo, 8 times middle grey, from which on a pixel counts less and less: lamps say nothing of the walls
-/// around.
+/// Exposed radiance over albedo, the mean of the colours, 8 times middle grey, from which on a pixel counts less and less: lamps say
+/// nothing of the walls around.
 const BRIGHT: f32 = 1.5;
 
 /// The logarithm of the largest change.
@@ -220,13 +222,13 @@ impl Refit {
         let memory = || Memory {
             pixels: Pixels::new(self.squares),
             fit: vec![0.0; KEPT * (self.squares + 2)],
-            factors: vec![0.0; SQUARE * self.squares],
+            factors: [(); COLOURS].map(|()| vec![0.0; SQUARE * self.squares]),
         };
         let colours = red.zip(green).zip(blue).zip(rows);
         colours.for_each_init(memory, |memory, (((red, green), blue), y)| {
             self.find(guides, [red, green, blue], y, memory);
-            for row in [red, green, blue] {
-                interleave(&memory.factors, self.squares, row, &change);
+            for (row, factors) in [red, green, blue].into_iter().zip(&memory.factors) {
+                interleave(factors, self.squares, row, &change);
             }
         });
     }
@@ -245,7 +247,8 @@ struct Memory {
     pixels: Pixels,
     /// The fits as they are at that row, a square more on either side.
     fit: Vec<f32>,
-    factors: Vec<f32>,
+    /// Of each colour.
+    factors: [Vec<f32>; COLOURS],
 }
 
 /// What is known of the pixels of a row, and what they are fitted to. Lines hold first the first pixels of all squares, then the
@@ -257,10 +260,10 @@ struct Pixels {
     targets: Vec<f32>,
     /// How much each counts.
     weight: Vec<f32>,
-    /// Radiance over albedo, the mean of the colours.
-    light: Vec<f32>,
-    /// Memory for a row.
+    /// Radiance as denoised, and albedo.
+    image: Vec<f32>,
     albedo: Vec<f32>,
+    /// Memory for a row.
     spare: Vec<f32>,
 }
 
@@ -273,14 +276,14 @@ impl Pixels {
             known: line(KNOWN, 1.0),
             targets: line(TARGETS, 0.0),
             weight: line(1, 0.0),
-            light: line(1, 0.0),
-            albedo: line(3, 1.0),
+            image: line(COLOURS, 0.0),
+            albedo: line(COLOURS, 1.0),
             spare: line(1, 0.0),
         }
     }
 
-    /// Reads what is known of row `y`: how much its pixels count, their guides, and the logarithm of what is denoised, the first
-    /// target.
+    /// Reads what is known of row `y`: how much its pixels count, their guides, and the logarithms of what is denoised, the first
+    /// targets.
     #[inline(always)]
     fn read(&mut self, guides: Guides, image: [&[f32]; 3], y: usize) {
         let len = SQUARE * self.squares;
@@ -294,19 +297,25 @@ impl Pixels {
             let logarithms = &mut self.known[(4 + c) * len..][..len];
             logarithms.iter_mut().zip(albedo).for_each(|(logarithm, a)| *logarithm = ln(*a));
         }
-        let line = &mut self.spare[..len];
-        self.light.fill(0.0);
         for (c, row) in image.into_iter().enumerate() {
-            part(row, self.squares, line);
-            let albedo = &self.albedo[c * len..][..len];
-            for (sum, (v, a)) in self.light.iter_mut().zip(line.iter().zip(albedo)) {
-                *sum += v.max(0.0) / (3.0 * a);
+            let [image, albedo] =
+                [&mut self.image, &mut self.albedo].map(|planes| &mut planes[c * len..][..len]);
+            part(row, self.squares, image);
+            let read = self.known[(4 + c) * len..][..len].iter().zip(image.iter_mut().zip(&*albedo));
+            for (target, (logarithm, (v, a))) in self.targets[c * len..][..len].iter_mut().zip(read) {
+                *v = v.max(0.0);
+                *target = ln(*v + FLOOR * a) - logarithm;
             }
         }
-        for ((weight, target), light) in self.weight.iter_mut().zip(&mut self.targets).zip(&self.light) {
-            let square = (light * (1.0 / BRIGHT)) * (light * (1.0 / BRIGHT));
-            *weight = 1.0 / (1.0 + square * square);
-            *target = ln(light + FLOOR);
+        let [red, green, blue] = [0, 1, 2].map(|c| &self.image[c * len..][..len]);
+        let [of_red, of_green, of_blue] = [0, 1, 2].map(|c| &self.albedo[c * len..][..len]);
+        for (i, weight) in self.weight.iter_mut().enumerate() {
+            // Of the mean of the quotients, all over one denominator: divisions are what takes time here.
+            let least = (3.0 * BRIGHT) * of_red[i] * of_green[i] * of_blue[i];
+            let light = red[i] * of_green[i] * of_blue[i]
+                + of_red[i] * (green[i] * of_blue[i] + of_green[i] * blue[i]);
+            let [least, light] = [least, light].map(|v| (v * v) * (v * v));
+            *weight = least / (least + light);
         }
         // Pixels of the last squares beyond the frame.
         for beyond in width..len {
@@ -314,28 +323,33 @@ impl Pixels {
         }
     }
 
-    /// Reads the samples over what is denoised, the other target.
+    /// Reads the samples over what is denoised, the other targets.
     #[inline(always)]
     fn read_samples(&mut self, guides: Guides, samples: Samples, y: usize) {
         let len = SQUARE * self.squares;
-        let (line, target) = (&mut self.spare[..len], &mut self.targets[len..]);
-        target.fill(0.0);
-        for c in 0..3 {
-            let albedo = &self.albedo[c * len..][..len];
+        let line = &mut self.spare[..len];
+        for c in 0..COLOURS {
+            let [albedo, image] = [&self.albedo, &self.image].map(|planes| &planes[c * len..][..len]);
+            let target = &mut self.targets[(COLOURS + c) * len..][..len];
+            let read = image.iter().zip(albedo);
+            let over = |sample: f32, (image, albedo): (&f32, &f32)| {
+                let floor = SAMPLE_FLOOR * albedo;
+                ((sample + floor) / (image + floor)).min(MOST)
+            };
             match samples {
                 Samples::Divided(samples) => {
                     part(guides.row(samples, y)[c], self.squares, line);
-                    target.iter_mut().zip(&*line).for_each(|(sum, sample)| *sum += sample);
+                    for (target, (v, read)) in target.iter_mut().zip(line.iter().zip(read)) {
+                        *target = over(v * read.1, read);
+                    }
                 }
                 Samples::Rendered(samples, exposure) => {
                     part(guides.row(samples, y)[c], self.squares, line);
-                    let read = line.iter().zip(albedo);
-                    target.iter_mut().zip(read).for_each(|(sum, (v, a))| *sum += v.max(0.0) * exposure / a);
+                    for (target, (v, read)) in target.iter_mut().zip(line.iter().zip(read)) {
+                        *target = over(v.max(0.0) * exposure, read);
+                    }
                 }
             }
-        }
-        for (target, light) in target.iter_mut().zip(&self.light) {
-            *target = ((*target * (1.0 / 3.0) + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
         }
     }
 }
@@ -482,9 +496,10 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
         let found = covariance(&sums[KNOWN], mean, mean);
         *variance = each(|l| found[l].max(0.0));
     }
-    let [(mean, with, variance), (level, mut missed, noise)] = targets;
+    let (denoised, samples) = targets.split_at(COLOURS);
 
     // Slopes of the samples: a ridge that is the variance with which as many of them decide on one.
+    let noise = each(|l| samples.iter().map(|(_, _, noise)| noise[l]).sum::<f32>() * (1.0 / COLOURS as f32));
     let doubt = each(|l| noise[l].max(LEAST_NOISE) / ((PIXELS * SLOPE * SLOPE) * count[l].max(LEAST_COUNT)));
     let mut doubted = covariances.clone();
     let mut diagonal = 0;
@@ -494,30 +509,33 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
     }
     let mut doubted = Symmetric::of(GUIDES, doubted);
     doubted.factor();
-    doubted.solve(&mut missed);
     let mut plain = Symmetric::of(GUIDES, covariances);
     plain.factor();
-    let mut smooth = with;
-    plain.solve(&mut smooth);
-
-    let mut rest = variance;
-    for i in 0..GUIDES {
-        rest = each(|l| rest[l] - smooth[i][l] * with[i][l]);
-    }
-    let given = each(|l| {
-        let blotches = BLOTCHES * BLOTCHES * (noise[l].max(LEAST_NOISE) * (1.0 / NOISY)).min(1.0);
-        let share = blotches / (rest[l].max(0.0) + blotches);
-        if inverse[l] > 0.0 { share } else { 0.0 }
-    });
     let mut kept = [[0.0; LANES]; KEPT];
-    let mut constant = each(|l| given[l] * mean[l]);
-    for i in 0..GUIDES {
-        // What was missed lies on a plane itself, so of it nothing is taken away.
-        kept[i] = each(|l| given[l] * smooth[i][l] + missed[i][l] / level[l].max(LEAST_LEVEL));
-        constant = each(|l| constant[l] - kept[i][l] * means[i][l]);
+    for ((kept, (mean, with, variance)), (level, missed, _)) in
+        kept.chunks_exact_mut(KNOWN + 1).zip(denoised).zip(samples)
+    {
+        let (mut missed, mut smooth) = (*missed, *with);
+        doubted.solve(&mut missed);
+        plain.solve(&mut smooth);
+        let mut rest = *variance;
+        for i in 0..GUIDES {
+            rest = each(|l| rest[l] - smooth[i][l] * with[i][l]);
+        }
+        let given = each(|l| {
+            let blotches = BLOTCHES * BLOTCHES * (noise[l].max(LEAST_NOISE) * (1.0 / NOISY)).min(1.0);
+            let share = blotches / (rest[l].max(0.0) + blotches);
+            if inverse[l] > 0.0 { share } else { 0.0 }
+        });
+        let mut constant = each(|l| given[l] * mean[l]);
+        for i in 0..GUIDES {
+            // What was missed lies on a plane itself, so of it nothing is taken away.
+            kept[1 + i] = each(|l| given[l] * smooth[i][l] + missed[i][l] / level[l].max(LEAST_LEVEL));
+            constant = each(|l| constant[l] - kept[1 + i][l] * means[i][l]);
+        }
+        kept[0] = constant;
+        kept[KNOWN] = given.map(|share| -share);
     }
-    kept[GUIDES] = constant;
-    kept[KNOWN] = given;
     kept
 }
 
@@ -548,29 +566,30 @@ impl Vectorised for Factors<'_> {
             fit[0] = fit[1];
             fit[squares + 1] = fit[squares];
         }
-        let mut fit = fit.chunks_exact(squares + 2);
-        factors.fill(0.0);
-        for guide in known[len..].chunks_exact(len) {
-            add_interpolated(1.0, fit.next().expect("a line for each guide"), guide, factors);
-        }
-        add_interpolated(1.0, fit.next().expect("a line of constants"), &known[..len], factors);
-        add_interpolated(-1.0, fit.next().expect("a line of shares"), &targets[..len], factors);
-        for (factor, weight) in factors.iter_mut().zip(&*weight) {
-            *factor = exp((*factor * weight).clamp(-LARGEST, LARGEST));
+        let of_colours = fit.chunks_exact((KNOWN + 1) * (squares + 2)).zip(targets.chunks_exact(len));
+        for (factors, (fit, denoised)) in factors.iter_mut().zip(of_colours) {
+            factors.fill(0.0);
+            for (fit, pixels) in fit.chunks_exact(squares + 2).zip(known.chunks_exact(len).chain([denoised]))
+            {
+                add_interpolated(fit, pixels, factors);
+            }
+            for (factor, weight) in factors.iter_mut().zip(&*weight) {
+                *factor = exp((*factor * weight).clamp(-LARGEST, LARGEST));
+            }
         }
     }
 }
 
-/// Adds values of squares, interpolated between their middles, times those of pixels and `sign`.
+/// Adds values of squares, interpolated between their middles, times those of pixels.
 #[inline(always)]
-fn add_interpolated(sign: f32, squares: &[f32], pixels: &[f32], sums: &mut [f32]) {
+fn add_interpolated(squares: &[f32], pixels: &[f32], sums: &mut [f32]) {
     let n = squares.len() - 2;
     for (phase, (sums, pixels)) in sums.chunks_exact_mut(n).zip(pixels.chunks_exact(n)).enumerate() {
         // The first half of a square's pixels lies between its middle and that of the square before.
         let (first, share) = between_of(phase);
         let (left, right) = (&squares[first..][..n], &squares[first + 1..][..n]);
         for ((sum, pixel), (left, right)) in sums.iter_mut().zip(pixels).zip(left.iter().zip(right)) {
-            *sum += sign * (left + (right - left) * share) * pixel;
+            *sum += (left + (right - left) * share) * pixel;
         }
     }
 }

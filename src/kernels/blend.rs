@@ -123,9 +123,10 @@ impl Kernel for Row<'_> {
                     weights[i] = S::mul(S::splat(BILINEAR[i]), S::exp(read(corners[i])));
                     total = S::add(total, weights[i]);
                 }
+                // The share of the level below, a logistic, over the sum of its weights.
                 let negative = S::mul(read(alpha), S::splat(-1.0));
-                let share = S::div(one, S::add(one, S::exp(negative)));
-                let part = S::div(share, total);
+                let part = S::div(one, S::mul(total, S::add(one, S::exp(negative))));
+                let share = S::mul(part, total);
                 for weight in &mut weights {
                     *weight = S::mul(*weight, part);
                 }

@@ -312,8 +312,9 @@ impl<const N: usize> Forward<'_, N> {
                     *sum = S::fma(values, weights, *sum);
                 }
             }
+            let inverse = S::div(S::splat(1.0), total);
             for (out, sum) in self.output.as_flattened_mut().iter_mut().zip(sums.as_flattened()) {
-                S::write_first(out[x..].as_mut_ptr(), count, S::div(*sum, total));
+                S::write_first(out[x..].as_mut_ptr(), count, S::mul(*sum, inverse));
             }
             S::write_first(self.total[x..].as_mut_ptr(), count, total);
         }

@@ -21,18 +21,29 @@ impl LogTransfer {
     }
 }
 
+/// The polynomial `p` for `ln(1 + r) = r - r^2 / 2 + r^3 p(r)` between the roots of 1/2 and 2, highest power first, which keeps the
+/// largest relative error of the logarithm least: 6e-9 (by least squares, weighted anew until no point errs more than others).
+const LN: [f32; 8] = [
+    -0.076_344_93,
+    0.127_615_75,
+    -0.131_601_83,
+    0.142_017_59,
+    -0.166_233_57,
+    0.200_012_27,
+    -0.250_008_2,
+    0.333_333_3,
+];
+
 /// Natural logarithm of a normal positive number, to 2e-7 absolute and relative: `x = 2^n m` with m between the roots of
-/// 1/2 and 2, and `ln m = 2 atanh s` with `s = (m - 1) / (m + 1)`, whose series is cut where it is below 2^-28.
+/// 1/2 and 2, and a polynomial for `ln m`, since a division would take as long as all the rest.
 #[inline(always)]
 pub fn ln(x: f32) -> f32 {
     const ROOT_OF_HALF: u32 = 0x3f35_04f3;
     let above = x.to_bits().wrapping_sub(ROOT_OF_HALF);
     let n = (above as i32 >> 23) as f32;
-    let m = f32::from_bits((above & 0x007f_ffff) + ROOT_OF_HALF);
-    let s = (m - 1.0) / (m + 1.0);
-    let z = s * s;
-    let series = z * (1.0 / 3.0 + z * (1.0 / 5.0 + z * (1.0 / 7.0 + z * (1.0 / 9.0))));
-    n * std::f32::consts::LN_2 + 2.0 * (s + s * series)
+    let r = f32::from_bits((above & 0x007f_ffff) + ROOT_OF_HALF) - 1.0;
+    let p = LN.iter().fold(0.0, |p, c| p * r + c);
+    n * std::f32::consts::LN_2 + (r + r * r * (r * p - 0.5))
 }
 
 #[cfg(test)]

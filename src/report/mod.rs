@@ -55,7 +55,7 @@ pub struct Method {
 pub struct Options {
     /// Folder for everything that is written.
     pub out: PathBuf,
-    /// Timed runs of each method and pair, after one that warms up; their median counts.
+    /// Timed runs of each method and pair, each after one that warms up; their median counts.
     pub repeats: usize,
     /// Threads that all methods use.
     pub threads: usize,

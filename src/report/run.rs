@@ -1,8 +1,7 @@
 //! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
 //!
-//! On a pair each method runs once to warm up (that output is scored), then all take turns for the
-//! timed runs: a machine that slows down slows them all. Memory is measured apart, once for each
-//! method and size of frame.
+//! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after one of its own that is
+//! not timed: a machine that slows down slows them all. Memory is measured apart, once for each method and size of frame.
 
 use std::{collections::HashMap, fs, path::PathBuf};
 
@@ -261,7 +260,7 @@ fn run_pair(
     }
 }
 
-/// The run that warms up and is scored. None, with a reason in the row, where it fails.
+/// The run that is scored. None, with a reason in the row, where it fails.
 fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
     let image = if method.name == NOISY {
         loaded.noisy.clone()

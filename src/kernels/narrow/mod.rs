@@ -415,11 +415,11 @@ struct Quantize<'a> {
 impl Kernel for Quantize<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
+        let Steps { step, zero } = self.steps;
         for (out, block) in self.out.iter_mut().zip(self.blocks) {
             // SAFETY: vectors are the tier's.
             let bytes = unsafe {
-                let Steps { step, zero } = self.steps;
-                let steps = S::add(S::div(S::load(block), S::splat(step)), S::splat(zero.into()));
+                let steps = S::fma(S::load(block), S::splat(step.recip()), S::splat(zero.into()));
                 S::bytes(S::max(steps, S::splat(0.0)))
             };
             out.0[self.lane..][..LANES].copy_from_slice(&bytes);

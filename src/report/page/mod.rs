@@ -228,10 +228,11 @@ impl Page<'_> {
             (
                 "times",
                 format!(
-                    "denoising alone, without file traffic; after a run that warms up, the median of {} \
-                     run{} in which all methods took turns",
-                    self.options.repeats,
-                    if self.options.repeats == 1 { "" } else { "s" }
+                    "denoising alone, without file traffic; all methods took turns{}, each run after one that warms up",
+                    match self.options.repeats {
+                        1 => String::new(),
+                        repeats => format!(" {repeats} times, whose median counts"),
+                    }
                 ),
             ),
             (
