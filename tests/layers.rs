@@ -216,7 +216,7 @@ fn filtering_by_predicted_kernels() {
         let case = Case::new(name);
         let (image, logits) = (case.images("image"), case.images("logits"));
         let confidence = case.has("confidence").then(|| case.images("confidence"));
-        let &(n, taps, h, w) = logits.shape();
+        let &(n, _, h, w) = logits.shape();
         // The radiance of the network's input takes no gradient; that of coarser levels does.
         for is_input in [false, true] {
             let field = match is_input {
@@ -224,7 +224,7 @@ fn filtering_by_predicted_kernels() {
                 false => traced_field(&image),
             };
             let trust = confidence.as_ref().map(traced_field);
-            let output = field.filter(taps.isqrt(), traced_field(&logits), trust);
+            let output = field.filter(traced_field(&logits), trust);
             let gradients = case.project(output.into_images());
             case.compare_image("d_logits", &gradients, &logits);
             if let Some(confidence) = &confidence {

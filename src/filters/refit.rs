@@ -260,10 +260,10 @@ struct Pixels {
     targets: Vec<f32>,
     /// How much each counts.
     weight: Vec<f32>,
-    /// Radiance as denoised, and albedo.
-    image: Vec<f32>,
-    albedo: Vec<f32>,
+    /// Radiance over albedo, of each colour.
+    light: Vec<f32>,
     /// Memory for a row.
+    albedo: Vec<f32>,
     spare: Vec<f32>,
 }
 
@@ -276,8 +276,8 @@ impl Pixels {
             known: line(KNOWN, 1.0),
             targets: line(TARGETS, 0.0),
             weight: line(1, 0.0),
-            image: line(COLOURS, 0.0),
-            albedo: line(COLOURS, 1.0),
+            light: line(COLOURS, 0.0),
+            albedo: line(3, 1.0),
             spare: line(1, 0.0),
         }
     }
@@ -297,25 +297,22 @@ impl Pixels {
             let logarithms = &mut self.known[(4 + c) * len..][..len];
             logarithms.iter_mut().zip(albedo).for_each(|(logarithm, a)| *logarithm = ln(*a));
         }
-        for (c, row) in image.into_iter().enumerate() {
-            let [image, albedo] =
-                [&mut self.image, &mut self.albedo].map(|planes| &mut planes[c * len..][..len]);
-            part(row, self.squares, image);
-            let read = self.known[(4 + c) * len..][..len].iter().zip(image.iter_mut().zip(&*albedo));
-            for (target, (logarithm, (v, a))) in self.targets[c * len..][..len].iter_mut().zip(read) {
-                *v = v.max(0.0);
-                *target = ln(*v + FLOOR * a) - logarithm;
+        let line = &mut self.spare[..len];
+        let of_colours = self.light.chunks_exact_mut(len).zip(self.albedo.chunks_exact(len));
+        for (row, (light, albedo)) in image.into_iter().zip(of_colours) {
+            part(row, self.squares, line);
+            for (light, (v, a)) in light.iter_mut().zip(line.iter().zip(albedo)) {
+                *light = v.max(0.0) / a;
             }
         }
-        let [red, green, blue] = [0, 1, 2].map(|c| &self.image[c * len..][..len]);
-        let [of_red, of_green, of_blue] = [0, 1, 2].map(|c| &self.albedo[c * len..][..len]);
+        let [red, green, blue] = [0, 1, 2].map(|c| &self.light[c * len..][..len]);
         for (i, weight) in self.weight.iter_mut().enumerate() {
-            // Of the mean of the quotients, all over one denominator: divisions are what takes time here.
-            let least = (3.0 * BRIGHT) * of_red[i] * of_green[i] * of_blue[i];
-            let light = red[i] * of_green[i] * of_blue[i]
-                + of_red[i] * (green[i] * of_blue[i] + of_green[i] * blue[i]);
-            let [least, light] = [least, light].map(|v| (v * v) * (v * v));
-            *weight = least / (least + light);
+            let light = (red[i] + green[i] + blue[i]) * (1.0 / 3.0);
+            let square = (light * (1.0 / BRIGHT)) * (light * (1.0 / BRIGHT));
+            *weight = 1.0 / (1.0 + square * square);
+        }
+        for (target, light) in self.targets.iter_mut().zip(&self.light) {
+            *target = ln(light + FLOOR);
         }
         // Pixels of the last squares beyond the frame.
         for beyond in width..len {
@@ -329,24 +326,20 @@ impl Pixels {
         let len = SQUARE * self.squares;
         let line = &mut self.spare[..len];
         for c in 0..COLOURS {
-            let [albedo, image] = [&self.albedo, &self.image].map(|planes| &planes[c * len..][..len]);
+            let [albedo, light] = [&self.albedo, &self.light].map(|planes| &planes[c * len..][..len]);
             let target = &mut self.targets[(COLOURS + c) * len..][..len];
-            let read = image.iter().zip(albedo);
-            let over = |sample: f32, (image, albedo): (&f32, &f32)| {
-                let floor = SAMPLE_FLOOR * albedo;
-                ((sample + floor) / (image + floor)).min(MOST)
-            };
+            let over = |sample: f32, light: f32| ((sample + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
             match samples {
                 Samples::Divided(samples) => {
                     part(guides.row(samples, y)[c], self.squares, line);
-                    for (target, (v, read)) in target.iter_mut().zip(line.iter().zip(read)) {
-                        *target = over(v * read.1, read);
-                    }
+                    let read = line.iter().zip(light);
+                    target.iter_mut().zip(read).for_each(|(target, (v, light))| *target = over(*v, *light));
                 }
                 Samples::Rendered(samples, exposure) => {
                     part(guides.row(samples, y)[c], self.squares, line);
-                    for (target, (v, read)) in target.iter_mut().zip(line.iter().zip(read)) {
-                        *target = over(v.max(0.0) * exposure, read);
+                    let read = line.iter().zip(albedo).zip(light);
+                    for (target, ((v, a), light)) in target.iter_mut().zip(read) {
+                        *target = over(v.max(0.0) * exposure / a, *light);
                     }
                 }
             }

@@ -80,7 +80,7 @@ impl Stream {
             x = layer.forward(vec![x]); // (N, 34, H, W) -> (N, K, H, W) -> ... -> (N, 441, H, W)
         }
         let logits = Field::from_activation(x, 0, KERNEL * KERNEL, 1);
-        field(image).filter(KERNEL, logits, None)
+        field(image).filter(logits, None)
     }
 }
 

@@ -363,8 +363,7 @@ fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(mut image: Field<T>, levels: Vec<
             // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
             Some(below) => noisy.blend(below, mask, corners),
         };
-        let k = kernel.extent().1.isqrt();
-        let filtered = blended.filter(k, kernel, Some(confidence));
+        let filtered = blended.filter(kernel, Some(confidence));
         if pyramid.is_empty() {
             return filtered;
         }

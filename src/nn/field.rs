@@ -174,8 +174,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 
     /// Filters the field, (N, 3, H, W), by k x k kernels: `logits` (N, k*k, H, W) and, where neighbours
     /// are not all to be trusted alike, `confidence` (N, 1, H, W). See [`Filter`].
-    pub fn filter(self, k: usize, logits: Self, confidence: Option<Self>) -> Self {
+    pub fn filter(self, logits: Self, confidence: Option<Self>) -> Self {
         let (images, _, h, w) = self.extent();
+        let k = logits.extent().1.isqrt();
         let tier = Tier::detect();
         let mut tape = self.tape.merge(logits.tape);
         let (image, logits) = (self.saved, logits.saved);
@@ -520,12 +521,11 @@ impl Field<NoneTape> {
     pub fn filter_rows<const N: usize>(
         fields: [&Self; N],
         rows: (usize, usize),
-        k: usize,
         logits: &Self,
         confidence: &Self,
     ) -> [Self; N] {
         let (_, _, _, w) = confidence.extent();
-        let h = rows.1 - rows.0;
+        let (h, k) = (rows.1 - rows.0, logits.extent().1.isqrt());
         let values = |field: &Self| field.saved.values.clone();
         let problem = (values(fields[0]), values(logits), Some(values(confidence)));
         let (mut outputs, mut total) = (fields.map(|_| plane_buffer(3 * h * w)), plane_buffer(h * w));

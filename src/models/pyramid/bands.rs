@@ -478,8 +478,7 @@ impl<'a> Frame<'a> {
 
     /// Filters the images; at full resolution, hands out what becomes of them.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
-        let k = self.network.kernel(scale);
-        let reach = k / 2;
+        let reach = self.network.kernel(scale) / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
         while let Some((rows, _)) = kernels.front() {
             let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
@@ -492,8 +491,8 @@ impl<'a> Frame<'a> {
             let sources: Vec<Field> =
                 images.iter().map(|image| image.source(scale).rows(near.clone())).collect();
             let outputs = match &sources[..] {
-                [image, normal] => Field::filter_rows([image, normal], inside, k, &kernel, &trust).into(),
-                images => Vec::from(Field::filter_rows([&images[0]], inside, k, &kernel, &trust)),
+                [image, normal] => Field::filter_rows([image, normal], inside, &kernel, &trust).into(),
+                images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
             };
             *filtered = rows.end;
             if scale > 0 {
