@@ -277,7 +277,7 @@ impl Pixels {
             targets: line(TARGETS, 0.0),
             weight: line(1, 0.0),
             light: line(COLOURS, 0.0),
-            albedo: line(3, 1.0),
+            albedo: line(COLOURS, 1.0),
             spare: line(1, 0.0),
         }
     }
@@ -328,20 +328,13 @@ impl Pixels {
         for c in 0..COLOURS {
             let [albedo, light] = [&self.albedo, &self.light].map(|planes| &planes[c * len..][..len]);
             let target = &mut self.targets[(COLOURS + c) * len..][..len];
-            let over = |sample: f32, light: f32| ((sample + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
-            match samples {
-                Samples::Divided(samples) => {
-                    part(guides.row(samples, y)[c], self.squares, line);
-                    let read = line.iter().zip(light);
-                    target.iter_mut().zip(read).for_each(|(target, (v, light))| *target = over(*v, *light));
-                }
-                Samples::Rendered(samples, exposure) => {
-                    part(guides.row(samples, y)[c], self.squares, line);
-                    let read = line.iter().zip(albedo).zip(light);
-                    for (target, ((v, a), light)) in target.iter_mut().zip(read) {
-                        *target = over(v.max(0.0) * exposure / a, *light);
-                    }
-                }
+            let (Samples::Divided(values) | Samples::Rendered(values, _)) = samples;
+            part(guides.row(values, y)[c], self.squares, line);
+            if let Samples::Rendered(_, exposure) = samples {
+                line.iter_mut().zip(albedo).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
+            }
+            for (target, (sample, light)) in target.iter_mut().zip(line.iter().zip(light)) {
+                *target = ((sample + SAMPLE_FLOOR) / (light + SAMPLE_FLOOR)).min(MOST);
             }
         }
     }
@@ -504,6 +497,7 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
     doubted.factor();
     let mut plain = Symmetric::of(GUIDES, covariances);
     plain.factor();
+    let blotches = each(|l| BLOTCHES * BLOTCHES * (noise[l].max(LEAST_NOISE) * (1.0 / NOISY)).min(1.0));
     let mut kept = [[0.0; LANES]; KEPT];
     for ((kept, (mean, with, variance)), (level, missed, _)) in
         kept.chunks_exact_mut(KNOWN + 1).zip(denoised).zip(samples)
@@ -516,8 +510,7 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
             rest = each(|l| rest[l] - smooth[i][l] * with[i][l]);
         }
         let given = each(|l| {
-            let blotches = BLOTCHES * BLOTCHES * (noise[l].max(LEAST_NOISE) * (1.0 / NOISY)).min(1.0);
-            let share = blotches / (rest[l].max(0.0) + blotches);
+            let share = blotches[l] / (rest[l].max(0.0) + blotches[l]);
             if inverse[l] > 0.0 { share } else { 0.0 }
         });
         let mut constant = each(|l| given[l] * mean[l]);

@@ -56,17 +56,21 @@ pub trait Denoiser: Send + Sync {
         self.denoise(passes)
     }
 
-    /// As [`Denoiser::denoise`], with what it cost, after a run that does not count: cores that have waited for another process
-    /// are slow for some 20 ms (twice as slow in a virtual machine), which must not be put down to whichever method comes next. A
-    /// method that works in a process of its own reports its filter's time, as warm, without start and file traffic.
+    /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
+    /// reports its filter's time, without start and file traffic.
     ///
     /// # Errors
     /// As [`Denoiser::denoise`].
     fn denoise_timed(&self, passes: &PassSet) -> Result<Run> {
-        self.denoise(passes)?;
         let start = Instant::now();
         let image = self.denoise(passes)?;
         Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
+    }
+
+    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by itself, or takes
+    /// seconds.
+    fn is_warm(&self) -> bool {
+        false
     }
 }
 

@@ -90,6 +90,10 @@ impl Denoiser for Nfor {
         };
         Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
     }
+
+    fn is_warm(&self) -> bool {
+        true
+    }
 }
 
 /// What the method sees of a render.

@@ -159,6 +159,10 @@ impl Denoiser for Oidn {
             peak_mib: Some(runs.iter().map(|r| r.mib).fold(0.0, f64::max)),
         })
     }
+
+    fn is_warm(&self) -> bool {
+        true
+    }
 }
 
 /// Writes (3, H, W) as a little-endian colour PFM: interleaved, rows from the bottom up.
