@@ -26,14 +26,14 @@ pub enum Error {
         /// What is wrong with it and what to do.
         reason: String,
     },
-    /// The view layer lacks a pass that the method needs.
+    /// The view layer lacks passes that the method needs.
     MissingPass {
         /// The EXR file.
         path: PathBuf,
         /// The view layer searched.
         view_layer: String,
-        /// The pass that is missing; the message says how Blender turns it on.
-        pass: Pass,
+        /// The passes that are missing; the message says how Blender turns them on.
+        passes: Vec<Pass>,
         /// The method that needs it.
         needed_by: String,
     },
@@ -63,12 +63,24 @@ impl fmt::Display for Error {
                 write!(f, "{}: cannot {action}: {source}", path.display())
             }
             Self::Invalid { path, reason } => write!(f, "{}: {reason}", path.display()),
-            Self::MissingPass { path, view_layer, pass, needed_by } => write!(
-                f,
-                "{}: view layer '{view_layer}' has no {pass} pass, which {needed_by} needs; {}",
-                path.display(),
-                pass.blender_setting()
-            ),
+            Self::MissingPass { path, view_layer, passes, needed_by } => {
+                let names: Vec<String> = passes.iter().map(Pass::to_string).collect();
+                let noun = if passes.len() == 1 { "pass" } else { "passes" };
+                let layer = match view_layer.as_str() {
+                    "" => "the file, which has no view layers,".into(),
+                    name => format!("view layer '{name}'"),
+                };
+                let mut settings: Vec<&str> = passes.iter().map(|pass| pass.blender_setting()).collect();
+                settings.dedup();
+                write!(
+                    f,
+                    "{}: {layer} has no {} {noun}, which {needed_by} needs; {}",
+                    path.display(),
+                    names.join(", "),
+                    settings.join("; ")
+                )?;
+                if view_layer.is_empty() { f.write_str("; save as OpenEXR MultiLayer") } else { Ok(()) }
+            }
             Self::Usage(message) => f.write_str(message),
             Self::Interrupted => f.write_str("interrupted"),
         }

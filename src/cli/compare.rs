@@ -4,17 +4,20 @@ use std::{path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
 
+use super::{print_line, warn_line};
 use crate::{
     Error, Result,
     frame::Frame,
-    metrics::{self, Incomparable},
-    passes::{self, Pass},
-    planes::Planes,
+    metrics,
+    passes::{self, Layer, Pass, PassSet},
     report::number,
 };
 
-/// Layer that `demc denoise` adds: where a file holds one, it is what the user wants judged.
+/// Layer that `demc denoise` adds: where A holds one, it is what the user wants judged.
 const DENOISED: &str = "Denoised";
+
+/// The renderer's image.
+const COMBINED: &str = "Combined";
 
 /// Arguments of `demc compare`.
 #[derive(Debug, ClapArgs)]
@@ -25,12 +28,15 @@ pub struct Args {
     /// The reference
     #[arg(value_name = "B")]
     reference: PathBuf,
-    /// View layer to compare [default: the one with the most passes]
+    /// View layer to compare [default: of A the one with the most passes, of B its namesake or only one]
     #[arg(long, value_name = "NAME")]
     view_layer: Option<String>,
     /// Layer of A to judge [default: Denoised where A has it, else Combined]
     #[arg(long, value_name = "NAME")]
     layer: Option<String>,
+    /// Layer of B to judge it by
+    #[arg(long, value_name = "NAME", default_value = COMBINED)]
+    reference_layer: String,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -41,79 +47,81 @@ pub struct Args {
 /// # Errors
 /// A file is unusable, or the images cannot be compared.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let image = radiance(&args.image, args.view_layer.as_deref(), args.layer.as_deref())?;
-    let reference = radiance(&args.reference, args.view_layer.as_deref(), None)?;
+    let image = judged(args)?;
+    let reference = reference(args, &image.view_layer)?;
+    if image.view_layer != reference.view_layer {
+        let [a, b] = [&image.view_layer, &reference.view_layer];
+        warn_line(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
+    }
+    image.check_same_pixels(&reference)?;
+    let [image, reference] =
+        [image, reference].map(|mut set| set.remove(Pass::Combined).expect("it is there"));
     let scores = metrics::score(&image, &reference).map_err(|why| {
-        let remedy = match why {
-            Incomparable::Size { .. } => "render both at one size",
-            Incomparable::NonFinite { .. } => "no metric is defined on them; render anew or denoise first",
-        };
         let reference = args.reference.display();
+        let remedy = "no metric is defined on them; render anew or denoise first";
         Error::invalid(&args.image, format!("cannot be compared with {reference}: {why}; {remedy}"))
     })?;
     if args.json {
         let object: serde_json::Map<String, serde_json::Value> =
             scores.named().into_iter().map(|(name, value)| (name.into(), value.into())).collect();
-        println!("{}", serde_json::Value::from(object));
+        print_line(&serde_json::Value::from(object).to_string());
         return Ok(ExitCode::SUCCESS);
     }
     for (name, value) in scores.named() {
         match value {
-            Some(value) => println!("{name} {}", number(value)),
-            None => eprintln!("{name}: none, {}", metrics::why_undefined(&reference)),
+            Some(value) => print_line(&format!("{name} {}", number(value))),
+            None => warn_line(&format!("{name}: none, {}", metrics::why_undefined(&reference))),
         }
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// RGB of the layer named, or by default of `Denoised`, or else of Combined.
-fn radiance(path: &PathBuf, view_layer: Option<&str>, layer: Option<&str>) -> Result<Planes> {
-    let frame = Frame::read(path)?;
-    match layer {
-        Some("Combined") => {}
-        Some(name) => {
-            return layer_rgb(&frame, view_layer, name)?.ok_or_else(|| {
-                Error::invalid(
-                    path,
-                    format!("has no layer '{name}' with R, G and B; `demc inspect` lists those there are"),
-                )
-            });
-        }
+/// What is judged, as the Combined of its view layer: the layer named, or by default `Denoised`, or else Combined.
+fn judged(args: &Args) -> Result<PassSet> {
+    let (frame, view_layer) = (Frame::read(&args.image)?, args.view_layer.as_deref());
+    let layer = match args.layer.as_deref() {
         None => {
-            if let Some(planes) = layer_rgb(&frame, view_layer, DENOISED)? {
-                eprintln!("{}: comparing its layer '{DENOISED}' (or say --layer Combined)", path.display());
-                return Ok(planes);
+            let denoised = passes::rgb_layers(&frame, view_layer, DENOISED).into_iter().next();
+            if denoised.is_some() {
+                let path = args.image.display();
+                warn_line(&format!("{path}: its layer '{DENOISED}' is judged (or say --layer {COMBINED})"));
             }
+            denoised
         }
-    }
-    let mut passes = passes::read(&frame, view_layer)?;
-    passes.remove(Pass::Combined).ok_or_else(|| {
-        Error::invalid(path, "has no Combined pass; `demc inspect` lists the passes there are")
+        Some(COMBINED) => None,
+        Some(name) => Some(named(&frame, view_layer, name)?),
+    };
+    let layer = match layer {
+        Some(layer) => layer,
+        None => passes::choose(&frame, &passes::layers(&frame), view_layer)?.clone(),
+    };
+    combined(&frame, &layer)
+}
+
+/// What it is judged by, of the view layer of that name if there is one.
+fn reference(args: &Args, view_layer: &str) -> Result<PassSet> {
+    let frame = Frame::read(&args.reference)?;
+    let layers = passes::layers(&frame);
+    let layer = match args.reference_layer.as_str() {
+        COMBINED => passes::choose_like(&frame, &layers, view_layer)?.clone(),
+        name => {
+            let namesake = layers.iter().any(|l| l.name == view_layer).then_some(view_layer);
+            named(&frame, namesake, name)?
+        }
+    };
+    combined(&frame, &layer)
+}
+
+/// The first view layer that holds a layer of that name, which is its Combined then.
+fn named(frame: &Frame, view_layer: Option<&str>, name: &str) -> Result<Layer> {
+    passes::rgb_layers(frame, view_layer, name).into_iter().next().ok_or_else(|| {
+        let why = format!("has no layer '{name}' with R, G and B; `demc inspect` lists those there are");
+        Error::invalid(frame.path(), why)
     })
 }
 
-/// The first part whose channels `<...>.<layer>.R`, `.G` and `.B` are complete.
-fn layer_rgb(frame: &Frame, view_layer: Option<&str>, layer: &str) -> Result<Option<Planes>> {
-    let wanted = view_layer.map(|v| format!("{v}.{layer}"));
-    for (p, part) in frame.parts().iter().enumerate() {
-        // Blender 5 names the part and leaves the channels bare in some files.
-        let find = |component: &str| {
-            part.channels.iter().position(|c| {
-                let prefix = match c.name.rsplit_once('.') {
-                    Some((prefix, last)) if last == component => prefix,
-                    None if c.name == component => part.name.as_deref().unwrap_or(""),
-                    _ => return false,
-                };
-                match &wanted {
-                    Some(wanted) => prefix == wanted,
-                    None => prefix == layer || prefix.ends_with(&format!(".{layer}")),
-                }
-            })
-        };
-        let (Some(r), Some(g), Some(b)) = (find("R"), find("G"), find("B")) else { continue };
-        let window = part.data_window;
-        let data = frame.decode(p, &[&[r, g, b]])?.remove(0);
-        return Ok(Some(Planes::from_vec(3, window.width, window.height, data)));
-    }
-    Ok(None)
+fn combined(frame: &Frame, layer: &Layer) -> Result<PassSet> {
+    let set = passes::read_layer(frame, layer, &[Pass::Combined])?;
+    set.require_all([Pass::Combined], "`demc compare`")?;
+    Ok(set)
 }

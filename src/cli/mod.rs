@@ -66,7 +66,7 @@ pub fn main() -> ExitCode {
         Command::PeakMemory(args) => peak_memory::run(&args),
     };
     done.unwrap_or_else(|error| {
-        eprintln!("demc: {error}");
+        warn_line(&format!("demc: {error}"));
         ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
     })
 }
@@ -74,4 +74,9 @@ pub fn main() -> ExitCode {
 /// One line on stdout. A reader that has gone away (`demc ... | head`) is no reason to stop.
 fn print_line(line: &str) {
     let _ = writeln!(std::io::stdout(), "{line}");
+}
+
+/// One line on stderr. Nobody who reads it is no reason to stop either.
+pub(crate) fn warn_line(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -49,14 +49,13 @@ struct Unassigned {
 /// A view layer's name and stereo view.
 type LayerKey = (String, Option<String>);
 
-/// The view layers of a frame, in file order, once for each stereo view.
-pub fn layers(frame: &Frame) -> Vec<Layer> {
+/// The channels of each view layer and stereo view, in file order, by the names of their passes.
+fn channels_by_pass(frame: &Frame) -> Vec<(LayerKey, BTreeMap<String, Vec<Unassigned>>)> {
     let views = frame.views();
-    // (layer, view) in file order, each with its channels by pass name.
     let mut found: Vec<(LayerKey, BTreeMap<String, Vec<Unassigned>>)> = Vec::new();
     for (p, part) in frame.parts().iter().enumerate() {
-        // A single part's name is the name of the file's only image, not of a pass.
-        let part_name = part.name.as_deref().filter(|n| frame.is_multi_part() || n.contains('.'));
+        // A single part's name is the name of the file's only image, unless it ends in that of a pass.
+        let part_name = part.name.as_deref().filter(|name| frame.is_multi_part() || ends_in_pass(name));
         for (c, channel) in part.channels.iter().enumerate() {
             let name = ChannelName::parse(&channel.name, part_name, part.view.as_deref(), &views);
             let key = (name.view_layer, name.view);
@@ -64,15 +63,43 @@ pub fn layers(frame: &Frame) -> Vec<Layer> {
                 found.push((key, BTreeMap::new()));
                 found.len() - 1
             });
+            let full_name = match part_name.filter(|_| !channel.name.contains('.')) {
+                Some(part) => format!("{part}.{}", channel.name),
+                None => channel.name.clone(),
+            };
             found[at].1.entry(name.pass).or_default().push(Unassigned {
                 part: p,
                 channel: c,
                 component: name.component,
-                full_name: channel.name.clone(),
+                full_name,
             });
         }
     }
-    found.into_iter().map(|((name, view), channels)| assign(name, view, channels)).collect()
+    found
+}
+
+/// Whether a part is called `<view layer>.<pass>`.
+fn ends_in_pass(part: &str) -> bool {
+    part.rsplit_once('.').is_some_and(|(_, tail)| TABLE.iter().any(|row| row.names.contains(&tail)))
+}
+
+/// The view layers of a frame, in file order, once for each stereo view.
+pub fn layers(frame: &Frame) -> Vec<Layer> {
+    let found = channels_by_pass(frame).into_iter();
+    found.map(|((name, view), channels)| assign(name, view, channels)).collect()
+}
+
+/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised`: each with those as
+/// its Combined and nothing else, in file order, once for each stereo view.
+pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<Layer> {
+    let found = channels_by_pass(frame).into_iter();
+    let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
+    let as_combined = |((layer, view), channels): (LayerKey, BTreeMap<String, Vec<Unassigned>>)| {
+        let at = match_components(channels.get(name)?, &["R", "G", "B"])?;
+        let passes = [(Pass::Combined, PassChannels { name: name.into(), ..at })].into();
+        Some(Layer { name: layer, view, passes, position_averaged: false, unrecognised: Vec::new() })
+    };
+    found.filter_map(as_combined).collect()
 }
 
 fn assign(name: String, view: Option<String>, channels: BTreeMap<String, Vec<Unassigned>>) -> Layer {
@@ -128,14 +155,9 @@ fn match_components(candidates: &[Unassigned], names: &[&str]) -> Option<PassCha
 /// # Errors
 /// There is no such view layer, or none with a Combined pass; the message lists those there are.
 pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) -> Result<&'a Layer> {
-    let listed = || {
-        let mut names: Vec<String> = layers.iter().map(|l| format!("'{}'", l.name)).collect();
-        names.dedup();
-        names.join(", ")
-    };
     match view_layer {
         Some(wanted) => layers.iter().find(|l| l.name == wanted).ok_or_else(|| {
-            Error::invalid(frame.path(), format!("has no view layer '{wanted}'; it has {}", listed()))
+            Error::invalid(frame.path(), format!("has no view layer '{wanted}'; {}", listed(layers)))
         }),
         None => layers
             .iter()
@@ -143,15 +165,37 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
             .filter(|l| l.passes.contains_key(&Pass::Combined))
             .max_by_key(|l| l.passes.len())
             .ok_or_else(|| {
-                Error::invalid(
-                    frame.path(),
-                    format!(
-                        "no layer has a Combined pass (layers: {}); {}",
-                        listed(),
-                        Pass::Combined.blender_setting()
-                    ),
-                )
+                let setting = Pass::Combined.blender_setting();
+                let why = format!("no layer has a Combined pass; {}; {setting}", listed(layers));
+                Error::invalid(frame.path(), why)
             }),
+    }
+}
+
+/// The view layer to hold against one of that name in another file: its namesake, or the only one with Combined.
+///
+/// # Errors
+/// Neither exists; the message lists what there is.
+pub fn choose_like<'a>(frame: &Frame, layers: &'a [Layer], name: &str) -> Result<&'a Layer> {
+    let mut candidates = layers.iter().filter(|l| l.passes.contains_key(&Pass::Combined)).peekable();
+    let Some(&first) = candidates.peek() else { return choose(frame, layers, None) };
+    if let Some(namesake) = layers.iter().find(|l| l.name == name) {
+        return Ok(namesake);
+    }
+    if candidates.any(|l| l.name != first.name) {
+        let why = format!("has no view layer '{name}', which it is to be held against; {}", listed(layers));
+        return Err(Error::invalid(frame.path(), format!("{why}; render or save that one alone")));
+    }
+    Ok(first)
+}
+
+/// The view layers of a file, as a sentence part.
+fn listed(layers: &[Layer]) -> String {
+    let mut names: Vec<String> = layers.iter().map(|l| format!("'{}'", l.name)).collect();
+    names.dedup();
+    match &names[..] {
+        [name] if name == "''" => "it has no view layers: save as OpenEXR MultiLayer".into(),
+        _ => format!("its view layers: {}", names.join(", ")),
     }
 }
 
@@ -180,6 +224,7 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     };
     let window = frame.parts()[anchor.part].data_window;
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
+    set.origin = (window.x, window.y);
 
     // One decoding run for each part: in single-part files all passes share their blocks.
     let mut by_part: BTreeMap<usize, Vec<(Pass, &[usize])>> = BTreeMap::new();

@@ -15,7 +15,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-pub use layers::{Layer, PassChannels, choose, layers, read, read_layer};
+pub use layers::{Layer, PassChannels, choose, choose_like, layers, read, read_layer, rgb_layers};
 pub use names::{NOISY_IMAGE, POSITION_AOV};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};
@@ -160,13 +160,16 @@ pub struct PassSet {
     pub width: usize,
     /// Rows.
     pub height: usize,
+    /// Where the first pixel lies in the coordinates of the display window: other than 0, 0 in cropped renders.
+    pub origin: (i32, i32),
     planes: BTreeMap<Pass, Planes>,
 }
 
 impl PassSet {
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
-        Self { path: path.into(), view_layer: view_layer.into(), width, height, planes: BTreeMap::new() }
+        let (path, view_layer) = (path.into(), view_layer.into());
+        Self { path, view_layer, width, height, origin: (0, 0), planes: BTreeMap::new() }
     }
 
     /// Some rows of those of `passes` that it holds.
@@ -224,12 +227,44 @@ impl PassSet {
 
     /// The pass, or an error that names file, pass and remedy.
     pub fn require(&self, pass: Pass, needed_by: &str) -> Result<&Planes> {
-        self.get(pass).ok_or_else(|| Error::MissingPass {
+        self.get(pass).ok_or_else(|| self.missing(vec![pass], needed_by))
+    }
+
+    /// Whether all of these passes are there.
+    ///
+    /// # Errors
+    /// Some are not: all of those are named, each with its remedy.
+    pub fn require_all(&self, passes: impl IntoIterator<Item = Pass>, needed_by: &str) -> Result<()> {
+        let missing: Vec<Pass> = passes.into_iter().filter(|pass| self.get(*pass).is_none()).collect();
+        if missing.is_empty() { Ok(()) } else { Err(self.missing(missing, needed_by)) }
+    }
+
+    fn missing(&self, passes: Vec<Pass>, needed_by: &str) -> Error {
+        Error::MissingPass {
             path: self.path.clone(),
             view_layer: self.view_layer.clone(),
-            pass,
+            passes,
             needed_by: needed_by.into(),
-        })
+        }
+    }
+
+    /// Whether the pixels of `reference` are those of this frame: as many, at the same place of the display window.
+    ///
+    /// # Errors
+    /// They are not.
+    pub fn check_same_pixels(&self, reference: &PassSet) -> Result<()> {
+        let place = |set: &PassSet| (set.width, set.height, set.origin);
+        if place(self) == place(reference) {
+            return Ok(());
+        }
+        let said = |set: &PassSet| {
+            let PassSet { width, height, origin: (x, y), .. } = set;
+            format!("{width}x{height} at {x},{y}")
+        };
+        let (own, other) = (said(self), said(reference));
+        let why =
+            format!("holds {own}, its reference {other}: other pixels; render both at one size and region");
+        Err(Error::invalid(&self.path, why))
     }
 
     /// Every pass held.
@@ -257,4 +292,14 @@ impl PassSet {
 /// The file is unusable, or has no such view layer.
 pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet> {
     read(&Frame::read(path)?, view_layer)
+}
+
+/// Reads a file and the passes of the view layer that is to be held against one of that name: see [`choose_like`].
+///
+/// # Errors
+/// The file is unusable, or has no such view layer.
+pub fn load_like(path: impl AsRef<Path>, view_layer: &str) -> Result<PassSet> {
+    let frame = Frame::read(path)?;
+    let layers = layers(&frame);
+    read_layer(&frame, choose_like(&frame, &layers, view_layer)?, &Pass::ALL)
 }

@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    metrics::{self, Incomparable, pairing},
+    metrics::{self, pairing},
     models::{Denoiser, Run},
     passes::{self, Pass, PassSet},
     planes::Planes,
@@ -167,24 +167,19 @@ pub struct Loaded {
     pub reference: Planes,
 }
 
-/// Reads a pair of frames, of the view layer named or the one with the most passes.
+/// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the reference its namesake.
 ///
 /// # Errors
-/// A file is unusable or lacks Combined, or their sizes differ.
+/// A file is unusable or lacks Combined, or they do not hold the same pixels.
 pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     let mut passes = passes::load(&pair.noisy, view_layer)?;
     passes.use_noisy_image();
     let noisy = passes.require(Pass::Combined, NOISY)?.clone();
     passes.sanitize();
-    let reference =
-        passes::load(&pair.reference, view_layer)?.require(Pass::Combined, "a reference")?.clone();
-    if (reference.width, reference.height) != (noisy.width, noisy.height) {
-        let why = Incomparable::Size {
-            image: (3, noisy.width, noisy.height),
-            reference: (3, reference.width, reference.height),
-        };
-        return Err(Error::invalid(&pair.noisy, format!("{why}; render both at one size")));
-    }
+    let mut reference = passes::load_like(&pair.reference, &passes.view_layer)?;
+    passes.check_same_pixels(&reference)?;
+    reference.require(Pass::Combined, "a reference")?;
+    let reference = reference.remove(Pass::Combined).expect("it is there");
     Ok(Loaded { noisy, passes, reference })
 }
 
