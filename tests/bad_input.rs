@@ -87,8 +87,19 @@ fn a_missing_pass() {
         &path,
         &["--model", "oidn-fast"],
         1,
-        &["view layer 'ViewLayer' has no Denoising Albedo pass", "oidn-fast needs", "Data > Denoising Data"],
+        &[
+            "'ViewLayer' has no Denoising Albedo, Denoising Normal passes",
+            "oidn-fast",
+            "Data > Denoising Data",
+        ],
     );
+    let settings = ["Data > Position", "Light > Diffuse > Color", "Light > Glossy > Color"];
+    fails_with(&path, &["--model", "demc"], 1, &settings);
+
+    let plain = dir.path().join("plain.exr");
+    exr::prelude::write_rgb_file(&plain, 8, 8, |_, _| (0.5f32, 0.5f32, 0.5f32)).unwrap();
+    fails_with(&plain, &["--model", "demc-s"], 1, &["has no view layers", "save as OpenEXR MultiLayer"]);
+    fails_with(&plain, &["--view-layer", "Foreground"], 1, &["no view layer 'Foreground'", "MultiLayer"]);
 }
 
 #[test]

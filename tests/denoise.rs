@@ -33,7 +33,12 @@ fn assert_kept(before: &Path, after: &Path) {
     assert_eq!(before.attributes, after.attributes);
     assert!(!before.layer_data.is_empty());
     for (old, new) in before.layer_data.iter().zip(&after.layer_data) {
-        assert_eq!((old.size, &old.attributes, &old.encoding), (new.size, &new.attributes, &new.encoding));
+        let kept = |layer: &exr::prelude::Layer<_>| {
+            let mut attributes = layer.attributes.clone();
+            attributes.other.remove(b"demc".as_slice()); // lists what was added
+            attributes
+        };
+        assert_eq!((old.size, kept(old), &old.encoding), (new.size, kept(new), &new.encoding));
         for channel in &old.channel_data.list {
             let now = new.channel_data.list.iter().find(|c| c.name == channel.name).expect("channel kept");
             assert_eq!(bits(&channel.sample_data), bits(&now.sample_data), "{}", channel.name);
@@ -205,11 +210,39 @@ fn skips_finished_results_unless_told_otherwise() {
     let (_dir, out) = out();
     demc(&out).arg(data("blender4.exr")).assert().success();
     let result = out.join("blender4.exr");
-    fs::write(&result, "finished earlier").unwrap();
+    fs::copy(data("blender5.exr"), &result).unwrap();
     demc(&out).arg(data("blender4.exr")).assert().success().stdout(contains("is there already"));
-    assert_eq!(fs::read(&result).unwrap(), b"finished earlier");
+    assert_eq!(fs::read(&result).unwrap(), fs::read(data("blender5.exr")).unwrap());
     demc(&out).arg(data("blender4.exr")).arg("--overwrite").assert().success();
     assert_kept(&data("blender4.exr"), &result);
+
+    // What a full disk or a failed copy left is no result.
+    for remains in [&b""[..], b"finished earlier", &fs::read(&result).unwrap()[..200]] {
+        fs::write(&result, remains).unwrap();
+        demc(&out).arg(data("blender4.exr")).assert().success().stdout(contains("already").not());
+        assert_kept(&data("blender4.exr"), &result);
+    }
+}
+
+#[test]
+fn previews_are_made_up_for_and_kept() {
+    let (_dir, out) = out();
+    let files = ["blender4.exr", "blender5_stereo.exr"];
+    let pngs = ["blender4.png", "blender5_stereo.left.png", "blender5_stereo.right.png"];
+    for args in [&[][..], &["--replace"]] {
+        let run = |more: &[&str]| demc(&out).args(files.map(data)).args(args).args(more).assert().success();
+        run(&["--overwrite", "--preview"]);
+        let whole = pngs.map(|png| fs::read(out.join(png)).unwrap());
+        pngs.iter().for_each(|png| fs::remove_file(out.join(png)).unwrap());
+        run(&["--preview"]).stdout(contains("2 already there"));
+        assert!(pngs.map(|png| fs::read(out.join(png)).unwrap()) == whole, "as written with the result");
+
+        fs::write(out.join(pngs[0]), "another program's").unwrap();
+        run(&["--preview"]);
+        fs::remove_file(out.join(files[0])).unwrap();
+        run(&["--preview"]).stderr(contains("blender4.png: kept; --overwrite"));
+        assert_eq!(fs::read(out.join(pngs[0])).unwrap(), b"another program's");
+    }
 }
 
 #[test]
@@ -272,6 +305,91 @@ fn layer_names() {
             .code(2)
             .stderr(contains("--layer"));
     }
+}
+
+#[test]
+fn replaces_the_layers_it_added_and_no_others() {
+    // Each file has a layer that demc does not read, in its own letter case or with bare channels.
+    for (file, layer) in [("blender4.exr", "AO"), ("blender5_stereo.exr", "cryptoobject00")] {
+        let (_dir, out) = out();
+        let run = demc(&out).arg(data(file)).args(["--layer", layer]).assert().code(1);
+        run.stderr(contains(format!("'ViewLayer.{layer}' that demc did not add; give --layer another name")));
+        assert_eq!(fs::read_dir(&out).unwrap().count(), 0);
+    }
+    for file in ["blender4.exr", "blender5.exr", "blender4_stereo.exr", "blender5_stereo.exr"] {
+        let (dir, first) = out();
+        let second = dir.path().join("second");
+        demc(&first).arg(data(file)).assert().success();
+        demc(&first).arg(data(file)).args(["--layer", "Clean", "--overwrite"]).assert().success();
+        demc(&second).arg(first.join(file)).args(["--layer", "Clean"]).assert().success();
+        assert_kept(&first.join(file), &second.join(file));
+        let parts = |path: &Path| read_exr(path).layer_data.len();
+        assert_eq!(parts(&first.join(file)), parts(&second.join(file)));
+    }
+}
+
+#[test]
+fn a_part_with_bare_channels_is_not_added_twice() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let part = |name: &str| {
+        let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
+        let channels = AnyChannels::sort(list.into_iter().collect());
+        Layer::new((4, 3), LayerAttributes::named(name), Encoding::SMALL_LOSSLESS, channels)
+    };
+    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
+    Image::from_layers(shared, vec![part("rgba"), part("Denoised")]).write().to_file(&input).unwrap();
+    demc(&out).arg(&input).assert().code(1).stderr(contains("'Denoised' that demc did not add"));
+    demc(&out).arg(&input).args(["--layer", "Clean"]).assert().success();
+    assert_kept(&input, &out.join("in.exr"));
+}
+
+#[test]
+fn a_part_name_with_a_dot_is_no_layer() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
+    let channels = AnyChannels::sort(list.into_iter().collect());
+    let layer = Layer::new((4, 3), LayerAttributes::named("shot.v001"), Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().to_file(&input).unwrap();
+    demc(&out).arg(&input).assert().success();
+    assert_same_values(&out.join("in.exr"), "R", "Denoised.R");
+}
+
+/// `demc ... 2>&1 | head`, or a log file on a full disk.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_batch_outlives_those_who_read_what_it_says() {
+    let (dir, out) = out();
+    let bad = dir.path().join("bad.exr");
+    fs::write(&bad, "not an image").unwrap();
+    let full = || fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let status = std::process::Command::new(assert_cmd::cargo::cargo_bin("demc"))
+        .args(["denoise", "--model", "noisy", "--out"])
+        .arg(&out)
+        .args([&bad, &data("blender4_two_layers.exr"), &data("blender5.exr")])
+        .stderr(full())
+        .stdout(full())
+        .status()
+        .unwrap();
+    assert_eq!(status.code(), Some(1));
+    assert_eq!(fs::read_dir(&out).unwrap().count(), 2);
+}
+
+#[test]
+fn an_input_that_names_nothing_does_not_stop_the_others() {
+    let (dir, out) = out();
+    let empty = dir.path().join("empty");
+    fs::create_dir(&empty).unwrap();
+    demc(&out)
+        .args([&empty, &dir.path().join("*.exr"), &data("blender4.exr")])
+        .assert()
+        .code(1)
+        .stdout(contains("1 denoised, 2 failed"))
+        .stderr(contains("no EXR files").and(contains("matches no file")));
+    assert!(out.join("blender4.exr").exists());
 }
 
 #[test]

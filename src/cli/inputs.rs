@@ -8,58 +8,84 @@ use std::{
 
 use crate::{Error, Result};
 
-/// Expands the inputs in the order given, each file once; directories and globs sorted by name.
-/// A plain path that does not exist is kept: reading it reports it, and the others go on.
+/// What the user's inputs name.
+#[derive(Default)]
+pub struct Inputs {
+    /// Files in the order given, each once; those of a directory or glob sorted by name.
+    pub files: Vec<PathBuf>,
+    /// Inputs, or paths that a glob came by, that name no file; each with the reason.
+    pub unusable: Vec<(PathBuf, Error)>,
+}
+
+/// Expands the inputs. A plain path that does not exist is kept: reading it reports it, and the others go on.
 ///
 /// # Errors
-/// A glob matches nothing or is malformed, or a directory holds no EXR.
-pub fn expand(inputs: &[PathBuf]) -> Result<Vec<PathBuf>> {
-    let mut files = Vec::new();
+/// A glob is malformed, or all inputs together name no file.
+pub fn expand(inputs: &[PathBuf]) -> Result<Inputs> {
+    let mut all = Inputs::default();
     for input in inputs {
-        if input.is_dir() {
-            files.extend(directory(input)?);
+        let before = (all.files.len(), all.unusable.len());
+        let nothing = if input.is_dir() {
+            directory(input, &mut all);
+            "no EXR files in this directory; name the files or a glob such as '*/*.exr' in it"
         } else if !input.exists() && has_wildcard(input) {
-            files.extend(pattern(input)?);
+            pattern(input, &mut all)?;
+            "matches no file; check the path and the pattern"
         } else {
-            files.push(input.clone());
+            all.files.push(input.clone());
+            continue;
+        };
+        if before == (all.files.len(), all.unusable.len()) {
+            all.unusable.push((input.clone(), Error::Usage(format!("{}: {nothing}", input.display()))));
         }
+    }
+    if all.files.is_empty()
+        && let Some((_, error)) = all.unusable.pop()
+    {
+        return Err(error);
     }
     let mut seen = HashSet::new();
-    files.retain(|f| seen.insert(fs::canonicalize(f).unwrap_or_else(|_| f.clone())));
-    Ok(files)
+    all.files.retain(|f| seen.insert(fs::canonicalize(f).unwrap_or_else(|_| f.clone())));
+    Ok(all)
 }
 
-fn directory(path: &Path) -> Result<Vec<PathBuf>> {
-    let entries = fs::read_dir(path).map_err(Error::io("read", path))?;
-    let mut files = Vec::new();
+fn directory(path: &Path, all: &mut Inputs) {
+    let entries = match fs::read_dir(path) {
+        Ok(entries) => entries,
+        Err(error) => return all.unusable.push((path.into(), Error::io("read", path)(error))),
+    };
+    let first = all.files.len();
     for entry in entries {
-        let file = entry.map_err(Error::io("read", path))?.path();
-        // Hidden files are other programs' unfinished work.
-        let hidden = file.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
-        if !hidden && is_exr(&file) && file.is_file() {
-            files.push(file);
+        match entry {
+            Ok(entry) => {
+                let file = entry.path();
+                // Hidden files are other programs' unfinished work.
+                let hidden = file.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+                if !hidden && is_exr(&file) && file.is_file() {
+                    all.files.push(file);
+                }
+            }
+            Err(error) => all.unusable.push((path.into(), Error::io("read", path)(error))),
         }
     }
-    files.sort();
-    if files.is_empty() {
-        return Err(Error::Usage(format!(
-            "{}: no EXR files in this directory; name the files or a glob such as '{}/*/*.exr'",
-            path.display(),
-            path.display()
-        )));
-    }
-    Ok(files)
+    all.files[first..].sort();
 }
 
-fn pattern(path: &Path) -> Result<Vec<PathBuf>> {
+fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
     let text = path.to_string_lossy();
     let matches = glob::glob(&text)
         .map_err(|e| Error::Usage(format!("{text}: not a valid glob ({}); quote or escape it", e.msg)))?;
-    let files: Vec<PathBuf> = matches.filter_map(std::result::Result::ok).filter(|p| p.is_file()).collect();
-    if files.is_empty() {
-        return Err(Error::Usage(format!("{text}: matches no file; check the path and the pattern")));
+    for found in matches {
+        match found {
+            Ok(file) if file.is_file() => all.files.push(file),
+            Ok(_) => {}
+            Err(error) => {
+                let path = error.path().to_path_buf();
+                all.unusable.push((path.clone(), Error::io("read", path)(error.into())));
+            }
+        }
     }
-    Ok(files)
+    Ok(())
 }
 
 fn has_wildcard(path: &Path) -> bool {

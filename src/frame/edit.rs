@@ -11,7 +11,7 @@ use exr::{
     math::Vec2,
     meta::{
         BlockDescription, MetaData,
-        attribute::{ChannelDescription, ChannelList, LineOrder, SampleType, Text},
+        attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, SampleType, Text},
         compute_level_size,
         header::{Header, LayerAttributes},
     },
@@ -24,6 +24,9 @@ use crate::Result;
 
 /// Largest finite half.
 pub(crate) const HALF_MAX: f32 = f16::MAX.to_f32_const();
+
+/// Attribute that names the layers of its part that demc added, one a line: those alone may be replaced.
+const MARK: &str = "demc";
 
 /// A channel to store: values of the whole data window, row-major.
 #[derive(Clone, Copy, Debug)]
@@ -91,10 +94,49 @@ impl Frame {
             .parts
             .iter()
             .position(|p| p.view == *beside_view && p.channels.iter().any(|c| c.name == named[0].0));
-        match holder {
-            Some(part) => self.set_channels(part, &named),
-            None if own_part => self.add_part(&header, &part_name, &named).map(|()| None),
-            None => self.set_channels(beside, &named),
+        let (part, recoded) = match holder {
+            Some(part) => (part, self.set_channels(part, &named)?),
+            None if own_part => {
+                self.add_part(&header, &part_name, &named)?;
+                (self.parts.len() - 1, None)
+            }
+            None => (beside, self.set_channels(beside, &named)?),
+        };
+        let mut marked = self.marked(part);
+        if !marked.iter().any(|layer| layer == name) {
+            marked.push(name.into());
+            let list = AttributeValue::Text(text(&marked.join("\n")));
+            self.meta.headers[part].own_attributes.other.insert(text(MARK), list);
+        }
+        Ok(recoded)
+    }
+
+    /// Whether a layer of that name, in any letter case, is there that [`Frame::set_layer`] did not add.
+    pub fn has_foreign_layer(&self, name: &str) -> bool {
+        let is_named = |part: &super::Part, channel: &str| {
+            let layer = match channel.rsplit_once('.') {
+                Some((layer, _)) => layer,
+                None => part.name.as_deref().unwrap_or_default(),
+            };
+            // Stereo views are named `<layer>.<view>` in channels, `<layer>-<view>` in parts.
+            let rest = layer.get(name.len()..).filter(|_| layer.is_char_boundary(name.len()));
+            rest.is_some_and(|rest| {
+                layer[..name.len()].eq_ignore_ascii_case(name)
+                    && (rest.is_empty() || self.views().iter().any(|view| rest.get(1..) == Some(view)))
+            })
+        };
+        let is_foreign = |(index, part): (usize, &super::Part)| {
+            part.channels.iter().any(|channel| is_named(part, &channel.name))
+                && !self.marked(index).iter().any(|layer| layer == name)
+        };
+        self.parts.iter().enumerate().any(is_foreign)
+    }
+
+    /// The layers of a part that [`Frame::set_layer`] added.
+    fn marked(&self, part: usize) -> Vec<String> {
+        match self.meta.headers[part].own_attributes.other.get(&text(MARK)) {
+            Some(AttributeValue::Text(list)) => super::string(list).lines().map(str::to_owned).collect(),
+            _ => Vec::new(),
         }
     }
 

@@ -4,7 +4,10 @@
 use std::{collections::HashMap, fs::File, io::BufReader, path::Path};
 
 use exr::{
-    block::{chunk::TileCoordinates, reader::ChunksReader},
+    block::{
+        chunk::TileCoordinates,
+        reader::{ChunksReader, Reader},
+    },
     meta::header::Header,
 };
 
@@ -27,16 +30,7 @@ impl Frame {
     /// The file cannot be read, is no EXR, is truncated or damaged, or holds deep data.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let file = File::open(path).map_err(Error::io("read", path))?;
-        let info = file.metadata().map_err(Error::io("read", path))?;
-        if info.is_dir() {
-            return Err(Error::invalid(path, "is a directory; name the EXR files in it"));
-        }
-        let mut buffered = BufReader::with_capacity(1 << 18, file);
-        check_magic(&mut buffered, path, info.len())?;
-
-        let reader = exr::block::read(buffered, false).map_err(|e| Self::error(path, e))?;
-        check_sizes(reader.headers(), path, info.len())?;
+        let (reader, byte_len) = open(path)?;
 
         // Where each block of each part belongs, in increasing y.
         let places: Vec<HashMap<TileCoordinates, usize>> = reader
@@ -69,10 +63,29 @@ impl Frame {
         }
 
         let meta = chunks_reader.meta_data().clone();
-        let mut frame = Self { path: path.into(), byte_len: info.len(), meta, parts: Vec::new(), chunks };
+        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks };
         frame.describe();
         Ok(frame)
     }
+
+    /// Whether a file is there whose headers say that it is an EXR; its pixels are not looked at.
+    pub fn exists(path: impl AsRef<Path>) -> bool {
+        open(path.as_ref()).is_ok()
+    }
+}
+
+/// Reads a file's headers; its length besides.
+fn open(path: &Path) -> Result<(Reader<BufReader<File>>, u64)> {
+    let file = File::open(path).map_err(Error::io("read", path))?;
+    let info = file.metadata().map_err(Error::io("read", path))?;
+    if info.is_dir() {
+        return Err(Error::invalid(path, "is a directory; name the EXR files in it"));
+    }
+    let mut buffered = BufReader::with_capacity(1 << 18, file);
+    check_magic(&mut buffered, path, info.len())?;
+    let reader = exr::block::read(buffered, false).map_err(|e| Frame::error(path, e))?;
+    check_sizes(reader.headers(), path, info.len())?;
+    Ok((reader, info.len()))
 }
 
 /// Memory is set aside as headers say: believe only what is plausible and what the file has room for.

@@ -47,6 +47,8 @@ pub fn atomically(path: &Path, write: impl FnOnce(&fs::File) -> Result<()>) -> R
     }
     let file = builder.tempfile_in(directory).map_err(Error::io("write", path))?;
     write(file.as_file())?;
+    // The name must not outlive a crash of the machine that its pixels did not.
+    file.as_file().sync_all().map_err(Error::io("write", path))?;
     file.persist(path).map_err(|e| Error::io("write", path)(e.error))?;
     Ok(())
 }

@@ -25,6 +25,8 @@ pub struct Options {
     pub tile: Option<usize>,
     /// `--preview`.
     pub preview: bool,
+    /// `--overwrite`.
+    pub overwrite: bool,
 }
 
 /// What became of a frame, for the user.
@@ -60,6 +62,13 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
     if options.view_layer.is_none() {
         report.notes.extend(note_other_layers(&layers, chosen));
     }
+    if let Some(added) = &options.layer {
+        let name = layer_name(&chosen.name, added);
+        if frame.has_foreign_layer(&name) {
+            let why = format!("holds a layer '{name}' that demc did not add; give --layer another name");
+            return Err(Error::invalid(input, why));
+        }
+    }
     let mut wanted = vec![Pass::Combined, Pass::Alpha, Pass::NoisyImage];
     wanted.extend(model.passes().iter().chain(model.optional_passes()));
     let mut views = Vec::new();
@@ -71,9 +80,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
             );
         }
         // Before any work: a missing pass is the user's commonest mistake.
-        for &pass in std::iter::once(&Pass::Combined).chain(model.passes()) {
-            set.require(pass, model.name())?;
-        }
+        set.require_all([&[Pass::Combined], model.passes()].concat(), model.name())?;
         for (pass, count) in set.sanitize() {
             *report.repaired.entry(pass.to_string()).or_default() += count;
         }
@@ -136,19 +143,20 @@ fn finite(radiance: Planes, report: &mut Report) -> Planes {
     set.remove(Pass::Combined).expect("inserted above")
 }
 
+/// The full name of a layer of a view layer.
+fn layer_name(view_layer: &str, name: &str) -> String {
+    if view_layer.is_empty() { name.into() } else { format!("{view_layer}.{name}") }
+}
+
 /// Adds the layers, or replaces the beauty, and writes the file.
 pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Result<Report> {
     let Frames { mut frame, views, mut report } = denoised;
-    let several = views.len() > 1;
     for (layer, Denoised { radiance, alpha }) in &views {
         let at = &layer.passes[&Pass::Combined];
         let recoded = match &options.layer {
             Some(name) => {
                 let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
-                let name = match layer.name.is_empty() {
-                    true => name.clone(),
-                    false => format!("{}.{name}", layer.name),
-                };
+                let name = layer_name(&layer.name, name);
                 let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
                     .iter()
                     .enumerate()
@@ -176,11 +184,43 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
     }
     if options.preview {
         for (layer, Denoised { radiance, .. }) in &views {
-            let view = layer.view.as_deref().filter(|_| several);
-            preview::write(&preview::path(output, view), radiance)?;
+            let path = preview::path(output, layer, views.len());
+            if options.overwrite || !path.exists() {
+                preview::write(&path, radiance)?;
+            } else {
+                report.notes.push(format!("{}: kept; --overwrite writes it anew", path.display()));
+            }
         }
     }
     // Last: an EXR that exists is a frame that is finished.
     frame.write(output)?;
     Ok(report)
+}
+
+/// Writes what previews of a finished result are wanted and missing.
+pub fn add_previews(output: &Path, options: &Options) -> Result<()> {
+    if !options.preview {
+        return Ok(());
+    }
+    let frame = Frame::read(output)?;
+    let layers = passes::layers(&frame);
+    let chosen = &passes::choose(&frame, &layers, options.view_layer.as_deref())?.name;
+    let views = match &options.layer {
+        Some(name) => passes::rgb_layers(&frame, Some(chosen), name),
+        None => layers.iter().filter(|layer| layer.name == *chosen).cloned().collect(),
+    };
+    if views.is_empty() {
+        return Err(Error::invalid(
+            output,
+            "lacks the layer to preview; --overwrite denoises the frame again",
+        ));
+    }
+    for layer in &views {
+        let path = preview::path(output, layer, views.len());
+        if !path.exists() {
+            let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
+            preview::write(&path, set.require(Pass::Combined, "--preview")?)?;
+        }
+    }
+    Ok(())
 }

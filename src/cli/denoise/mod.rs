@@ -18,7 +18,11 @@ use std::{
 use clap::Args as ClapArgs;
 use frame_job::Options;
 
-use super::{SOME_FAILED, inputs, stop};
+use super::{
+    SOME_FAILED,
+    inputs::{self, Inputs},
+    stop,
+};
 use crate::{
     Error, Result, models,
     passes::{NOISY_IMAGE, Pass},
@@ -88,7 +92,7 @@ pub struct Job {
 /// only show in the exit status.
 pub fn run(args: Args) -> Result<ExitCode> {
     check_layer_name(&args.layer)?;
-    let files = inputs::expand(&args.inputs)?;
+    let Inputs { files, unusable } = inputs::expand(&args.inputs)?;
     let jobs = plan(files, &args.out)?;
     // Before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
@@ -105,11 +109,13 @@ pub fn run(args: Args) -> Result<ExitCode> {
         layer: (!args.replace).then_some(args.layer),
         tile: args.tile.map(|t| t as usize),
         preview: args.preview,
+        overwrite: args.overwrite,
     };
-    let mut progress = progress::Progress::new(jobs.len(), args.json);
-    let end = pipeline::run(jobs, args.overwrite, model.into(), options, |job, outcome| {
-        progress.report(job, outcome);
-    })?;
+    let mut progress = progress::Progress::new(jobs.len() + unusable.len(), args.json);
+    for (input, error) in unusable {
+        progress.report(&Job { input, output: PathBuf::new() }, &pipeline::Outcome::Failed(error));
+    }
+    let end = pipeline::run(jobs, model.into(), options, |job, outcome| progress.report(job, outcome))?;
     let failed = progress.finish(end == pipeline::End::Stopped);
     Ok(match end {
         pipeline::End::Stopped => ExitCode::from(stop::INTERRUPTED),

@@ -17,7 +17,7 @@ use super::{
     Job,
     frame_job::{self, Denoised, Frames, Options, Report},
 };
-use crate::{Error, Result, cli::stop, models::Denoiser, passes::PassSet};
+use crate::{Error, Result, cli::stop, frame::Frame, models::Denoiser, passes::PassSet};
 
 /// What became of one file.
 pub enum Outcome {
@@ -46,7 +46,6 @@ enum Event {
 /// What the stages share.
 struct Batch {
     jobs: Vec<Job>,
-    overwrite: bool,
     model: Arc<dyn Denoiser>,
     options: Options,
     /// Held while a file is being written, and for good once the user has asked to stop.
@@ -59,13 +58,12 @@ struct Batch {
 /// Ctrl-C cannot be listened for.
 pub fn run(
     jobs: Vec<Job>,
-    overwrite: bool,
     model: Arc<dyn Denoiser>,
     options: Options,
     mut report: impl FnMut(&Job, &Outcome),
 ) -> Result<End> {
     let total = jobs.len();
-    let batch = Arc::new(Batch { jobs, overwrite, model, options, writing: Mutex::new(()) });
+    let batch = Arc::new(Batch { jobs, model, options, writing: Mutex::new(()) });
     let (events, reports) = channel();
     let stop_events = events.clone();
     stop::on_request(move || {
@@ -113,8 +111,10 @@ fn spawn(
 
 fn load_all(batch: &Batch, next: &SyncSender<(usize, Frames<PassSet>)>, events: &Sender<Event>) {
     for (index, job) in batch.jobs.iter().enumerate() {
-        if !batch.overwrite && job.output.exists() {
-            let _ = events.send(Event::Finished(index, Outcome::Skipped));
+        if !batch.options.overwrite && Frame::exists(&job.output) {
+            let previewed = attempt(&job.output, || frame_job::add_previews(&job.output, &batch.options));
+            let outcome = previewed.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
+            let _ = events.send(Event::Finished(index, outcome));
             continue;
         }
         let loaded = attempt(&job.input, || frame_job::load(&job.input, &*batch.model, &batch.options));
@@ -148,10 +148,7 @@ fn store_all(batch: &Batch, frames: &Receiver<(usize, Frames<Denoised>)>, events
             let _writing = batch.writing.lock().unwrap_or_else(PoisonError::into_inner);
             attempt(&job.input, || frame_job::store(denoised, &job.output, &batch.options))
         };
-        let outcome = match stored {
-            Ok(report) => Outcome::Done(report),
-            Err(error) => Outcome::Failed(error),
-        };
+        let outcome = stored.map_or_else(Outcome::Failed, Outcome::Done);
         let _ = events.send(Event::Finished(index, outcome));
     }
 }

@@ -10,12 +10,13 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use crate::{
     Error, Result, frame,
     metrics::display::{display, exposure},
+    passes::Layer,
     planes::Planes,
 };
 
-/// The preview's path: the result's, with the view where there are several, as `.png`.
-pub fn path(output: &Path, view: Option<&str>) -> PathBuf {
-    match view {
+/// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.
+pub fn path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
+    match layer.view.as_deref().filter(|_| views > 1) {
         None => output.with_extension("png"),
         Some(view) => output.with_extension(format!("{view}.png")),
     }

@@ -5,7 +5,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use super::{Job, pipeline::Outcome};
-use crate::cli::print_line;
+use crate::cli::{print_line, warn_line};
 
 /// Counts and prints outcomes.
 pub struct Progress {
@@ -21,6 +21,7 @@ pub struct Progress {
 #[derive(Serialize)]
 struct Line<'a> {
     input: String,
+    #[serde(skip_serializing_if = "String::is_empty")]
     output: String,
     /// `done`, `skipped` or `failed`.
     status: &'static str,
@@ -68,7 +69,7 @@ impl Progress {
             false => print_plain(job, outcome, count, total),
         });
         if let Outcome::Failed(error) = outcome {
-            self.bar.suspend(|| eprintln!("demc: {error}"));
+            self.bar.suspend(|| warn_line(&format!("demc: {error}")));
         }
     }
 
@@ -106,14 +107,14 @@ fn print_plain(job: &Job, outcome: &Outcome, count: usize, total: usize) {
             ));
             let repaired: Vec<String> = report.repaired.iter().map(|(p, n)| format!("{n} in {p}")).collect();
             if !repaired.is_empty() {
-                eprintln!(
+                warn_line(&format!(
                     "demc: note: {}: non-finite values (NaN or infinity) repaired: {}",
                     job.input.display(),
                     repaired.join(", ")
-                );
+                ));
             }
             for note in &report.notes {
-                eprintln!("demc: note: {}: {note}", job.input.display());
+                warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
         Outcome::Skipped => print_line(&format!("{prefix}{}  is there already", job.output.display())),

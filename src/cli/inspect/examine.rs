@@ -81,17 +81,14 @@ pub struct Method {
     passes: Vec<Pass>,
 }
 
-/// The networks, the classical methods and the peers, with the passes they need.
+/// The networks with weights, the classical methods and the peers, with the passes they need.
 pub fn methods() -> Vec<Method> {
     let method = |name: &str, passes: &[Pass]| Method { name: name.into(), passes: passes.to_vec() };
     let built_in =
         BUILT_IN.into_iter().filter_map(|(name, _)| Some(method(name, Learned::built_in(name)?.passes())));
-    // The passes of a network follow from its architecture alone: any seed will do.
-    let untrained =
-        models::untrained().map(|(name, config)| method(name, models::build(&config, 0).passes()));
     let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES);
     let others = others.filter_map(|name| Some(method(name, models::open(name).ok()?.passes())));
-    built_in.chain(untrained).chain(others).collect()
+    built_in.chain(others).collect()
 }
 
 /// Reads and decodes a whole file.

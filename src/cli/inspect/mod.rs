@@ -8,7 +8,7 @@ use std::{path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, inputs};
+use super::{SOME_FAILED, inputs, print_line, warn_line};
 use crate::Result;
 
 /// Arguments of `demc inspect`.
@@ -28,16 +28,17 @@ pub struct Args {
 /// The inputs name nothing.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let methods = examine::methods();
-    let mut failed = false;
-    for path in inputs::expand(&args.files)? {
+    let inputs = inputs::expand(&args.files)?;
+    let mut failed = !inputs.unusable.is_empty();
+    inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
+    for path in inputs.files {
         match examine::examine(&path, &methods) {
             Ok(report) if args.json => {
-                let line = serde_json::to_string(&report).expect("strings and numbers serialise");
-                super::print_line(&line);
+                print_line(&serde_json::to_string(&report).expect("strings and numbers serialise"));
             }
-            Ok(report) => super::print_line(&print::text(&report)),
+            Ok(report) => print_line(&print::text(&report)),
             Err(error) => {
-                eprintln!("demc: {error}");
+                warn_line(&format!("demc: {error}"));
                 failed = true;
             }
         }
