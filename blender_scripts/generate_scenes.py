@@ -83,7 +83,10 @@ def parse(arguments):
                 parser.error(f"{folder}: no such folder (--{name})")
     if options.guides_only and options.denoise_references:
         parser.error("--guides-only keeps no light that --denoise-references could clean")
-    options.blends = find_blends(options.blend) if options.blend else {}
+    try:
+        options.blends = find_blends(options.blend, KINDS) if options.blend else {}
+    except ValueError as error:
+        parser.error(str(error))
     known = set(KINDS) | set(options.blends)
     options.kinds = options.kinds.split(",") if options.kinds else sorted(known)
     unknown = set(options.kinds) - known
