@@ -294,6 +294,7 @@ def main():
     os.makedirs(options.out, exist_ok=True)
     options.out = os.path.abspath(options.out)
     library, records, failed = Library(options.assets), Records(options.out), 0
+    cl.end_at_once(records.end)
     for seed in options.seeds:
         if options.stop_file and os.path.exists(options.stop_file):
             print(f"stopped: {options.stop_file} exists")
@@ -313,7 +314,7 @@ def main():
             if os.environ.get("DEMC_TRACEBACK"):
                 traceback.print_exc()
             print(f"{scene_name}: failed, {cl.reason(error)}")
-        finally:  # after Ctrl-C too
+        finally:
             records.end()
     cl.finish(failed)
 
