@@ -15,6 +15,7 @@ nothing to see go to rejected.csv and are not tried again.
 """
 
 import argparse
+import contextlib
 import csv
 import logging
 import os
@@ -82,7 +83,10 @@ def parse(arguments):
                 parser.error(f"{folder}: no such folder (--{name})")
     if options.guides_only and options.denoise_references:
         parser.error("--guides-only keeps no light that --denoise-references could clean")
-    options.blends = find_blends(options.blend) if options.blend else {}
+    try:
+        options.blends = find_blends(options.blend, KINDS) if options.blend else {}
+    except ValueError as error:
+        parser.error(str(error))
     known = set(KINDS) | set(options.blends)
     options.kinds = options.kinds.split(",") if options.kinds else sorted(known)
     unknown = set(options.kinds) - known
@@ -124,6 +128,7 @@ class Records:
 
     def __init__(self, out):
         self.out = out
+        self.mark = os.path.join(out, ".under_way")
         self.done = {row[0] for row in self._rows("manifest.csv")}
         self.rejected = {row[0]: row[1] for row in self._rows("rejected.csv")}
 
@@ -152,20 +157,24 @@ class Records:
         self.rejected[scene_name] = reason
 
     def begin(self, scene_name):
-        """Marks a scene as under way. A scene that took Blender down twice is rejected: returns
-        False for it."""
-        path = os.path.join(self.out, ".under_way")
+        """Marks a scene as under way; a mark that is still there is of a try that `end` never came
+        after. A scene that took Blender down twice is rejected: returns False for it."""
         tries = 0
-        if os.path.exists(path):
-            with open(path, encoding="utf-8") as file:
-                name, _, count = file.read().partition(" ")
+        if os.path.exists(self.mark):
+            with open(self.mark, encoding="utf-8") as file:
+                name, _, count = file.read().rpartition(" ")  # a .blend's name may hold spaces
             tries = int(count or 0) if name == scene_name else 0
         if tries >= 2:
             self.reject(scene_name, "Blender crashed")
             return False
-        with open(path, "w", encoding="utf-8") as file:
+        with open(self.mark, "w", encoding="utf-8") as file:
             file.write(f"{scene_name} {tries + 1}")
         return True
+
+    def end(self):
+        """Takes the mark away: Blender still runs, whatever became of the scene."""
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(self.mark)
 
 
 def settings_of_scene(edits, scene, rng, options, is_blend):
@@ -285,6 +294,7 @@ def main():
     os.makedirs(options.out, exist_ok=True)
     options.out = os.path.abspath(options.out)
     library, records, failed = Library(options.assets), Records(options.out), 0
+    cl.end_at_once(records.end)
     for seed in options.seeds:
         if options.stop_file and os.path.exists(options.stop_file):
             print(f"stopped: {options.stop_file} exists")
@@ -304,6 +314,8 @@ def main():
             if os.environ.get("DEMC_TRACEBACK"):
                 traceback.print_exc()
             print(f"{scene_name}: failed, {cl.reason(error)}")
+        finally:
+            records.end()
     cl.finish(failed)
 
 

@@ -122,6 +122,10 @@ def main():
         with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
             archive.extractall(folder)
             library, entries = catalogue(archive)
+            source = library.get("name", os.path.splitext(os.path.basename(path))[0])
+            licence = library.get("license")
+            if licence is None:
+                print(f"{path}: its catalogue names no licence")
             for model in entries:
                 name = model["model"]
                 try:
@@ -139,10 +143,11 @@ def main():
                     failed += 1
                     print(f"{name}: left out, {cl.reason(error)}")
                     continue
-                rows.append((name, category, round(max(dimensions(model)), 3), library["name"], model.get("creator", ""), library["license"]))
+                rows.append((name, category, round(max(dimensions(model)), 3), source, model.get("creator", ""), licence or "not named"))
     with open(os.path.join(options.out, "models.tsv"), "w", encoding="utf-8", newline="") as file:
         csv.writer(file, delimiter="\t", lineterminator="\n", quoting=csv.QUOTE_NONE, quotechar=None).writerows([_HEADER, *rows])
     print(f"{len(rows)} models in {models}, {failed} left out")
+    cl.finish(failed)
 
 
 if __name__ == "__main__":

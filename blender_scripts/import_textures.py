@@ -81,7 +81,7 @@ def main():
     """Entry point of the script."""
     options = parse(cl.script_arguments())
     cl.quiet_stdout()
-    stored = passed = 0
+    stored = passed = failed = 0
     for folder in options.folders:
         for path, kind in candidates(folder):
             place = os.path.splitext(os.path.relpath(path, folder))[0]
@@ -91,8 +91,10 @@ def main():
             except (RuntimeError, ValueError) as error:  # one bad image must not cost the others
                 print(f"{path}: left out, {cl.reason(error)}")
                 kept = False
+                failed += 1
             stored, passed = stored + kept, passed + (not kept)
     print(f"{stored} textures in {options.out}, {passed} of fitting names left out")
+    cl.finish(failed)
 
 
 if __name__ == "__main__":

@@ -398,6 +398,7 @@ def main():
                 raise
             print(f"{name}: left out, {cl.reason(error)}")
     print(f"{made} tracks in {options.out}, {failed} left out")
+    cl.finish(failed)
 
 
 if __name__ == "__main__":

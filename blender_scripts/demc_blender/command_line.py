@@ -2,7 +2,10 @@
 
 import argparse
 import os
+import signal
+import socket
 import sys
+import threading
 
 import bpy
 
@@ -32,6 +35,28 @@ def quiet_stdout():
     os.dup2(sink, 1)
     os.close(sink)
     sys.stdout = os.fdopen(ours, "w", buffering=1, encoding="utf-8", errors="replace")
+
+
+def end_at_once(tidy):
+    """Lets Ctrl-C and SIGTERM end the script at once, after `tidy()`.
+
+    Python's own handler waits until a render ends, and the KeyboardInterrupt is then lost in Cycles' callbacks. An open Blender
+    window keeps its handlers.
+    """
+    if not bpy.app.background:
+        return
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+    signal.set_wakeup_fd(writer.detach())
+
+    def wait():
+        number = reader.recv(1)[0]
+        tidy()
+        os._exit(128 + number)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def reason(error):

@@ -9,13 +9,22 @@ from mathutils import Euler, Vector
 from . import views
 
 
-def find_blends(folder):
-    """Name -> path of every .blend under a folder."""
+def find_blends(folder, taken=()):
+    """Name -> path of every .blend under a folder, by name. Two of one name are refused, and names that are taken:
+    which one a seed draws would be chance."""
     found = {}
-    for root, _, files in os.walk(folder):
-        for file in files:
-            if file.endswith(".blend"):
-                found[os.path.splitext(file)[0]] = os.path.join(root, file)
+    for root, folders, files in os.walk(folder):
+        folders.sort()
+        for file in sorted(files):
+            name, extension = os.path.splitext(file)
+            if extension != ".blend":
+                continue
+            path = os.path.join(root, file)
+            if name in found:
+                raise ValueError(f"{found[name]} and {path} have one name: rename one of them (--blend)")
+            if name in taken:
+                raise ValueError(f"{path}: {name} is also a kind of made scenes: rename the file (--blend)")
+            found[name] = path
     if not found:
         raise ValueError(f"{folder}: no .blend below it (--blend)")
     return dict(sorted(found.items()))

@@ -9,12 +9,12 @@ errs as the denoiser of the references does; the noise of the latter is the same
 """
 
 import argparse
-import csv
 import random
 import tempfile
 
 import numpy as np
 
+import manifests
 from clean_references import exr, planes
 from methods import add_options, both
 
@@ -39,8 +39,7 @@ def main():
     add_options(parser)
     parser.add_argument("--most", type=int, default=110, help="pairs drawn from the manifest, if it has more")
     options = parser.parse_args()
-    with open(options.manifest, encoding="utf-8", newline="") as file:
-        pairs = [row for row in csv.DictReader(file) if row["spp"] == "4"]
+    pairs = [row for row in manifests.read(options.manifest) if row["spp"] == "4"]
     random.Random(3).shuffle(pairs)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -53,6 +52,8 @@ def main():
             ours, theirs = both(options, pair["noisy"], folder)
             references = (planes(reference, name, "RGB")[0] for name in ("Combined", "Noisy Image"))
             rows.append(errors(ours, theirs, *references))
+    if len(rows) < 3:
+        raise SystemExit(f"{options.manifest}: {len(rows)} pairs of 4 samples whose references keep a Noisy Image, at least 3 are needed")
     rows.sort(key=lambda row: row[1])
     tell("all", rows)
     for k, name in enumerate(("lowest", "middle", "highest")):

@@ -9,10 +9,10 @@ have no noise of their own. What is there already is kept.
 """
 
 import argparse
-import csv
 import os
 import tempfile
 
+import manifests
 from clean_references import clean, exr, planes
 from looks import denoised, mirrored, seen
 from methods import add_options
@@ -41,8 +41,8 @@ def main():
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
     pairs = []
-    with open(options.manifest, encoding="utf-8", newline="") as file, tempfile.TemporaryDirectory() as folder:
-        for row in csv.DictReader(file):
+    with tempfile.TemporaryDirectory() as folder:
+        for row in manifests.read(options.manifest):
             frame = os.path.basename(row["noisy"]).removesuffix(".exr")
             target = os.path.join(options.out, f"{frame}_ref.exr")
             if not os.path.exists(target):
@@ -52,8 +52,7 @@ def main():
                 channels |= {name.replace("Combined", "Noisy Image"): taught[..., c] for c, name in enumerate(names)}
                 exr.write_half(target, channels)
             pairs.append([row["scene"], row["noisy"], target, row["spp"]])
-    with open(os.path.join(options.out, "manifest.csv"), "w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([["scene", "noisy", "reference", "spp"], *pairs])
+    manifests.write(os.path.join(options.out, "manifest.csv"), pairs)
     print(f"{len(pairs)} pairs in {options.out}")
 
 

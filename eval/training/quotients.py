@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
-"""Tells what dividing radiance by its own noisy albedo is worth: quotients.py FRAME_0004spp.exr... --clean DIR
+"""Tells what dividing radiance by its own noisy albedo is worth.
+
+    python quotients.py '../shared/data/val/*_0004spp.exr' --clean DIR
 
 Of the pixels of each frame whose albedo is more than 5% off, prints the median RelMSE of the radiance as it is, and of the
 radiance times the clean albedo over the noisy one. DIR holds the frames with their albedo denoised (`clean_guides.py FRAMES DIR
---oidn PATH/oidnDenoise --guides albedo`), the reference lies beside each frame. Needs numpy and openexr.
+--oidn PATH/oidnDenoise --guides albedo`), the reference lies beside each frame. Needs numpy.
 """
 
 import argparse
+import glob
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +26,11 @@ def colours(path, render_pass):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("frames", nargs="+", type=Path)
+    parser.add_argument("frames", help="quoted glob of noisy frames, <scene>_<spp>spp.exr beside <scene>_ref.exr")
     parser.add_argument("--clean", required=True, type=Path)
     args = parser.parse_args()
 
-    for frame in args.frames:
+    for frame in map(Path, sorted(glob.glob(args.frames))):
         scene = frame.name.rsplit("_", 1)[0]
         radiance = colours(frame, "Combined")
         reference = colours(frame.with_name(f"{scene}_ref.exr"), "Combined")

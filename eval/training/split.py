@@ -6,8 +6,10 @@ A FOLDER holds manifest.csv (scene, noisy, reference, spp). A scene is held out,
 up to the seed ("s28136" of "s28136_skin") is a multiple of 12; of its pairs only the first noise at 4 spp is scored.
 A folder after --pairs holds NAME_0004spp.exr and NAME_ref.exr, views of the scenes of B, which are all trained on.
 """
-import argparse, csv, re, zlib
+import argparse, re, zlib
 from pathlib import Path
+
+import manifests
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("train", type=Path)
@@ -18,22 +20,20 @@ options = parser.parse_args()
 
 train, held_out = [], []
 for folder in options.folders:
-    with open(folder / "manifest.csv", newline="") as file:
-        for row in csv.DictReader(file):
-            pair = [row["scene"], folder / row["noisy"], folder / row["reference"], row["spp"]]
-            scene = re.match(r"s\d+", row["scene"])
-            if scene is None:
-                raise SystemExit(f"{folder / 'manifest.csv'}: scene {row['scene']!r} does not begin with s and its seed")
-            if zlib.crc32(scene.group().encode()) % 12:
-                train.append(pair)
-            elif row["spp"] == "4" and not re.search(r"_n\d", row["noisy"]):
-                held_out.append(pair)
+    for row in manifests.read(folder / "manifest.csv"):
+        pair = [row["scene"], row["noisy"], row["reference"], row["spp"]]
+        scene = re.match(r"s\d+", row["scene"])
+        if scene is None:
+            raise SystemExit(f"{folder / 'manifest.csv'}: scene {row['scene']!r} does not begin with s and its seed")
+        if zlib.crc32(scene.group().encode()) % 12:
+            train.append(pair)
+        elif row["spp"] == "4" and not re.search(r"_n\d", Path(row["noisy"]).name):
+            held_out.append(pair)
 for folder in options.pairs:
     for noisy in sorted(folder.glob("*_0004spp.exr")):
         name = noisy.name.removesuffix("_0004spp.exr")
         train.append([name, noisy, folder / f"{name}_ref.exr", "4"])
 
 for path, pairs in (options.train, train), (options.held_out, held_out):
-    with open(path, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([["scene", "noisy", "reference", "spp"], *pairs])
+    manifests.write(path, pairs)
     print(f"{path}: {len(pairs)} pairs")

@@ -10,12 +10,12 @@ there already is kept.
 """
 
 import argparse
-import csv
 import os
 import tempfile
 
 import numpy as np
 
+import manifests
 from clean_references import clean, exr, planes
 
 
@@ -38,9 +38,8 @@ def main():
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
     views = {}
-    with open(options.manifest, encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            views.setdefault((row["reference"], row["spp"]), []).append(row["noisy"])
+    for row in manifests.read(options.manifest):
+        views.setdefault((row["reference"], row["spp"]), []).append(row["noisy"])
     pairs = []
     with tempfile.TemporaryDirectory() as folder:
         for (_, spp), frames in views.items():
@@ -50,8 +49,7 @@ def main():
                 taught, names = teach(options.oidn, folder, frames)
                 exr.write_half(target, {name: taught[..., c] for c, name in enumerate(names)})
             pairs += [[f"{scene}_taught", frame, target, spp] for scene, frame in zip(scenes, frames)]
-    with open(os.path.join(options.out, "manifest.csv"), "w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([["scene", "noisy", "reference", "spp"], *pairs])
+    manifests.write(os.path.join(options.out, "manifest.csv"), pairs)
     print(f"{len(pairs)} pairs in {options.out}")
 
 
