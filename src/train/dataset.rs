@@ -186,6 +186,8 @@ impl Stored {
     ) -> Result<Self> {
         let frame = Frame::read(&pair.noisy)?;
         let mut noisy = passes::read(&frame, None)?;
+        // As for inference: Combined may be what Blender made of the render.
+        noisy.use_noisy_image();
         for &pass in needed {
             noisy.require(pass, "training")?;
         }
@@ -283,9 +285,10 @@ impl Stored {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
+    use std::{collections::BTreeSet, path::Path};
 
     use super::*;
+    use crate::frame::{NewChannel, SampleKind};
 
     /// A frame of 8x8 pixels all of whose passes are `value` everywhere.
     fn stored(reference: &str, spp: u32, value: f32) -> Stored {
@@ -351,17 +354,47 @@ mod tests {
         assert!((80..132).contains(&sides[0]), "{sides:?}");
     }
 
-    #[test]
-    fn frames_that_hold_no_crop_at_all_are_named() {
-        let file =
-            |name: &str| std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
-        let pair = Pair {
+    /// A pair of real frames of 128x128 pixels.
+    fn room() -> Pair {
+        let file = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+        Pair {
             scene: "s0000_room".into(),
             noisy: file("s0000_room_0004spp.exr"),
             reference: file("s0000_room_ref.exr"),
             spp: 4,
             frame: None,
-        };
+        }
+    }
+
+    /// [`room`], the noisy frame of which `folder` gets with another layer: each channel is `values`.
+    fn room_with(folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> Pair {
+        let mut pair = room();
+        let mut frame = Frame::read(&pair.noisy).unwrap();
+        let channels = axes.map(|component| NewChannel { component, kind: SampleKind::Float, values });
+        frame.set_layer(0, &format!("ViewLayer.{layer}"), None, &channels).unwrap();
+        pair.noisy = folder.join("noisy.exr");
+        frame.write(&pair.noisy).unwrap();
+        pair
+    }
+
+    /// The only frame of a dataset of one pair, with one pass and Combined as its target.
+    fn only(pair: Pair, pass: Pass) -> Sample {
+        let data = Dataset::load(&[pair], (&[pass], &[]), &[Pass::Combined], false, 1).unwrap();
+        data.frame(0).1
+    }
+
+    #[test]
+    fn learns_from_the_render_and_not_from_what_blender_denoised() {
+        let folder = tempfile::tempdir().unwrap();
+        let render = vec![3.0; 128 * 128];
+        let pair = room_with(folder.path(), "Noisy Image", ["R", "G", "B"], &render);
+        let sample = only(pair, Pass::Combined);
+        assert_eq!(sample.passes.get(Pass::Combined).unwrap().channel(1), render);
+    }
+
+    #[test]
+    fn frames_that_hold_no_crop_at_all_are_named() {
+        let pair = room();
         let load = |least| {
             Dataset::load(
                 std::slice::from_ref(&pair),
