@@ -16,7 +16,7 @@ use crate::{
     testset::Pair,
 };
 
-/// Frames and references, decoded once and held as half floats (the precision they mostly come in).
+/// Frames and references, decoded once and held in the precision that they mostly come in, see [`Values`].
 pub struct Dataset {
     frames: Vec<Stored>,
     /// Pixels of all frames up to and with each.
@@ -31,10 +31,10 @@ struct Stored {
     view_layer: String,
     width: usize,
     height: usize,
-    passes: Vec<(Pass, Vec<f16>)>,
-    reference: Vec<(Pass, Vec<f16>)>,
+    passes: Vec<(Pass, Values)>,
+    reference: Vec<(Pass, Values)>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
-    raw_reference: Option<Vec<f16>>,
+    raw_reference: Option<Values>,
     /// See [`pairing::warning`].
     warning: Option<String>,
 }
@@ -51,10 +51,34 @@ pub struct Sample {
     pub raw_reference: Option<Planes>,
 }
 
-/// Halves of the training copy: brighter values are clipped to the largest.
-fn to_half(values: &[f32]) -> Vec<f16> {
-    let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
-    Vec::from_f32_slice(&clipped)
+/// The training copy of a pass, (C, H, W).
+#[cfg_attr(test, derive(Clone))]
+enum Values {
+    /// Values beyond the largest half are clipped to it.
+    Half(Vec<f16>),
+    Full(Vec<f32>),
+}
+
+impl Values {
+    /// Halves, but for places and distances: far from the origin, what a half cannot tell apart is larger than what is
+    /// looked at, and no half holds the 1e10 of a ray that hits nothing.
+    fn of(pass: Pass, values: &[f32]) -> Self {
+        match pass {
+            Pass::Position | Pass::Depth | Pass::DenoisingDepth => Self::Full(values.to_vec()),
+            _ => {
+                let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
+                Self::Half(Vec::from_f32_slice(&clipped))
+            }
+        }
+    }
+
+    /// Writes `out.len()` values from the one at `start`.
+    fn read(&self, start: usize, out: &mut [f32]) {
+        match self {
+            Self::Half(values) => values[start..][..out.len()].convert_to_f32_slice(out),
+            Self::Full(values) => out.copy_from_slice(&values[start..][..out.len()]),
+        }
+    }
 }
 
 impl Dataset {
@@ -219,11 +243,12 @@ impl Stored {
                 ),
             ));
         }
-        let raw_reference =
-            reference.get(Pass::NoisyImage).filter(|_| raw_references).map(|raw| to_half(&raw.data));
-        let kept = |passes: &PassSet, wanted: &[&[Pass]]| -> Vec<(Pass, Vec<f16>)> {
+        let copy = |(pass, planes): (Pass, &Planes)| (pass, Values::of(pass, &planes.data));
+        let raw = reference.get(Pass::NoisyImage).filter(|_| raw_references);
+        let raw_reference = raw.map(|raw| Values::of(Pass::NoisyImage, &raw.data));
+        let kept = |passes: &PassSet, wanted: &[&[Pass]]| -> Vec<(Pass, Values)> {
             let wanted = |pass: &Pass| wanted.iter().any(|passes| passes.contains(pass));
-            passes.iter().filter(|(p, _)| wanted(p)).map(|(p, planes)| (p, to_half(&planes.data))).collect()
+            passes.iter().filter(|(pass, _)| wanted(pass)).map(copy).collect()
         };
         let radiance = [&noisy, &reference].map(|passes| passes.get(Pass::Combined));
         let warning = match radiance {
@@ -252,33 +277,33 @@ impl Stored {
         Sample {
             passes: self.passes(&self.passes, at, size),
             reference: self.passes(&self.reference, at, size),
-            raw_reference: self.raw_reference.as_deref().map(|data| self.cut(data, 3, at, size)),
+            raw_reference: self.raw_reference.as_ref().map(|values| self.cut(values, 3, at, size)),
         }
     }
 
     /// Some passes of a crop.
     fn passes(
         &self,
-        all: &[(Pass, Vec<f16>)],
+        all: &[(Pass, Values)],
         at: (usize, usize),
         (width, height): (usize, usize),
     ) -> PassSet {
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
-        for (pass, data) in all {
-            passes.insert(*pass, self.cut(data, pass.channels(), at, (width, height)));
+        for (pass, values) in all {
+            passes.insert(*pass, self.cut(values, pass.channels(), at, (width, height)));
         }
         passes
     }
 
     fn cut(
         &self,
-        data: &[f16],
+        values: &Values,
         channels: usize,
         (x, y): (usize, usize),
         (width, height): (usize, usize),
     ) -> Planes {
         Planes::from_rows(channels, (width, height), |c, row, out| {
-            data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
+            values.read((c * self.height + y + row) * self.width + x, out);
         })
     }
 }
@@ -296,7 +321,7 @@ mod tests {
     }
 
     fn stored_of(side: usize, reference: &str, spp: u32, value: f32) -> Stored {
-        let plane = |channels: usize| vec![f16::from_f32(value); channels * side * side];
+        let values = |pass: Pass| (pass, Values::of(pass, &vec![value; pass.channels() * side * side]));
         let pair = Pair {
             scene: "scene".into(),
             noisy: "noisy.exr".into(),
@@ -309,8 +334,8 @@ mod tests {
             view_layer: "ViewLayer".into(),
             width: side,
             height: side,
-            passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
-            reference: vec![(Pass::Combined, plane(3))],
+            passes: [Pass::Combined, Pass::Depth].map(values).into(),
+            reference: vec![values(Pass::Combined)],
             raw_reference: None,
             warning: None,
         }
@@ -390,6 +415,20 @@ mod tests {
         let pair = room_with(folder.path(), "Noisy Image", ["R", "G", "B"], &render);
         let sample = only(pair, Pass::Combined);
         assert_eq!(sample.passes.get(Pass::Combined).unwrap().channel(1), render);
+    }
+
+    #[test]
+    fn places_far_from_the_origin_and_misses_stay_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        // A hundredth apart, where halves are 1 to 2 apart.
+        let places: Vec<f32> = (0..128 * 128).map(|i| 2000.0 + 0.01 * i as f32).collect();
+        let pair = room_with(folder.path(), "Position", ["X", "Y", "Z"], &places);
+        assert_eq!(only(pair, Pass::Position).passes.get(Pass::Position).unwrap().channel(2), places);
+        for depth in [Pass::Depth, Pass::DenoisingDepth] {
+            let mut miss = [0.0];
+            Values::of(depth, &[1e10]).read(0, &mut miss);
+            assert_eq!(miss, [1e10], "{depth}");
+        }
     }
 
     #[test]
