@@ -199,6 +199,9 @@ fn refuses_what_cannot_be_trained() {
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
         .code(1)
         .stderr(says("trained on and validated on"));
+    // The same frames, by another path.
+    let roundabout = data("s0000_room").replace("tests/data", "tests/data/../data");
+    run(train(&out, 4).args(["--val", &roundabout])).code(1).stderr(says("trained on and validated on"));
     run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
     run(train(&out, 4).args(["--optimizer", "sgd"])).code(2).stderr(says("adam or muon"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));

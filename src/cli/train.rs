@@ -1,9 +1,10 @@
 //! `demc train`: fits a network to pairs of noisy and reference frames.
 
 use std::{
+    collections::HashSet,
     fs,
     io::IsTerminal,
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::ExitCode,
     sync::{
         Arc,
@@ -143,10 +144,15 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a pair is held out: decided by its reference's file name alone, so that every sample count and
-/// seed of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
-fn held_out(reference: &Path) -> bool {
-    let name = reference.file_name().unwrap_or_default().to_string_lossy();
+/// Whether a pair is held out: decided by its reference's file name without the frame number, so that every
+/// sample count, seed and frame of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+fn held_out(pair: &Pair) -> bool {
+    let mut name = pair.reference.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    if let Some(frame) = &pair.frame
+        && let Some(at) = name.rfind(&format!(".{frame}."))
+    {
+        name.replace_range(at..=at + frame.len(), "");
+    }
     let hash = name
         .bytes()
         .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
@@ -206,11 +212,14 @@ impl Args {
         }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
-            pairs.into_iter().partition(|p| held_out(&p.reference))
+            pairs.into_iter().partition(held_out)
         } else {
             (all_pairs(&self.val)?, pairs)
         };
-        if let Some(pair) = training.iter().find(|p| validation.iter().any(|v| v.reference == p.reference)) {
+        // However each was typed.
+        let file = |p: &Pair| fs::canonicalize(&p.reference).unwrap_or_else(|_| p.reference.clone());
+        let validated: HashSet<PathBuf> = validation.iter().map(file).collect();
+        if let Some(pair) = training.iter().find(|p| validated.contains(&file(p))) {
             return Err(Error::invalid(
                 &pair.reference,
                 "is both trained on and validated on; give --val other scenes than --data",
@@ -320,5 +329,29 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Ok(ExitCode::from(super::stop::INTERRUPTED))
         }
         other => other.map(|()| ExitCode::SUCCESS),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pair(reference: String, frame: Option<String>) -> Pair {
+        Pair { scene: "shot".into(), noisy: "noisy.exr".into(), reference: reference.into(), spp: 4, frame }
+    }
+
+    #[test]
+    fn frames_of_a_sequence_are_held_out_with_its_still_or_trained_on_together() {
+        let name = |scene: usize, frame: &str| format!("train/s{scene:04}_room_ref{frame}.exr");
+        let still = |scene| held_out(&pair(name(scene, ""), None));
+        for scene in 0..40 {
+            for frame in ["0001", "0017", "-0003"] {
+                let of_sequence = pair(name(scene, &format!(".{frame}")), Some(frame.into()));
+                assert_eq!(held_out(&of_sequence), still(scene), "{scene}, frame {frame}");
+            }
+        }
+        // Which stills they are is not to change.
+        let held: Vec<usize> = (0..40).filter(|scene| still(*scene)).collect();
+        assert_eq!(held, [0, 3, 4, 7, 15, 20, 33, 39]);
     }
 }
