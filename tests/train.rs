@@ -196,6 +196,9 @@ fn refuses_what_cannot_be_trained() {
     run(&mut train_with("noisy", "64", &out, 4)).code(2).stderr(says("trainable: demc-s"));
     run(&mut train_with("demc-s", "50", &out, 4)).code(2).stderr(says("multiple of 16"));
     run(train_with("kpcn", "8", &out, 4).args(["--loss", "ssim"])).code(2).stderr(says("11 at least"));
+    let prefilter = || train_with("prefilter", "64", &out, 4);
+    run(prefilter().args(["--loss", "ssim"])).code(2).stderr(says("--loss geomean"));
+    run(prefilter().arg("--raw-references")).code(2).stderr(says("--raw-references: prefilter"));
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
         .code(1)
         .stderr(says("trained on and validated on"));

@@ -188,7 +188,18 @@ impl Args {
             network.prefilter = weights_file::prefilter_widths(path)?;
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
-        let multiple = models::build(&network, 0).multiple();
+        let built = models::build(&network, 0);
+        if !built.makes_radiance() {
+            if self.raw_references {
+                let reason = "makes no radiance, of which alone references hold what it was before; leave it out";
+                return Err(usage(format!("--raw-references: {} {reason}", self.model)));
+            }
+            if self.loss.needs_radiance() {
+                let reason = "makes no radiance that a display would show; take --loss geomean";
+                return Err(usage(format!("--loss {}: {} {reason}", self.loss, self.model)));
+            }
+        }
+        let multiple = built.multiple();
         if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
         }

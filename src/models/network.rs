@@ -124,7 +124,12 @@ pub trait Network: Send + Sync {
         &[Pass::Combined]
     }
 
-    /// What it should make of a frame, by its reference: radiance, (3, H, W).
+    /// Whether it makes radiance of a frame, not guides for other networks.
+    fn makes_radiance(&self) -> bool {
+        self.targets() == [Pass::Combined]
+    }
+
+    /// What it should make of a frame, by its reference: radiance, (3, H, W), if [`Network::makes_radiance`].
     ///
     /// # Errors
     /// A pass is missing.

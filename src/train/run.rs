@@ -283,7 +283,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
         }
         logs.push(metrics::error::relmse(image, reference).max(f64::MIN_POSITIVE).ln());
-        if reference.channels == 3
+        if network.makes_radiance()
             && let Some(exposure) = metrics::display::exposure(reference)
         {
             let display = |p| metrics::display::display(p, exposure);
