@@ -6,14 +6,17 @@ use std::{
     fs,
     path::{Path, PathBuf},
     process::{Command, Stdio},
+    sync::atomic::{AtomicBool, Ordering},
     time::{Duration, Instant},
 };
 
 use assert_cmd::cargo::cargo_bin;
 use demc::{
+    Error,
     models::{self, weights_file},
     nn::weights::{self, Tensor},
     passes,
+    train::{self, Event, Options},
 };
 use predicates::prelude::*;
 
@@ -149,6 +152,48 @@ fn wait_for(path: &Path) {
         assert!(start.elapsed() < Duration::from_secs(120), "{} never came", path.display());
         std::thread::sleep(Duration::from_millis(5));
     }
+}
+
+#[test]
+fn skipped_steps_are_told_and_a_run_that_takes_none_stops_with_the_checkpoint_before() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    // The first step leaves weights that make no finite image; without --val, none is asked for.
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args(["train", "--data", &data("s0010_outdoor"), "--batch", "1", "--patch", "32"]);
+    command.args(["--model", "demc-s", "--every", "4", "--steps", "12", "--lr", "1e30:1e30"]);
+    let says = predicate::str::contains;
+    run(command.arg("--out").arg(&out))
+        .code(1)
+        .stderr(says("warning: 3 of the last 4 steps").and(says("none of the last 4 steps")));
+    let rows = log(&out);
+    assert_eq!(rows.len(), 2, "{rows:?}");
+    assert!(rows[1].starts_with("4,") && !rows[1].contains("NaN"), "{rows:?}");
+
+    // Step 1 goes well, step 2 leaves such weights, step 3 is skipped.
+    let options = options(&out);
+    let well = Options { lr: (1e-4, 1e-4), ..options.clone() };
+    let cut = dir.path().join("cut");
+    assert!(matches!(run_until(&well, &cut, false, 1), Err(Error::Interrupted)));
+    let good = tensors(&cut);
+    assert!(matches!(run_until(&options, &cut, true, 3), Err(Error::Interrupted)));
+    assert_eq!(tensors(&cut), good);
+}
+
+/// What a run's config.json holds.
+fn options(out: &Path) -> Options {
+    let text = fs::read_to_string(out.join("config.json")).expect("a configuration");
+    serde_json::from_str(&text).expect("options")
+}
+
+/// Trains in this process until the step `stop_at`, as if interrupted there.
+fn run_until(options: &Options, out: &Path, resume: bool, stop_at: usize) -> demc::Result<()> {
+    let stop = AtomicBool::new(false);
+    train::run(options, out, resume, &stop, &mut |event| {
+        if matches!(event, Event::Step { step, .. } if step == stop_at) {
+            stop.store(true, Ordering::Relaxed);
+        }
+    })
 }
 
 #[test]

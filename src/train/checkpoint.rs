@@ -20,7 +20,7 @@ pub struct Progress {
     pub seconds: f64,
     /// Sum and number of training losses since the last line of the log.
     pub losses: (f64, usize),
-    /// Steps skipped because their gradient was not finite.
+    /// Steps skipped since then because their gradient was not finite.
     pub skipped: usize,
     /// The best validation RelMSE so far.
     pub best: Option<f64>,

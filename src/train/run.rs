@@ -75,7 +75,7 @@ pub struct Options {
 /// What the caller hears of.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Something the user should know of the data.
+    /// Something the user should know of the data, or of how training goes.
     Warning(String),
     /// A step was done.
     Step {
@@ -92,10 +92,12 @@ pub enum Event {
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
 /// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
-/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint.
+/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint follows a step
+/// that was skipped: where all are, the weights of the one before are good.
 ///
 /// # Errors
-/// A pair is unusable, or the run folder cannot be read or written.
+/// A pair is unusable, the run folder cannot be read or written, or no step between two rows of the log had a finite
+/// gradient.
 pub fn run(
     options: &Options,
     out: &Path,
@@ -144,8 +146,9 @@ pub fn run(
         let last = progress.step == options.steps;
         if progress.step % options.every == 0 || last {
             progress.seconds += since.elapsed().as_secs_f64();
-            let score = validate(&mut *average, &validation)?;
             let (sum, count) = std::mem::take(&mut progress.losses);
+            report_skipped(std::mem::take(&mut progress.skipped), count, out, on)?;
+            let score = validate(&mut *average, &validation)?;
             let row = log::Row {
                 step: progress.step,
                 seconds: (progress.seconds * 10.0).round() / 10.0,
@@ -166,7 +169,8 @@ pub fn run(
             since = Instant::now();
         }
         let stopping = stop.load(Ordering::Relaxed);
-        if last || stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS {
+        let due = stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS;
+        if last || (due && finite) {
             progress.seconds += std::mem::replace(&mut since, Instant::now()).elapsed().as_secs_f64();
             checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
             saved = Instant::now();
@@ -174,6 +178,29 @@ pub fn run(
         if stopping && !last {
             return Err(Error::Interrupted);
         }
+    }
+    Ok(())
+}
+
+/// Warns of steps that were skipped beside the `taken` ones since the last row of the log.
+///
+/// # Errors
+/// None was taken.
+fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(Event)) -> Result<()> {
+    if taken == 0 {
+        return Err(Error::invalid(
+            out,
+            format!(
+                "none of the last {skipped} steps had a finite gradient; lower \"lr\" in its config.json and pass \
+                 --resume to go on from the checkpoint before, or train anew with a lower --lr"
+            ),
+        ));
+    }
+    if skipped > 0 {
+        let steps = skipped + taken;
+        on(Event::Warning(format!(
+            "{skipped} of the last {steps} steps had no finite gradient and were skipped; should most be, lower --lr"
+        )));
     }
     Ok(())
 }
@@ -220,7 +247,7 @@ fn learning_rate((largest, last): (f64, f64), steps: usize, step: usize) -> f64 
     warmed.min(1.0) * (largest + (last - largest) * done)
 }
 
-/// One optimiser step. Returns the loss and whether its gradient was finite.
+/// One optimiser step. Returns the loss, and whether it and its gradient were finite: else nothing changed.
 fn step(
     network: &mut dyn Network,
     optimizer: &mut Optimizer,
@@ -247,6 +274,9 @@ fn step(
     let image = network.forward_taped(&stack(&inputs), &mut stats);
     let loss = options.loss.of(image, reference, raw, &scales);
     let value = f64::from(loss.as_vec()[0]);
+    if !value.is_finite() {
+        return Ok((value, false));
+    }
     let mut gradients = loss.backward();
     let norm = optimizer.update(step, lr, network.params(), &mut gradients);
     if norm.is_finite()
