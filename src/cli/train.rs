@@ -89,8 +89,12 @@ pub struct Args {
     /// prefilter; without it those of --init, or the built-in ones
     #[arg(long)]
     prefilter: Option<PathBuf>,
-    /// Go on from the run folder's checkpoint, with its config.json
-    #[arg(long)]
+    /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for more steps, edit
+    /// them there
+    #[arg(long, conflicts_with_all = [
+        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "optimizer",
+        "weight_decay", "precision", "average", "val", "every", "seed", "init", "prefilter",
+    ])]
     resume: bool,
     /// Threads to use; all processors without it
     #[arg(long)]
@@ -160,6 +164,14 @@ fn held_out(pair: &Pair) -> bool {
     (hash >> 32) % HOLD_OUT == 0
 }
 
+/// Pairs with absolute paths: a run may be resumed from another folder.
+fn from_anywhere(mut pairs: Vec<Pair>) -> Result<Vec<Pair>> {
+    for path in pairs.iter_mut().flat_map(|pair| [&mut pair.noisy, &mut pair.reference]) {
+        *path = std::path::absolute(&path).map_err(Error::io("read", &*path))?;
+    }
+    Ok(pairs)
+}
+
 /// Whether the noisy frame of a pair holds what KPCN's two streams read.
 fn has_light_passes(pair: &Pair) -> Result<bool> {
     let frame = Frame::read(&pair.noisy)?;
@@ -191,7 +203,8 @@ impl Args {
         let built = models::build(&network, 0);
         if !built.makes_radiance() {
             if self.raw_references {
-                let reason = "makes no radiance, of which alone references hold what it was before; leave it out";
+                let reason =
+                    "makes no radiance, of which alone references hold what it was before; leave it out";
                 return Err(usage(format!("--raw-references: {} {reason}", self.model)));
             }
             if self.loss.needs_radiance() {
@@ -250,8 +263,8 @@ impl Args {
         }
         Ok(Options {
             network,
-            train: training,
-            validation,
+            train: from_anywhere(training)?,
+            validation: from_anywhere(validation)?,
             steps: self.steps,
             batch: self.batch,
             patch: self.patch,
@@ -288,11 +301,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 "holds a run already; pass --resume to go on with it, or another --out",
             ));
         }
-        let options = args.options()?;
-        fs::create_dir_all(&args.out).map_err(Error::io("create", &args.out))?;
-        let text = serde_json::to_string_pretty(&options).expect("options serialise");
-        fs::write(&config, text).map_err(Error::io("write", &config))?;
-        options
+        args.options()?
     };
     eprintln!(
         "{} pairs to train on, {} to validate on; {} steps of {} crops of up to {p}x{p}",
@@ -349,6 +358,17 @@ mod tests {
 
     fn pair(reference: String, frame: Option<String>) -> Pair {
         Pair { scene: "shot".into(), noisy: "noisy.exr".into(), reference: reference.into(), spp: 4, frame }
+    }
+
+    #[test]
+    fn resuming_takes_no_option_that_would_be_ignored() {
+        let command = <Args as clap::Args>::augment_args(clap::Command::new("train"));
+        let resume = command.get_arguments().find(|a| a.get_id() == "resume").expect("an option");
+        let refused = command.get_arg_conflicts_with(resume);
+        for argument in command.get_arguments().filter(|a| *a != resume) {
+            let counts = ["out", "threads"].iter().any(|name| argument.get_id() == name);
+            assert_eq!(refused.contains(&argument), !counts, "{argument}");
+        }
     }
 
     #[test]

@@ -282,12 +282,7 @@ impl Stored {
     }
 
     /// Some passes of a crop.
-    fn passes(
-        &self,
-        all: &[(Pass, Values)],
-        at: (usize, usize),
-        (width, height): (usize, usize),
-    ) -> PassSet {
+    fn passes(&self, all: &[(Pass, Values)], at: (usize, usize), (width, height): (usize, usize)) -> PassSet {
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
         for (pass, values) in all {
             passes.insert(*pass, self.cut(values, pass.channels(), at, (width, height)));

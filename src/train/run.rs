@@ -1,6 +1,7 @@
 //! The training loop.
 
 use std::{
+    io::Write,
     path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
     time::Instant,
@@ -18,6 +19,7 @@ use super::{
 use crate::{
     Error, Result,
     features::Inputs,
+    frame::atomically,
     metrics,
     models::{
         self, learned,
@@ -29,7 +31,8 @@ use crate::{
     testset::Pair,
 };
 
-/// Everything that decides a run's result. Written to the run folder as `config.json`.
+/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were read: a
+/// folder without one is free.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// The network.
@@ -107,16 +110,20 @@ pub fn run(
 ) -> Result<()> {
     log::create_dir(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
+    let resume = resume && checkpoint_path.exists();
     let mut network = match &options.init {
-        Some(path) => weights_file::read_as(path, &options.network, options.seed)?,
-        None => models::build(&options.network, options.seed),
+        Some(path) if !resume => weights_file::read_as(path, &options.network, options.seed)?,
+        _ => models::build(&options.network, options.seed),
     };
-    set_prefilter(&mut *network, options)?;
+    // A checkpoint holds every parameter, those of the prefilter too: the files that gave them may be gone.
+    if !resume {
+        set_prefilter(&mut *network, options)?;
+    }
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
     let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
     let mut progress = Progress::default();
-    if resume && checkpoint_path.exists() {
+    if resume {
         progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut optimizer)?;
     }
     let mut rows = log::read(&log_path, progress.step)?;
@@ -128,6 +135,11 @@ pub fn run(
     let targets = network.targets();
     let training = Dataset::load(&options.train, wanted, targets, options.raw_references, least)?;
     let validation = Dataset::load(&options.validation, wanted, targets, false, 1)?;
+    if !resume {
+        let config = out.join("config.json");
+        let text = serde_json::to_string_pretty(options).expect("options serialise");
+        atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
+    }
     training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
