@@ -423,8 +423,11 @@ fn a_prefilter_learns_from_references_that_keep_their_guides_and_serves_other_ne
     let weights = out.join("best.safetensors");
     let network = dir.path().join("network");
     run(train(&network, 4).arg("--prefilter").arg(&weights)).success();
-    let config = weights_file::config(&network.join("best.safetensors")).expect("weights");
-    assert_eq!(config.prefilter, [8; 4]);
+    let (_, held) = weights_file::read(&network.join("best.safetensors")).expect("weights");
+    assert_eq!(held.network.prefilter, [8; 4]);
+    assert_eq!(held.training.prefilter, Some(weights.display().to_string()));
+    assert_eq!(held.training.average, Some(0.999));
+    assert!(held.training.precision.is_some());
     let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
     let mut denoise = Command::new(cargo_bin("demc"));
     denoise.args(["denoise", &input, "--model"]).arg(&weights).arg("--out").arg(dir.path().join("images"));

@@ -343,6 +343,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
 
 /// What a weights file says of its training.
 fn facts(options: &Options, row: &log::Row) -> Facts {
+    let path = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
     Facts {
         frames: options.train.len(),
         steps: row.step,
@@ -350,10 +351,14 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         patch: options.patch,
         lr: options.lr,
         loss: options.loss.to_string(),
+        raw_references: options.raw_references,
         optimizer: options.optimizer.to_string(),
         weight_decay: options.weight_decay,
+        precision: Some(options.precision),
+        average: Some(options.average),
         seed: options.seed,
-        init: options.init.as_ref().map(|p| p.display().to_string()),
+        init: path(&options.init),
+        prefilter: path(&options.prefilter),
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,
