@@ -6,14 +6,17 @@ use std::{
     fs,
     path::{Path, PathBuf},
     process::{Command, Stdio},
+    sync::atomic::{AtomicBool, Ordering},
     time::{Duration, Instant},
 };
 
 use assert_cmd::cargo::cargo_bin;
 use demc::{
+    Error,
     models::{self, weights_file},
     nn::weights::{self, Tensor},
     passes,
+    train::{self, Event, Options},
 };
 use predicates::prelude::*;
 
@@ -152,6 +155,86 @@ fn wait_for(path: &Path) {
 }
 
 #[test]
+fn skipped_steps_are_told_and_a_run_that_takes_none_stops_with_the_checkpoint_before() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    // The first step leaves weights that make no finite image; without --val, none is asked for.
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args(["train", "--data", &data("s0010_outdoor"), "--batch", "1", "--patch", "32"]);
+    command.args(["--model", "demc-s", "--every", "4", "--steps", "12", "--lr", "1e30:1e30"]);
+    let says = predicate::str::contains;
+    run(command.arg("--out").arg(&out))
+        .code(1)
+        .stderr(says("warning: 3 of the last 4 steps").and(says("none of the last 4 steps")));
+    let rows = log(&out);
+    assert_eq!(rows.len(), 2, "{rows:?}");
+    assert!(rows[1].starts_with("4,") && !rows[1].contains("NaN"), "{rows:?}");
+
+    // Step 1 goes well, step 2 leaves such weights, step 3 is skipped.
+    let options = options(&out);
+    let well = Options { lr: (1e-4, 1e-4), ..options.clone() };
+    let cut = dir.path().join("cut");
+    assert!(matches!(run_until(&well, &cut, false, 1), Err(Error::Interrupted)));
+    let good = tensors(&cut);
+    assert!(matches!(run_until(&options, &cut, true, 3), Err(Error::Interrupted)));
+    assert_eq!(tensors(&cut), good);
+}
+
+/// What a run's config.json holds.
+fn options(out: &Path) -> Options {
+    let text = fs::read_to_string(out.join("config.json")).expect("a configuration");
+    serde_json::from_str(&text).expect("options")
+}
+
+/// Trains in this process until the step `stop_at`, as if interrupted there.
+fn run_until(options: &Options, out: &Path, resume: bool, stop_at: usize) -> demc::Result<()> {
+    let stop = AtomicBool::new(false);
+    train::run(options, out, resume, &stop, &mut |event| {
+        if matches!(event, Event::Step { step, .. } if step == stop_at) {
+            stop.store(true, Ordering::Relaxed);
+        }
+    })
+}
+
+#[test]
+fn a_resumed_run_needs_none_of_the_weights_it_began_with() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let (first, other) = (dir.path().join("first"), dir.path().join("other"));
+    run(&mut train(&first, 2)).success();
+    let begin = first.join("best.safetensors");
+    let (whole, cut) = (dir.path().join("whole"), dir.path().join("cut"));
+    run(train(&other, 2).arg("--init").arg(&begin).arg("--prefilter").arg(&begin)).success();
+    let options = Options { steps: 6, every: 2, ..options(&other) };
+    run_until(&options, &whole, false, 0).expect("it ends");
+    assert!(matches!(run_until(&options, &cut, false, 3), Err(Error::Interrupted)));
+    fs::remove_file(&begin).expect("it was there");
+    run_until(&options, &cut, true, 0).expect("it ends");
+    assert_eq!(log(&cut), log(&whole));
+    assert_eq!(tensors(&cut), tensors(&whole));
+    let held = |out: &Path| {
+        let (_, metadata) = weights_file::read(&out.join("last.safetensors")).expect("weights");
+        (metadata.network, metadata.ranges)
+    };
+    assert_eq!(held(&cut), held(&whole));
+}
+
+#[test]
+fn a_run_goes_on_from_any_folder_to_as_many_steps_as_its_configuration_says() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args(["train", "--data", "tests/data/s0010_outdoor_*.exr", "--batch", "1", "--patch", "32"]);
+    command.args(["--model", "demc-s", "--every", "2", "--steps", "2"]).arg("--out").arg(&out);
+    run(command.current_dir(env!("CARGO_MANIFEST_DIR"))).success();
+    let longer = Options { steps: 4, ..options(&out) };
+    fs::write(out.join("config.json"), serde_json::to_string(&longer).expect("text")).expect("a file");
+    let mut command = resume(Path::new("run"));
+    run(command.current_dir(dir.path())).success();
+    assert_eq!(log(&out).len(), 3, "rows after 2 and 4 steps");
+    run(resume(&out).args(["--steps", "6"])).code(2).stderr(predicate::str::contains("--steps"));
+}
+
+#[test]
 fn training_lowers_the_loss() {
     let dir = tempfile::tempdir().expect("a folder");
     for optimizer in ["adam", "muon"] {
@@ -196,9 +279,15 @@ fn refuses_what_cannot_be_trained() {
     run(&mut train_with("noisy", "64", &out, 4)).code(2).stderr(says("trainable: demc-s"));
     run(&mut train_with("demc-s", "50", &out, 4)).code(2).stderr(says("multiple of 16"));
     run(train_with("kpcn", "8", &out, 4).args(["--loss", "ssim"])).code(2).stderr(says("11 at least"));
+    let prefilter = || train_with("prefilter", "64", &out, 4);
+    run(prefilter().args(["--loss", "ssim"])).code(2).stderr(says("--loss geomean"));
+    run(prefilter().arg("--raw-references")).code(2).stderr(says("--raw-references: prefilter"));
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
         .code(1)
         .stderr(says("trained on and validated on"));
+    // The same frames, by another path.
+    let roundabout = data("s0000_room").replace("tests/data", "tests/data/../data");
+    run(train(&out, 4).args(["--val", &roundabout])).code(1).stderr(says("trained on and validated on"));
     run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
     run(train(&out, 4).args(["--optimizer", "sgd"])).code(2).stderr(says("adam or muon"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
@@ -294,9 +383,12 @@ fn a_prefilter_learns_from_references_that_keep_their_guides_and_serves_other_ne
     let dir = tempfile::tempdir().expect("a folder");
     let out = dir.path().join("prefilter");
     let says = predicate::str::contains;
-    run(&mut train_with("prefilter", "64", &dir.path().join("refused"), 4))
-        .code(1)
-        .stderr(says("s0000_room_ref.exr").and(says("Denoising Albedo")));
+    // What began nothing is in nothing's way.
+    for _ in 0..2 {
+        run(&mut train_with("prefilter", "64", &dir.path().join("refused"), 4))
+            .code(1)
+            .stderr(says("s0000_room_ref.exr").and(says("Denoising Albedo")));
+    }
 
     // The frames themselves hold both guides: what is learned from them is to change nothing.
     let pairs = ["s0000_room", "s0010_outdoor"].map(|scene| {
@@ -331,8 +423,11 @@ fn a_prefilter_learns_from_references_that_keep_their_guides_and_serves_other_ne
     let weights = out.join("best.safetensors");
     let network = dir.path().join("network");
     run(train(&network, 4).arg("--prefilter").arg(&weights)).success();
-    let config = weights_file::config(&network.join("best.safetensors")).expect("weights");
-    assert_eq!(config.prefilter, [8; 4]);
+    let (_, held) = weights_file::read(&network.join("best.safetensors")).expect("weights");
+    assert_eq!(held.network.prefilter, [8; 4]);
+    assert_eq!(held.training.prefilter, Some(weights.display().to_string()));
+    assert_eq!(held.training.average, Some(0.999));
+    assert!(held.training.precision.is_some());
     let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
     let mut denoise = Command::new(cargo_bin("demc"));
     denoise.args(["denoise", &input, "--model"]).arg(&weights).arg("--out").arg(dir.path().join("images"));

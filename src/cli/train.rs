@@ -1,9 +1,10 @@
 //! `demc train`: fits a network to pairs of noisy and reference frames.
 
 use std::{
+    collections::HashSet,
     fs,
     io::IsTerminal,
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::ExitCode,
     sync::{
         Arc,
@@ -88,8 +89,12 @@ pub struct Args {
     /// prefilter; without it those of --init, or the built-in ones
     #[arg(long)]
     prefilter: Option<PathBuf>,
-    /// Go on from the run folder's checkpoint, with its config.json
-    #[arg(long)]
+    /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for more steps, edit
+    /// them there
+    #[arg(long, conflicts_with_all = [
+        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "optimizer",
+        "weight_decay", "precision", "average", "val", "every", "seed", "init", "prefilter",
+    ])]
     resume: bool,
     /// Threads to use; all processors without it
     #[arg(long)]
@@ -143,15 +148,28 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a pair is held out: decided by its reference's file name alone, so that every sample count and
-/// seed of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
-fn held_out(reference: &Path) -> bool {
-    let name = reference.file_name().unwrap_or_default().to_string_lossy();
+/// Whether a pair is held out: decided by its reference's file name without the frame number, so that every
+/// sample count, seed and frame of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+fn held_out(pair: &Pair) -> bool {
+    let mut name = pair.reference.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    if let Some(frame) = &pair.frame
+        && let Some(at) = name.rfind(&format!(".{frame}."))
+    {
+        name.replace_range(at..=at + frame.len(), "");
+    }
     let hash = name
         .bytes()
         .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
     // The low bits of this hash depend on few bits of the name.
     (hash >> 32) % HOLD_OUT == 0
+}
+
+/// Pairs with absolute paths: a run may be resumed from another folder.
+fn from_anywhere(mut pairs: Vec<Pair>) -> Result<Vec<Pair>> {
+    for path in pairs.iter_mut().flat_map(|pair| [&mut pair.noisy, &mut pair.reference]) {
+        *path = std::path::absolute(&path).map_err(Error::io("read", &*path))?;
+    }
+    Ok(pairs)
 }
 
 /// Whether the noisy frame of a pair holds what KPCN's two streams read.
@@ -182,7 +200,19 @@ impl Args {
             network.prefilter = weights_file::prefilter_widths(path)?;
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
-        let multiple = models::build(&network, 0).multiple();
+        let built = models::build(&network, 0);
+        if !built.makes_radiance() {
+            if self.raw_references {
+                let reason =
+                    "makes no radiance, of which alone references hold what it was before; leave it out";
+                return Err(usage(format!("--raw-references: {} {reason}", self.model)));
+            }
+            if self.loss.needs_radiance() {
+                let reason = "makes no radiance that a display would show; take --loss geomean";
+                return Err(usage(format!("--loss {}: {} {reason}", self.loss, self.model)));
+            }
+        }
+        let multiple = built.multiple();
         if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
             return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
         }
@@ -206,11 +236,14 @@ impl Args {
         }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
-            pairs.into_iter().partition(|p| held_out(&p.reference))
+            pairs.into_iter().partition(held_out)
         } else {
             (all_pairs(&self.val)?, pairs)
         };
-        if let Some(pair) = training.iter().find(|p| validation.iter().any(|v| v.reference == p.reference)) {
+        // However each was typed.
+        let file = |p: &Pair| fs::canonicalize(&p.reference).unwrap_or_else(|_| p.reference.clone());
+        let validated: HashSet<PathBuf> = validation.iter().map(file).collect();
+        if let Some(pair) = training.iter().find(|p| validated.contains(&file(p))) {
             return Err(Error::invalid(
                 &pair.reference,
                 "is both trained on and validated on; give --val other scenes than --data",
@@ -230,8 +263,8 @@ impl Args {
         }
         Ok(Options {
             network,
-            train: training,
-            validation,
+            train: from_anywhere(training)?,
+            validation: from_anywhere(validation)?,
             steps: self.steps,
             batch: self.batch,
             patch: self.patch,
@@ -268,11 +301,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 "holds a run already; pass --resume to go on with it, or another --out",
             ));
         }
-        let options = args.options()?;
-        fs::create_dir_all(&args.out).map_err(Error::io("create", &args.out))?;
-        let text = serde_json::to_string_pretty(&options).expect("options serialise");
-        fs::write(&config, text).map_err(Error::io("write", &config))?;
-        options
+        args.options()?
     };
     eprintln!(
         "{} pairs to train on, {} to validate on; {} steps of {} crops of up to {p}x{p}",
@@ -320,5 +349,40 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             Ok(ExitCode::from(super::stop::INTERRUPTED))
         }
         other => other.map(|()| ExitCode::SUCCESS),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pair(reference: String, frame: Option<String>) -> Pair {
+        Pair { scene: "shot".into(), noisy: "noisy.exr".into(), reference: reference.into(), spp: 4, frame }
+    }
+
+    #[test]
+    fn resuming_takes_no_option_that_would_be_ignored() {
+        let command = <Args as clap::Args>::augment_args(clap::Command::new("train"));
+        let resume = command.get_arguments().find(|a| a.get_id() == "resume").expect("an option");
+        let refused = command.get_arg_conflicts_with(resume);
+        for argument in command.get_arguments().filter(|a| *a != resume) {
+            let counts = ["out", "threads"].iter().any(|name| argument.get_id() == name);
+            assert_eq!(refused.contains(&argument), !counts, "{argument}");
+        }
+    }
+
+    #[test]
+    fn frames_of_a_sequence_are_held_out_with_its_still_or_trained_on_together() {
+        let name = |scene: usize, frame: &str| format!("train/s{scene:04}_room_ref{frame}.exr");
+        let still = |scene| held_out(&pair(name(scene, ""), None));
+        for scene in 0..40 {
+            for frame in ["0001", "0017", "-0003"] {
+                let of_sequence = pair(name(scene, &format!(".{frame}")), Some(frame.into()));
+                assert_eq!(held_out(&of_sequence), still(scene), "{scene}, frame {frame}");
+            }
+        }
+        // Which stills they are is not to change.
+        let held: Vec<usize> = (0..40).filter(|scene| still(*scene)).collect();
+        assert_eq!(held, [0, 3, 4, 7, 15, 20, 33, 39]);
     }
 }

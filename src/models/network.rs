@@ -67,6 +67,22 @@ pub enum Architecture {
     Lbf,
 }
 
+impl Architecture {
+    /// Feature set and transfer of radiance, as weights files record them. The number goes up whenever a value that the network
+    /// reads or writes comes to mean something else, as by another constant in `features`: weights from before are then
+    /// refused, where they would be run on what they were not trained on.
+    pub fn inputs(self) -> &'static str {
+        match self {
+            Self::Demc | Self::DemcNofusion | Self::Semc => "paper/gamma/1",
+            // Alike, since a prefilter may be part of a pyramid, and come out of one.
+            Self::Pyramid | Self::Prefilter => "guides/logarithm/1",
+            Self::Kpcn => "kpcn-streams/logarithm/1",
+            Self::KpcnCombined => "kpcn-combined/logarithm/1",
+            Self::Lbf => "lbf/logarithm/1",
+        }
+    }
+}
+
 /// A network input of several samples, (N, C, H, W).
 pub type Stacked = (Shape, PlaneBuffer);
 
@@ -124,7 +140,12 @@ pub trait Network: Send + Sync {
         &[Pass::Combined]
     }
 
-    /// What it should make of a frame, by its reference: radiance, (3, H, W).
+    /// Whether it makes radiance of a frame, not guides for other networks.
+    fn makes_radiance(&self) -> bool {
+        self.targets() == [Pass::Combined]
+    }
+
+    /// What it should make of a frame, by its reference: radiance, (3, H, W), if [`Network::makes_radiance`].
     ///
     /// # Errors
     /// A pass is missing.

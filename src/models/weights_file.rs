@@ -11,8 +11,8 @@ use super::{
 use crate::{
     Error, Result,
     nn::{
-        Arithmetic, Rng,
-        weights::{self, Precision, Tensor},
+        Arithmetic, Precision, Rng,
+        weights::{self, Tensor},
     },
 };
 
@@ -31,17 +31,29 @@ pub struct Facts {
     pub lr: (f64, f64),
     /// What was minimised.
     pub loss: String,
+    /// Whether squared errors were against references as they were before they were denoised.
+    #[serde(default)]
+    pub raw_references: bool,
     /// How gradients became updates; files from before there was a choice do not say.
     #[serde(default = "adam")]
     pub optimizer: String,
     /// Share of the hidden convolutions' weights that a step took away at a learning rate of 1.
     #[serde(default)]
     pub weight_decay: f64,
+    /// What convolutions rounded their factors to; older files do not say.
+    #[serde(default)]
+    pub precision: Option<Precision>,
+    /// Weight of the past in the average of the weights, which is what is kept; older files do not say.
+    #[serde(default)]
+    pub average: Option<f64>,
     /// The seed of weights, crops and augmentation.
     pub seed: u64,
     /// The weights file it began with, if any.
     #[serde(default)]
     pub init: Option<String>,
+    /// The weights file whose prefilter it got, if not the built-in one or that of `init`.
+    #[serde(default)]
+    pub prefilter: Option<String>,
     /// Seconds of training.
     pub seconds: f64,
     /// Pairs validated on.
@@ -61,6 +73,9 @@ fn adam() -> String {
 pub struct Metadata {
     /// The network.
     pub network: Config,
+    /// What it was trained to read, see [`Architecture::inputs`]; files without it hold the first that there were.
+    #[serde(default)]
+    pub inputs: Option<String>,
     /// How it was trained.
     pub training: Facts,
     /// The largest value that each layer's ReLU left on the frames it was validated on, which arithmetic in 8
@@ -76,14 +91,16 @@ pub struct Metadata {
 pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()> {
     let ranges = network.convolutions().into_iter().filter_map(|c| Some((c.name().to_string(), c.range?)));
     let ranges = ranges.collect();
-    let metadata = Metadata { network: network.config(), training: facts.clone(), ranges };
+    let config = network.config();
+    let inputs = Some(config.architecture.inputs().into());
+    let metadata = Metadata { network: config, inputs, training: facts.clone(), ranges };
     let metadata = serde_json::to_string(&metadata).expect("metadata serialises");
     let tensors: Vec<Tensor> = network
         .params()
         .into_iter()
         .map(|p| Tensor { name: p.name.clone(), shape: p.shape.clone(), values: p.values() })
         .collect();
-    weights::write(path, &metadata, &tensors, Precision::Half)
+    weights::write(path, &metadata, &tensors, weights::Precision::Half)
 }
 
 /// Reads a network from a weights file.
@@ -104,8 +121,13 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
     let (metadata, tensors) = metadata(&bytes, path)?;
     let held = &metadata.network;
     let mut network = super::build(config, seed);
-    if held == config && fill(&mut *network, &tensors, path).is_ok() {
-        return Ok(network);
+    // The same widths may be another version's, with smaller kernels.
+    let mut misfit = None;
+    if held == config {
+        match fill(&mut *network, &tensors, path) {
+            Ok(()) => return Ok(network),
+            Err(e) => misfit = Some(e),
+        }
     }
     // Only convolutions can be widened: a network's every parameter must belong to one.
     let all = 2 * network.convolutions().len() == network.params().len();
@@ -120,15 +142,13 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
             })
         })
     };
-    if !fits {
-        return Err(Error::invalid(
-            path,
-            format!(
-                "holds {held}, which is neither {config} nor narrower; choose --model and --widths alike"
-            ),
-        ));
+    if fits {
+        return Ok(network);
     }
-    Ok(network)
+    Err(misfit.unwrap_or_else(|| {
+        let reason = "choose --model and --widths alike";
+        Error::invalid(path, format!("holds {held}, which is neither {config} nor narrower; {reason}"))
+    }))
 }
 
 /// The widths of the prefilter that a weights file can give: that of its network, or its network itself.
@@ -189,6 +209,16 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
         Error::invalid(path, format!("no network in its metadata ({e}); use a run's best.safetensors"))
     })?;
     super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
+    let inputs = metadata.network.architecture.inputs();
+    if let Some(held) = metadata.inputs.as_deref().filter(|held| *held != inputs) {
+        return Err(Error::invalid(
+            path,
+            format!(
+                "was trained on inputs {held}, but this version of demc makes {inputs}; run the version that wrote \
+                 it, or train it anew"
+            ),
+        ));
+    }
     Ok((metadata, tensors))
 }
 
@@ -228,4 +258,56 @@ fn fill(network: &mut dyn Network, tensors: &[Tensor], path: &Path) -> Result<()
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Writes fresh weights of the smallest prefilter, changed by `change`, into `folder`.
+    fn changed(
+        folder: &Path,
+        change: impl FnOnce(&mut serde_json::Value, &mut Vec<Tensor>),
+    ) -> (Config, std::path::PathBuf) {
+        let config = Config::new(Architecture::Prefilter, &[1; 4]);
+        let facts = serde_json::json!({
+            "frames": 1, "steps": 1, "batch": 1, "patch": 16, "lr": [1.0, 1.0], "loss": "smape", "seed": 1,
+            "seconds": 0.0, "validation_frames": 0, "validation_relmse": null, "validation_ssim": null,
+        });
+        let facts: Facts = serde_json::from_value(facts).expect("what the first files said");
+        let path = folder.join("weights.safetensors");
+        write(&path, &mut *super::super::build(&config, 1), &facts).unwrap();
+        let (metadata, mut tensors) = weights::read(&path).unwrap();
+        let mut metadata = serde_json::from_str(&metadata).unwrap();
+        change(&mut metadata, &mut tensors);
+        weights::write(&path, &metadata.to_string(), &tensors, weights::Precision::Half).unwrap();
+        (config, path)
+    }
+
+    #[test]
+    fn weights_trained_on_other_inputs_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let (_, path) = changed(folder.path(), |metadata, _| {
+            assert_eq!(metadata["inputs"], "guides/logarithm/1");
+            metadata["inputs"] = "guides/logarithm/0".into();
+        });
+        let error = read(&path).err().unwrap().to_string();
+        let named = ["weights.safetensors", "guides/logarithm/0", "guides/logarithm/1", "train it anew"];
+        assert!(named.iter().all(|part| error.contains(part)), "{error}");
+        // Those from before they were recorded are read as ever.
+        let (_, path) = changed(folder.path(), |metadata, _| {
+            metadata.as_object_mut().unwrap().remove("inputs");
+        });
+        assert_eq!(read(&path).unwrap().1.inputs, None);
+    }
+
+    #[test]
+    fn what_is_damaged_is_told_where_nothing_was_to_be_widened() {
+        let folder = tempfile::tempdir().unwrap();
+        let (config, path) = changed(folder.path(), |_, tensors| {
+            tensors.retain(|tensor| tensor.name != "decoder.0.up.bias");
+        });
+        let error = read_as(&path, &config, 1).err().unwrap().to_string();
+        assert!(error.contains("decoder.0.up.bias is missing"), "{error}");
+    }
 }

@@ -20,7 +20,7 @@ pub struct Progress {
     pub seconds: f64,
     /// Sum and number of training losses since the last line of the log.
     pub losses: (f64, usize),
-    /// Steps skipped because their gradient was not finite.
+    /// Steps skipped since then because their gradient was not finite.
     pub skipped: usize,
     /// The best validation RelMSE so far.
     pub best: Option<f64>,
@@ -83,4 +83,25 @@ pub fn load(
         param.set(find(format!("average.{}", param.name), len)?);
     }
     Ok(progress)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{models, train::Rule};
+
+    #[test]
+    fn counters_come_back_to_the_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        let config = models::network::Config::new(models::network::Architecture::Lbf, &[4]);
+        let mut network = models::build(&config, 1);
+        let mut average = network.duplicate();
+        let mut optimizer = Optimizer::new(Rule::Adam, 0.0);
+        // A sum that a hasty reading of its digits misses by a bit.
+        let saved = Progress { losses: (240.41605154424906, 499), ..Progress::default() };
+        save(&path, &saved, &mut *network, &mut *average, &mut optimizer).unwrap();
+        let held = load(&path, &mut *network, &mut *average, &mut optimizer).unwrap();
+        assert_eq!(held, saved);
+    }
 }

@@ -16,7 +16,7 @@ use crate::{
     testset::Pair,
 };
 
-/// Frames and references, decoded once and held as half floats (the precision they mostly come in).
+/// Frames and references, decoded once and held in the precision that they mostly come in, see [`Values`].
 pub struct Dataset {
     frames: Vec<Stored>,
     /// Pixels of all frames up to and with each.
@@ -31,10 +31,10 @@ struct Stored {
     view_layer: String,
     width: usize,
     height: usize,
-    passes: Vec<(Pass, Vec<f16>)>,
-    reference: Vec<(Pass, Vec<f16>)>,
+    passes: Vec<(Pass, Values)>,
+    reference: Vec<(Pass, Values)>,
     /// The reference before it was denoised, where that is wanted and its file holds it.
-    raw_reference: Option<Vec<f16>>,
+    raw_reference: Option<Values>,
     /// See [`pairing::warning`].
     warning: Option<String>,
 }
@@ -51,10 +51,34 @@ pub struct Sample {
     pub raw_reference: Option<Planes>,
 }
 
-/// Halves of the training copy: brighter values are clipped to the largest.
-fn to_half(values: &[f32]) -> Vec<f16> {
-    let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
-    Vec::from_f32_slice(&clipped)
+/// The training copy of a pass, (C, H, W).
+#[cfg_attr(test, derive(Clone))]
+enum Values {
+    /// Values beyond the largest half are clipped to it.
+    Half(Vec<f16>),
+    Full(Vec<f32>),
+}
+
+impl Values {
+    /// Halves, but for places and distances: far from the origin, what a half cannot tell apart is larger than what is
+    /// looked at, and no half holds the 1e10 of a ray that hits nothing.
+    fn of(pass: Pass, values: &[f32]) -> Self {
+        match pass {
+            Pass::Position | Pass::Depth | Pass::DenoisingDepth => Self::Full(values.to_vec()),
+            _ => {
+                let clipped: Vec<f32> = values.iter().map(|v| v.clamp(-HALF_MAX, HALF_MAX)).collect();
+                Self::Half(Vec::from_f32_slice(&clipped))
+            }
+        }
+    }
+
+    /// Writes `out.len()` values from the one at `start`.
+    fn read(&self, start: usize, out: &mut [f32]) {
+        match self {
+            Self::Half(values) => values[start..][..out.len()].convert_to_f32_slice(out),
+            Self::Full(values) => out.copy_from_slice(&values[start..][..out.len()]),
+        }
+    }
 }
 
 impl Dataset {
@@ -186,6 +210,8 @@ impl Stored {
     ) -> Result<Self> {
         let frame = Frame::read(&pair.noisy)?;
         let mut noisy = passes::read(&frame, None)?;
+        // As for inference: Combined may be what Blender made of the render.
+        noisy.use_noisy_image();
         for &pass in needed {
             noisy.require(pass, "training")?;
         }
@@ -217,11 +243,12 @@ impl Stored {
                 ),
             ));
         }
-        let raw_reference =
-            reference.get(Pass::NoisyImage).filter(|_| raw_references).map(|raw| to_half(&raw.data));
-        let kept = |passes: &PassSet, wanted: &[&[Pass]]| -> Vec<(Pass, Vec<f16>)> {
+        let copy = |(pass, planes): (Pass, &Planes)| (pass, Values::of(pass, &planes.data));
+        let raw = reference.get(Pass::NoisyImage).filter(|_| raw_references);
+        let raw_reference = raw.map(|raw| Values::of(Pass::NoisyImage, &raw.data));
+        let kept = |passes: &PassSet, wanted: &[&[Pass]]| -> Vec<(Pass, Values)> {
             let wanted = |pass: &Pass| wanted.iter().any(|passes| passes.contains(pass));
-            passes.iter().filter(|(p, _)| wanted(p)).map(|(p, planes)| (p, to_half(&planes.data))).collect()
+            passes.iter().filter(|(pass, _)| wanted(pass)).map(copy).collect()
         };
         let radiance = [&noisy, &reference].map(|passes| passes.get(Pass::Combined));
         let warning = match radiance {
@@ -250,42 +277,38 @@ impl Stored {
         Sample {
             passes: self.passes(&self.passes, at, size),
             reference: self.passes(&self.reference, at, size),
-            raw_reference: self.raw_reference.as_deref().map(|data| self.cut(data, 3, at, size)),
+            raw_reference: self.raw_reference.as_ref().map(|values| self.cut(values, 3, at, size)),
         }
     }
 
     /// Some passes of a crop.
-    fn passes(
-        &self,
-        all: &[(Pass, Vec<f16>)],
-        at: (usize, usize),
-        (width, height): (usize, usize),
-    ) -> PassSet {
+    fn passes(&self, all: &[(Pass, Values)], at: (usize, usize), (width, height): (usize, usize)) -> PassSet {
         let mut passes = PassSet::new(&self.pair.noisy, &self.view_layer, width, height);
-        for (pass, data) in all {
-            passes.insert(*pass, self.cut(data, pass.channels(), at, (width, height)));
+        for (pass, values) in all {
+            passes.insert(*pass, self.cut(values, pass.channels(), at, (width, height)));
         }
         passes
     }
 
     fn cut(
         &self,
-        data: &[f16],
+        values: &Values,
         channels: usize,
         (x, y): (usize, usize),
         (width, height): (usize, usize),
     ) -> Planes {
         Planes::from_rows(channels, (width, height), |c, row, out| {
-            data[(c * self.height + y + row) * self.width + x..][..width].convert_to_f32_slice(out);
+            values.read((c * self.height + y + row) * self.width + x, out);
         })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
+    use std::{collections::BTreeSet, path::Path};
 
     use super::*;
+    use crate::frame::{NewChannel, SampleKind};
 
     /// A frame of 8x8 pixels all of whose passes are `value` everywhere.
     fn stored(reference: &str, spp: u32, value: f32) -> Stored {
@@ -293,7 +316,7 @@ mod tests {
     }
 
     fn stored_of(side: usize, reference: &str, spp: u32, value: f32) -> Stored {
-        let plane = |channels: usize| vec![f16::from_f32(value); channels * side * side];
+        let values = |pass: Pass| (pass, Values::of(pass, &vec![value; pass.channels() * side * side]));
         let pair = Pair {
             scene: "scene".into(),
             noisy: "noisy.exr".into(),
@@ -306,8 +329,8 @@ mod tests {
             view_layer: "ViewLayer".into(),
             width: side,
             height: side,
-            passes: vec![(Pass::Combined, plane(3)), (Pass::Depth, plane(1))],
-            reference: vec![(Pass::Combined, plane(3))],
+            passes: [Pass::Combined, Pass::Depth].map(values).into(),
+            reference: vec![values(Pass::Combined)],
             raw_reference: None,
             warning: None,
         }
@@ -351,17 +374,61 @@ mod tests {
         assert!((80..132).contains(&sides[0]), "{sides:?}");
     }
 
-    #[test]
-    fn frames_that_hold_no_crop_at_all_are_named() {
-        let file =
-            |name: &str| std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
-        let pair = Pair {
+    /// A pair of real frames of 128x128 pixels.
+    fn room() -> Pair {
+        let file = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+        Pair {
             scene: "s0000_room".into(),
             noisy: file("s0000_room_0004spp.exr"),
             reference: file("s0000_room_ref.exr"),
             spp: 4,
             frame: None,
-        };
+        }
+    }
+
+    /// [`room`], the noisy frame of which `folder` gets with another layer: each channel is `values`.
+    fn room_with(folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> Pair {
+        let mut pair = room();
+        let mut frame = Frame::read(&pair.noisy).unwrap();
+        let channels = axes.map(|component| NewChannel { component, kind: SampleKind::Float, values });
+        frame.set_layer(0, &format!("ViewLayer.{layer}"), None, &channels).unwrap();
+        pair.noisy = folder.join("noisy.exr");
+        frame.write(&pair.noisy).unwrap();
+        pair
+    }
+
+    /// The only frame of a dataset of one pair, with one pass and Combined as its target.
+    fn only(pair: Pair, pass: Pass) -> Sample {
+        let data = Dataset::load(&[pair], (&[pass], &[]), &[Pass::Combined], false, 1).unwrap();
+        data.frame(0).1
+    }
+
+    #[test]
+    fn learns_from_the_render_and_not_from_what_blender_denoised() {
+        let folder = tempfile::tempdir().unwrap();
+        let render = vec![3.0; 128 * 128];
+        let pair = room_with(folder.path(), "Noisy Image", ["R", "G", "B"], &render);
+        let sample = only(pair, Pass::Combined);
+        assert_eq!(sample.passes.get(Pass::Combined).unwrap().channel(1), render);
+    }
+
+    #[test]
+    fn places_far_from_the_origin_and_misses_stay_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        // A hundredth apart, where halves are 1 to 2 apart.
+        let places: Vec<f32> = (0..128 * 128).map(|i| 2000.0 + 0.01 * i as f32).collect();
+        let pair = room_with(folder.path(), "Position", ["X", "Y", "Z"], &places);
+        assert_eq!(only(pair, Pass::Position).passes.get(Pass::Position).unwrap().channel(2), places);
+        for depth in [Pass::Depth, Pass::DenoisingDepth] {
+            let mut miss = [0.0];
+            Values::of(depth, &[1e10]).read(0, &mut miss);
+            assert_eq!(miss, [1e10], "{depth}");
+        }
+    }
+
+    #[test]
+    fn frames_that_hold_no_crop_at_all_are_named() {
+        let pair = room();
         let load = |least| {
             Dataset::load(
                 std::slice::from_ref(&pair),

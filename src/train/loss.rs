@@ -65,6 +65,11 @@ impl Loss {
         if self == Loss::Ssim { ssim::WINDOW } else { 1 }
     }
 
+    /// Whether it compares images as a display would show them, which must be radiance, (N, 3, H, W).
+    pub fn needs_radiance(self) -> bool {
+        self == Loss::Ssim
+    }
+
     /// The loss of `image` against `reference`, same shape and scale.
     ///
     /// Squared errors are against `raw` where it is given, with the denominators of `reference`: noise in the

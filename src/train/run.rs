@@ -1,6 +1,7 @@
 //! The training loop.
 
 use std::{
+    io::Write,
     path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
     time::Instant,
@@ -18,6 +19,7 @@ use super::{
 use crate::{
     Error, Result,
     features::Inputs,
+    frame::atomically,
     metrics,
     models::{
         self, learned,
@@ -29,7 +31,8 @@ use crate::{
     testset::Pair,
 };
 
-/// Everything that decides a run's result. Written to the run folder as `config.json`.
+/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were read: a
+/// folder without one is free.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// The network.
@@ -75,7 +78,7 @@ pub struct Options {
 /// What the caller hears of.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Something the user should know of the data.
+    /// Something the user should know of the data, or of how training goes.
     Warning(String),
     /// A step was done.
     Step {
@@ -92,10 +95,12 @@ pub enum Event {
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
 /// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
-/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint.
+/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint follows a step
+/// that was skipped: where all are, the weights of the one before are good.
 ///
 /// # Errors
-/// A pair is unusable, or the run folder cannot be read or written.
+/// A pair is unusable, the run folder cannot be read or written, or no step between two rows of the log had a finite
+/// gradient.
 pub fn run(
     options: &Options,
     out: &Path,
@@ -105,16 +110,20 @@ pub fn run(
 ) -> Result<()> {
     log::create_dir(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
+    let resume = resume && checkpoint_path.exists();
     let mut network = match &options.init {
-        Some(path) => weights_file::read_as(path, &options.network, options.seed)?,
-        None => models::build(&options.network, options.seed),
+        Some(path) if !resume => weights_file::read_as(path, &options.network, options.seed)?,
+        _ => models::build(&options.network, options.seed),
     };
-    set_prefilter(&mut *network, options)?;
+    // A checkpoint holds every parameter, those of the prefilter too: the files that gave them may be gone.
+    if !resume {
+        set_prefilter(&mut *network, options)?;
+    }
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
     let mut average = network.duplicate();
     let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
     let mut progress = Progress::default();
-    if resume && checkpoint_path.exists() {
+    if resume {
         progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut optimizer)?;
     }
     let mut rows = log::read(&log_path, progress.step)?;
@@ -126,6 +135,11 @@ pub fn run(
     let targets = network.targets();
     let training = Dataset::load(&options.train, wanted, targets, options.raw_references, least)?;
     let validation = Dataset::load(&options.validation, wanted, targets, false, 1)?;
+    if !resume {
+        let config = out.join("config.json");
+        let text = serde_json::to_string_pretty(options).expect("options serialise");
+        atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
+    }
     training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
@@ -144,8 +158,9 @@ pub fn run(
         let last = progress.step == options.steps;
         if progress.step % options.every == 0 || last {
             progress.seconds += since.elapsed().as_secs_f64();
-            let score = validate(&mut *average, &validation)?;
             let (sum, count) = std::mem::take(&mut progress.losses);
+            report_skipped(std::mem::take(&mut progress.skipped), count, out, on)?;
+            let score = validate(&mut *average, &validation)?;
             let row = log::Row {
                 step: progress.step,
                 seconds: (progress.seconds * 10.0).round() / 10.0,
@@ -166,7 +181,8 @@ pub fn run(
             since = Instant::now();
         }
         let stopping = stop.load(Ordering::Relaxed);
-        if last || stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS {
+        let due = stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS;
+        if last || (due && finite) {
             progress.seconds += std::mem::replace(&mut since, Instant::now()).elapsed().as_secs_f64();
             checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
             saved = Instant::now();
@@ -174,6 +190,29 @@ pub fn run(
         if stopping && !last {
             return Err(Error::Interrupted);
         }
+    }
+    Ok(())
+}
+
+/// Warns of steps that were skipped beside the `taken` ones since the last row of the log.
+///
+/// # Errors
+/// None was taken.
+fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(Event)) -> Result<()> {
+    if taken == 0 {
+        return Err(Error::invalid(
+            out,
+            format!(
+                "none of the last {skipped} steps had a finite gradient; lower \"lr\" in its config.json and pass \
+                 --resume to go on from the checkpoint before, or train anew with a lower --lr"
+            ),
+        ));
+    }
+    if skipped > 0 {
+        let steps = skipped + taken;
+        on(Event::Warning(format!(
+            "{skipped} of the last {steps} steps had no finite gradient and were skipped; should most be, lower --lr"
+        )));
     }
     Ok(())
 }
@@ -220,7 +259,7 @@ fn learning_rate((largest, last): (f64, f64), steps: usize, step: usize) -> f64 
     warmed.min(1.0) * (largest + (last - largest) * done)
 }
 
-/// One optimiser step. Returns the loss and whether its gradient was finite.
+/// One optimiser step. Returns the loss, and whether it and its gradient were finite: else nothing changed.
 fn step(
     network: &mut dyn Network,
     optimizer: &mut Optimizer,
@@ -247,6 +286,9 @@ fn step(
     let image = network.forward_taped(&stack(&inputs), &mut stats);
     let loss = options.loss.of(image, reference, raw, &scales);
     let value = f64::from(loss.as_vec()[0]);
+    if !value.is_finite() {
+        return Ok((value, false));
+    }
     let mut gradients = loss.backward();
     let norm = optimizer.update(step, lr, network.params(), &mut gradients);
     if norm.is_finite()
@@ -283,7 +325,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
         }
         logs.push(metrics::error::relmse(image, reference).max(f64::MIN_POSITIVE).ln());
-        if reference.channels == 3
+        if network.makes_radiance()
             && let Some(exposure) = metrics::display::exposure(reference)
         {
             let display = |p| metrics::display::display(p, exposure);
@@ -301,6 +343,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
 
 /// What a weights file says of its training.
 fn facts(options: &Options, row: &log::Row) -> Facts {
+    let path = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
     Facts {
         frames: options.train.len(),
         steps: row.step,
@@ -308,10 +351,14 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         patch: options.patch,
         lr: options.lr,
         loss: options.loss.to_string(),
+        raw_references: options.raw_references,
         optimizer: options.optimizer.to_string(),
         weight_decay: options.weight_decay,
+        precision: Some(options.precision),
+        average: Some(options.average),
         seed: options.seed,
-        init: options.init.as_ref().map(|p| p.display().to_string()),
+        init: path(&options.init),
+        prefilter: path(&options.prefilter),
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,
