@@ -1,5 +1,8 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
+//!
+//! Whoever changes what a network reads changes [`Architecture::inputs`](crate::models::network::Architecture::inputs) with it, by
+//! which weights trained on something else are refused.
 
 mod black;
 mod fireflies;

@@ -55,7 +55,8 @@ fn other_pixels_are_not_compared() {
     let [a, b] = ["a.exr", "b.exr"].map(|f| dir.path().join(f));
     write(&a, (10, 10), &[("V.Combined", 1.0)]);
     write(&b, (40, 40), &[("V.Combined", 1.0)]);
-    let told = contains("a.exr: holds 16x16 at 10,10, its reference 16x16 at 40,40");
+    let told = contains("a.exr: holds 16x16 pixels at 10,10, its reference")
+        .and(contains("b.exr 16x16 pixels at 40,40"));
     compare(&a, &b).assert().code(1).stdout("").stderr(told);
     compare(&a, &a).assert().success().stdout(contains("rmse 0\n"));
 }
@@ -76,5 +77,5 @@ fn both_layers_can_be_named() {
     }
     let lacks = compare(&path, &path).args(["--reference-layer", "Clean"]).assert().code(1);
     lacks.stderr(contains("a.exr: has no layer 'Clean' with R, G and B"));
-    compare(&path, &data("blender4.exr")).assert().code(1).stderr(contains("40x24 at 0,0"));
+    compare(&path, &data("blender4.exr")).assert().code(1).stderr(contains("40x24 pixels at 0,0"));
 }

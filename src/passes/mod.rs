@@ -259,11 +259,10 @@ impl PassSet {
         }
         let said = |set: &PassSet| {
             let PassSet { width, height, origin: (x, y), .. } = set;
-            format!("{width}x{height} at {x},{y}")
+            format!("{width}x{height} pixels at {x},{y}")
         };
-        let (own, other) = (said(self), said(reference));
-        let why =
-            format!("holds {own}, its reference {other}: other pixels; render both at one size and region");
+        let (own, other, path) = (said(self), said(reference), reference.path.display());
+        let why = format!("holds {own}, its reference {path} {other}; render both at one size and region");
         Err(Error::invalid(&self.path, why))
     }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::Augment;
 use crate::{
     Error, Result,
-    frame::{Frame, HALF_MAX},
+    frame::HALF_MAX,
     metrics::pairing,
     nn::Rng,
     passes::{self, Pass, PassSet},
@@ -208,32 +208,15 @@ impl Stored {
         raw_references: bool,
         least: usize,
     ) -> Result<Self> {
-        let frame = Frame::read(&pair.noisy)?;
-        let mut noisy = passes::read(&frame, None)?;
+        let mut noisy = passes::load(&pair.noisy, None)?;
         // As for inference: Combined may be what Blender made of the render.
         noisy.use_noisy_image();
-        for &pass in needed {
-            noisy.require(pass, "training")?;
-        }
+        noisy.require_all(needed.iter().copied(), "training")?;
         noisy.sanitize();
-        let mut reference = passes::load(&pair.reference, None)?;
+        let mut reference = passes::load_like(&pair.reference, &noisy.view_layer)?;
         reference.sanitize();
-        for &pass in targets {
-            reference.require(pass, "training")?;
-        }
-        if (reference.width, reference.height) != (noisy.width, noisy.height) {
-            return Err(Error::invalid(
-                &pair.noisy,
-                format!(
-                    "{}x{} pixels, but its reference {} has {}x{}; render both at one size",
-                    noisy.width,
-                    noisy.height,
-                    pair.reference.display(),
-                    reference.width,
-                    reference.height
-                ),
-            ));
-        }
+        reference.require_all(targets.iter().copied(), "training")?;
+        noisy.check_same_pixels(&reference)?;
         if noisy.width.min(noisy.height) < least {
             return Err(Error::invalid(
                 &pair.noisy,
@@ -308,7 +291,7 @@ mod tests {
     use std::{collections::BTreeSet, path::Path};
 
     use super::*;
-    use crate::frame::{NewChannel, SampleKind};
+    use crate::frame::{Frame, NewChannel, SampleKind};
 
     /// A frame of 8x8 pixels all of whose passes are `value` everywhere.
     fn stored(reference: &str, spp: u32, value: f32) -> Stored {
