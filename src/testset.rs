@@ -102,7 +102,7 @@ pub fn pairs(spec: &str) -> Result<Vec<Pair>> {
 /// The test set that `spec` (directory, manifest, glob or one EXR file) names.
 ///
 /// A glob or a file picks noisy renders, references or both; a reference that it leaves out is looked for
-/// beside its noisy render.
+/// beside its noisy render. Directories and globs pass over hidden files.
 ///
 /// # Errors
 /// Nothing is there, the manifest is malformed, or no pair is complete.
@@ -114,7 +114,7 @@ pub fn read(spec: &str) -> Result<TestSet> {
             .map(|entry| entry.map(|e| e.path()))
             .collect::<Result<Vec<_>, _>>()
             .map_err(Error::io("read", path))?;
-        match_files(files.into_iter().filter(|f| f.is_file()), true)
+        match_files(files.into_iter().filter(|f| f.is_file() && !is_hidden(f)), true)
     } else if path.is_file() && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
         match_files([path.to_path_buf()], false)
     } else if path.is_file() {
@@ -128,7 +128,9 @@ pub fn read(spec: &str) -> Result<TestSet> {
                 let path = e.path().to_path_buf();
                 Error::io("read", path)(e.into())
             })?;
-            files.push(file);
+            if !is_hidden(&file) {
+                files.push(file);
+            }
         }
         if files.is_empty() {
             return Err(Error::Usage(format!(
@@ -149,6 +151,11 @@ pub fn read(spec: &str) -> Result<TestSet> {
         return Err(Error::Usage(format!("no render pair in '{spec}': {hint}")));
     }
     Ok(set)
+}
+
+/// Whether a file is other programs' own, such as the `._room_0004spp.exr` that macOS leaves beside a file it copied.
+fn is_hidden(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'))
 }
 
 /// What a file name says about a render.
@@ -368,6 +375,16 @@ mod tests {
         assert!(set.unmatched.is_empty());
         let set = read(dir.path().join("b_0004spp.exr").to_str().unwrap()).unwrap();
         assert_eq!(ids(&set), ["b_0004spp"]);
+    }
+
+    #[test]
+    fn hidden_files_are_passed_over() {
+        let dir = folder(&["a_0004spp.exr", "a_ref.exr", "._a_0004spp.exr", "._a_ref.exr", ".b_0004spp.exr"]);
+        for pattern in ["", "*_0004spp.exr", "*.exr"] {
+            let set = read(dir.path().join(pattern).to_str().unwrap()).unwrap();
+            assert_eq!(ids(&set), ["a_0004spp"], "'{pattern}'");
+            assert!(set.unmatched.is_empty(), "'{pattern}': {:?}", set.unmatched);
+        }
     }
 
     #[test]
