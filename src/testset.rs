@@ -6,7 +6,7 @@
 //! relative to itself. Only names are looked at; no image is opened.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, HashMap},
     fmt,
     path::{Path, PathBuf},
 };
@@ -253,7 +253,8 @@ struct Row {
 }
 
 /// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
-/// the reference; a noisy file that is missing is kept, so that the row fails where it is read.
+/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines with the
+/// same files are an error: reports know a pair by its files, and would have rows for one of the two.
 fn manifest(path: &Path) -> Result<TestSet> {
     let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
     let mut reader = csv::ReaderBuilder::new()
@@ -263,6 +264,7 @@ fn manifest(path: &Path) -> Result<TestSet> {
         .map_err(|e| Error::invalid(path, format!("cannot read the manifest: {e}; {remedy}")))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     let mut set = TestSet::default();
+    let mut seen = HashMap::new();
     for row in reader.deserialize::<Row>() {
         let row = row.map_err(|e| Error::invalid(path, format!("{e}; {remedy}")))?;
         let frame = row
@@ -272,6 +274,15 @@ fn manifest(path: &Path) -> Result<TestSet> {
             .and_then(parse_name)
             .and_then(|n| n.frame.map(str::to_string));
         let (noisy, reference) = (directory.join(&row.noisy), directory.join(&row.reference));
+        if let Some(before) = seen.insert((noisy.clone(), reference.clone()), row.scene.clone()) {
+            return Err(Error::Usage(format!(
+                "{}: '{}' lists the same two files as '{before}' before it: {} and {}; take one of the lines out",
+                path.display(),
+                row.scene,
+                noisy.display(),
+                reference.display()
+            )));
+        }
         if reference.is_file() {
             set.pairs.push(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame });
         } else {
@@ -397,6 +408,29 @@ mod tests {
         assert_eq!(ids(&set), ["s_0008spp.0002", "z_0004spp"]);
         assert_eq!(set.pairs[1].noisy, dir.path().join("x.exr"));
         assert!(set.unmatched[0].to_string().contains("gone.exr"));
+    }
+
+    #[test]
+    fn files_listed_twice_are_an_error_that_names_both_scenes() {
+        let dir = folder(&["x.exr", "y.exr", "z.exr"]);
+        let file = dir.path().join("set.csv");
+        let list = |lines: &str| {
+            std::fs::write(&file, format!("scene,noisy,reference,spp\n{lines}")).unwrap();
+            read(file.to_str().unwrap())
+        };
+        for twice in
+            ["a,x.exr,y.exr,4\n# comment\nb,./x.exr,y.exr,8\n", "a,x.exr,gone.exr,4\n\nb,x.exr,gone.exr,4\n"]
+        {
+            let Err(Error::Usage(message)) = list(twice) else { panic!("{twice}") };
+            for part in ["set.csv: 'b'", "as 'a'", "x.exr", "take one"] {
+                assert!(message.contains(part), "{message}");
+            }
+        }
+        assert_eq!(
+            list("a,x.exr,y.exr,4\na,z.exr,y.exr,4\n").unwrap().pairs.len(),
+            2,
+            "one reference for two"
+        );
     }
 
     #[test]
