@@ -228,7 +228,7 @@ pub fn run(
     std::fs::create_dir_all(out).map_err(crate::Error::io("create", out))?;
     let mut rows = Vec::new();
     for pair in pairs {
-        let loaded = report::load(pair, view_layer);
+        let loaded = report::load_listed(pair, view_layer);
         for method in methods {
             let mut before = None;
             for trial in Trial::ALL {

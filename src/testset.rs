@@ -39,6 +39,13 @@ impl Pair {
         }
     }
 
+    /// What to say where there is no reference.
+    pub fn no_reference(&self) -> Error {
+        let wanted = self.reference.display();
+        let remedy = "render it, or take the noisy file out of the set";
+        Error::invalid(&self.noisy, format!("no reference: {wanted} is missing; {remedy}"))
+    }
+
     /// A name that is unique in its test set: `bathroom_0004spp`, `shot_0004spp.0017`.
     pub fn id(&self) -> String {
         let frame = self.frame.as_ref().map(|f| format!(".{f}")).unwrap_or_default();
@@ -49,13 +56,8 @@ impl Pair {
 /// A file of a test set that cannot be scored, and what it lacks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Unmatched {
-    /// A noisy render; the reference it lacks.
-    Noisy {
-        /// The noisy file.
-        path: PathBuf,
-        /// The reference looked for.
-        wanted: PathBuf,
-    },
+    /// A noisy render, with the reference that was looked for.
+    Noisy(Pair),
     /// A reference that no noisy render goes with.
     Reference(PathBuf),
 }
@@ -63,12 +65,7 @@ pub enum Unmatched {
 impl fmt::Display for Unmatched {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Noisy { path, wanted } => write!(
-                f,
-                "{}: no reference: {} is missing; render it, or take the noisy file out of the set",
-                path.display(),
-                wanted.display()
-            ),
+            Self::Noisy(pair) => pair.no_reference().fmt(f),
             Self::Reference(path) => write!(
                 f,
                 "{}: reference without a noisy render named <scene>_<spp>spp.exr beside it",
@@ -214,13 +211,10 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
         let wanted = directory.join(format!("{scene}_ref{suffix}.exr"));
         let key = (directory, scene.clone(), frame.clone());
         let reference = references.get(&key).cloned().or_else(|| wanted.is_file().then(|| wanted.clone()));
-        match reference {
-            Some(reference) => {
-                used.insert(reference.clone());
-                set.pairs.push(Pair { scene, noisy: path, reference, spp, frame });
-            }
-            None => set.unmatched.push(Unmatched::Noisy { path, wanted }),
-        }
+        used.extend(reference.clone());
+        let is_complete = reference.is_some();
+        let pair = Pair { scene, noisy: path, reference: reference.unwrap_or(wanted), spp, frame };
+        set.add(pair, is_complete);
     }
     if report_references {
         let unused = references.into_values().filter(|r| !used.contains(r));
@@ -231,16 +225,39 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
 }
 
 impl TestSet {
-    fn sort(&mut self) {
-        // Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
-        self.pairs.sort_by_cached_key(|p| {
-            let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
-            (p.scene.clone(), number, p.spp, p.noisy.clone())
+    /// Every noisy render, sorted as the pairs are: with those without their reference, which a table must not hide.
+    pub fn all_noisy(&self) -> Vec<Pair> {
+        let lacking = self.unmatched.iter().filter_map(|unmatched| match unmatched {
+            Unmatched::Noisy(pair) => Some(pair),
+            Unmatched::Reference(_) => None,
         });
+        let mut pairs: Vec<Pair> = self.pairs.iter().chain(lacking).cloned().collect();
+        sort(&mut pairs);
+        pairs
+    }
+
+    fn add(&mut self, pair: Pair, is_complete: bool) {
+        if is_complete {
+            self.pairs.push(pair);
+        } else {
+            self.unmatched.push(Unmatched::Noisy(pair));
+        }
+    }
+
+    fn sort(&mut self) {
+        sort(&mut self.pairs);
         self.unmatched.sort_by_cached_key(|u| match u {
-            Unmatched::Noisy { path, .. } | Unmatched::Reference(path) => path.clone(),
+            Unmatched::Noisy(Pair { noisy: path, .. }) | Unmatched::Reference(path) => path.clone(),
         });
     }
+}
+
+/// Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
+fn sort(pairs: &mut [Pair]) {
+    pairs.sort_by_cached_key(|p| {
+        let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
+        (p.scene.clone(), number, p.spp, p.noisy.clone())
+    });
 }
 
 /// A row of a manifest.
@@ -283,11 +300,8 @@ fn manifest(path: &Path) -> Result<TestSet> {
                 reference.display()
             )));
         }
-        if reference.is_file() {
-            set.pairs.push(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame });
-        } else {
-            set.unmatched.push(Unmatched::Noisy { path: noisy, wanted: reference });
-        }
+        let is_complete = reference.is_file();
+        set.add(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame }, is_complete);
     }
     set.sort();
     Ok(set)
@@ -367,6 +381,8 @@ mod tests {
         assert!(lines[1].contains("c_ref.exr"), "{}", lines[1]);
         assert!(lines[2].contains("d_ref.0001.exr"), "a still reference is not a frame's: {}", lines[2]);
         assert!(lines[3].contains("d_ref.exr"), "{}", lines[3]);
+        let all: Vec<_> = set.all_noisy().iter().map(Pair::id).collect();
+        assert_eq!(all, ["a_0004spp", "b_0004spp", "d_0004spp.0001"]);
     }
 
     #[test]

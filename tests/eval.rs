@@ -139,8 +139,12 @@ fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
             .and(predicate::str::contains("cut_0004spp.exr")),
     );
     let rows = table(&out.path().join("scores.csv"));
-    assert_eq!(rows.len(), 3);
-    for (scene, reason) in [("cut", "cut_0004spp.exr"), ("small", "image 128x128, reference 64x64")] {
+    assert_eq!(rows.len(), 4);
+    for (scene, reason) in [
+        ("cut", "cut_0004spp.exr"),
+        ("small", "image 128x128, reference 64x64"),
+        ("lonely", "lonely_ref.exr is missing; render it"),
+    ] {
         let row = row(&rows, scene, "noisy");
         assert!(row["reason"].contains(reason), "{}", row["reason"]);
         for metric in ["relmse", "ssim", "rmse", "max_error", "seconds", "exposure"] {
@@ -149,7 +153,7 @@ fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
     }
     assert_ne!(row(&rows, "good", "noisy")["relmse"], "");
     let summary = table(&out.path().join("summary.csv"));
-    assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "2"));
+    assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "3"));
     assert!(!out.path().join("sheets/cut_0004spp.png").exists());
 }
 

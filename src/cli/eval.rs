@@ -9,7 +9,6 @@ use super::methods;
 use crate::{
     Error, Result,
     report::{self, Event, Method, Options, Row},
-    testset,
 };
 
 /// Arguments of `demc eval`.
@@ -39,11 +38,10 @@ pub struct Args {
 /// # Errors
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: Args) -> Result<ExitCode> {
-    let set = testset::read(&args.asked.test_set)?;
+    let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let threads = args.asked.threads();
     let methods = args.asked.methods()?;
     let baseline = baseline(&args, &methods)?;
-    let mut failed = methods::tell_unmatched(&set);
     let options = Options {
         out: args.out,
         repeats: args.repeats.into(),
@@ -55,10 +53,10 @@ pub fn run(args: Args) -> Result<ExitCode> {
     };
     let pool = methods::pool(threads)?;
     let mut progress = Progress::new();
-    let rows = pool
-        .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
+    let rows =
+        pool.install(|| report::evaluate(&pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
     progress.finish();
-    failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
+    let failed = rows.iter().filter(|row| !row.reason.is_empty()).count();
     for file in ["summary.csv", "report.html"] {
         println!("{}", options.out.join(file).display());
     }

@@ -9,7 +9,6 @@ use crate::{
     Result,
     report::number,
     stability::{self, Row, Trial},
-    testset,
 };
 
 /// Arguments of `demc stability`.
@@ -27,10 +26,9 @@ pub struct Args {
 /// # Errors
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let set = testset::read(&args.asked.test_set)?;
+    let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let methods = args.asked.methods()?;
-    let mut failed = methods::tell_unmatched(&set);
-    let (mut done, all) = (0, set.pairs.len() * methods.len() * Trial::ALL.len());
+    let (mut done, all) = (0, pairs.len() * methods.len() * Trial::ALL.len());
     let mut tell = |row: &Row| {
         done += 1;
         let value =
@@ -45,8 +43,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     };
     let view_layer = args.asked.view_layer.as_deref();
     let rows = methods::pool(args.asked.threads())?
-        .install(|| stability::run(&set.pairs, &methods, view_layer, &args.out, &mut tell))?;
-    failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
+        .install(|| stability::run(&pairs, &methods, view_layer, &args.out, &mut tell))?;
+    let failed = rows.iter().filter(|row| !row.reason.is_empty()).count();
     println!("{}", args.out.join("stability_summary.csv").display());
     Ok(methods::finish(failed, &args.out.join("stability.csv")))
 }

@@ -188,6 +188,17 @@ pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     Ok(Loaded { noisy, passes, reference })
 }
 
+/// As [`load`], of a pair whose reference may be missing.
+///
+/// # Errors
+/// As [`load`], or there is no reference.
+pub fn load_listed(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
+    if !pair.reference.is_file() {
+        return Err(pair.no_reference());
+    }
+    load(pair, view_layer)
+}
+
 /// Memory peaks known so far, by method, width and height.
 type Peaks = HashMap<(String, usize, usize), Option<f64>>;
 
@@ -205,7 +216,7 @@ fn run_pair(
         row.threads = options.threads;
         row
     };
-    let loaded = match load(pair, options.view_layer.as_deref()) {
+    let loaded = match load_listed(pair, options.view_layer.as_deref()) {
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
