@@ -7,7 +7,7 @@ use std::{fs, path::Path};
 use assert_cmd::assert::Assert;
 use common::{
     demc,
-    files::data,
+    files::{data, write_render},
     python,
     tables::{Row, table},
 };
@@ -155,6 +155,34 @@ fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
     let summary = table(&out.path().join("summary.csv"));
     assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "3"));
     assert!(!out.path().join("sheets/cut_0004spp.png").exists());
+}
+
+#[test]
+fn a_score_that_is_not_defined_is_an_empty_cell_with_a_note_and_no_failure() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (scene, size, light) in [("black", 16, 0.0), ("small", 8, 0.5)] {
+        let noisy =
+            |name: &str, at: usize| if name.starts_with("Combined") { 0.4 + (at % 7) as f32 } else { 1.0 };
+        write_render(&set.path().join(format!("{scene}_0004spp.exr")), size, size, noisy);
+        write_render(&set.path().join(format!("{scene}_ref.exr")), size, size, |_, _| light);
+    }
+    let run = || eval(set.path(), out.path(), &["--models", "noisy"]).success();
+    run().stderr(predicate::str::contains("note: small_0004spp: no ssim"));
+    let rows = table(&out.path().join("scores.csv"));
+    for (scene, empty, note) in [
+        ("black", &["ssim", "exposure", "flip"][..], "no ssim, exposure, flip: the reference is black"),
+        ("small", &["ssim"], "no ssim: the images are smaller than its window of 11x11"),
+    ] {
+        let row = row(&rows, scene, "noisy");
+        for metric in ["relmse", "ssim", "rmse", "max_error", "exposure", "smape", "flip"] {
+            assert_eq!(row[metric].is_empty(), empty.contains(&metric), "{scene} {metric}");
+        }
+        assert_eq!(row["reason"], "");
+        assert!(row["note"].starts_with(&format!("{scene}_0004spp: {note}")), "{}", row["note"]);
+    }
+    let page = fs::read_to_string(out.path().join("report.html")).unwrap();
+    assert!(page.contains("the reference is black") && !page.contains("rows failed"));
+    run().stderr(predicate::str::contains("2 of 2 rows are there already"));
 }
 
 #[test]
@@ -328,7 +356,7 @@ fn a_reference_of_another_scene_is_scored_and_said_to_be_one() {
         .stderr(predicate::str::contains("note: swapped_0004spp: ").and(predicate::str::contains(said)))
         .stderr(predicate::str::contains("good_0004spp: ").not());
     assert!(table(&out.path().join("scores.csv")).iter().all(|row| !row["relmse"].is_empty()));
-    for file in ["run.json", "report.html"] {
+    for file in ["scores.csv", "report.html"] {
         assert_eq!(fs::read_to_string(out.path().join(file)).unwrap().matches(said).count(), 1, "{file}");
     }
 }

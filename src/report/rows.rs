@@ -13,7 +13,7 @@ use super::cell;
 use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
-pub const COLUMNS: [&str; 22] = [
+pub const COLUMNS: [&str; 23] = [
     "scene",
     "model",
     "spp",
@@ -36,6 +36,7 @@ pub const COLUMNS: [&str; 22] = [
     "noisy",
     "reference",
     "reason",
+    "note",
 ];
 
 /// What one method scored on one pair. A number that could not be measured is none; `reason` says why.
@@ -83,8 +84,12 @@ pub struct Row {
     pub noisy: PathBuf,
     /// The reference file.
     pub reference: PathBuf,
-    /// Why scores are missing; empty where all is well.
+    /// Why the method failed here, so that it is tried again; empty where all is well.
     pub reason: String,
+    /// What else a reader should know: why a score is not defined, what the method said of the frame. Of the pair itself that is
+    /// in the row of `noisy`.
+    #[serde(default)]
+    pub note: String,
 }
 
 /// What makes a row the same row in another run.
@@ -106,6 +111,14 @@ impl Row {
     /// What identifies it.
     pub fn key(&self) -> Key {
         (self.noisy.clone(), self.reference.clone(), self.model.clone())
+    }
+
+    /// Adds to the note.
+    pub fn say(&mut self, note: &str) {
+        if !self.note.is_empty() {
+            self.note += "; ";
+        }
+        self.note += note;
     }
 
     /// Whether the method gave scores here.
@@ -160,6 +173,7 @@ impl Row {
             self.noisy.display().to_string(),
             self.reference.display().to_string(),
             self.reason.clone(),
+            self.note.clone(),
         ]
     }
 }
@@ -262,6 +276,9 @@ mod tests {
         full.relmse = Some(0.0123);
         full.non_finite = Some(0);
         full.reason = "line one".into();
+        full.say("one");
+        full.say("two, three");
+        assert_eq!(full.note, "one; two, three");
         table.push(full.clone()).unwrap();
         assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), full.clone()]);
 

@@ -38,7 +38,7 @@ pub enum Event<'a> {
     },
     /// A pair is being read.
     Pair(&'a Pair),
-    /// What a method says about its treatment of a pair.
+    /// What a reader should know of the row that comes next.
     Note(&'a str),
     /// A row is finished.
     Row(&'a Row),
@@ -61,13 +61,10 @@ pub fn evaluate(
     fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
     let provenance = Provenance::now();
-    let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
+    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
     let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
     // A row that failed is tried again.
     kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
-    // What was said of rows that are kept still holds.
-    now.notes = before.notes.clone();
-    now.notes.retain(|method, _| kept.iter().any(|row| row.model == *method));
     let keep_sheets = !options.overwrite && before.same_methods(&now);
 
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
@@ -84,13 +81,10 @@ pub fn evaluate(
         }
         on(Event::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
-        for (method, note) in done.notes {
-            on(Event::Note(&note));
-            if now.notes.entry(method).or_default().insert(note) {
-                now.write(&stored)?;
-            }
-        }
         for row in done.rows {
+            if !row.note.is_empty() {
+                on(Event::Note(&row.note));
+            }
             on(Event::Row(&row));
             table.push(row)?;
         }
@@ -122,7 +116,6 @@ pub fn evaluate(
         summaries: &summaries,
         charts: &charts,
         scenes: &scenes,
-        notes: &now.notes,
         options,
         provenance: &provenance,
     }
@@ -144,8 +137,6 @@ fn sheet_path(pairs: &[Pair], pair: &Pair, options: &Options) -> Option<PathBuf>
 
 /// What running a pair gave.
 struct Done {
-    /// What the methods, by name, say about their treatment of the pair.
-    notes: Vec<(String, String)>,
     /// Rows of the methods that were not finished.
     rows: Vec<Row>,
     /// Images for the sheet, where the pair could be read.
@@ -220,7 +211,7 @@ fn run_pair(
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
-            return Done { notes: Vec::new(), rows: open().map(fail).collect(), scene: None };
+            return Done { rows: open().map(fail).collect(), scene: None };
         }
     };
     let (width, height) = (loaded.noisy.width, loaded.noisy.height);
@@ -233,7 +224,14 @@ fn run_pair(
         }
         let mut row = new_row(method);
         (row.width, row.height) = (Some(width), Some(height));
-        let image = first_run(method, &loaded, &mut row);
+        let image = first_run(method, pair, &loaded, &mut row);
+        if !finished {
+            method.denoiser.notes(&loaded.passes).iter().for_each(|note| row.say(note));
+        }
+        if !finished && method.name == NOISY {
+            let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
+            warning.iter().for_each(|warning| row.say(warning));
+        }
         if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
             let measure = || (method.peak_mib)(&pair.noisy);
             row.peak_mib = *peaks.entry((method.name.clone(), width, height)).or_insert_with(measure);
@@ -261,12 +259,7 @@ fn run_pair(
             row.set_time(times, width * height);
         }
     }
-    let mut notes: Vec<(String, String)> =
-        open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect();
-    let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
-    notes.extend(warning.map(|warning| (NOISY.into(), warning)));
     Done {
-        notes,
         rows: rows.into_iter().flatten().collect(),
         scene: shown.then_some(Scene { reference: loaded.reference, images }),
     }
@@ -282,7 +275,7 @@ fn timed_run(denoiser: &dyn Denoiser, passes: &PassSet) -> Result<Run> {
 }
 
 /// The run that is scored. None, with a reason in the row, where it fails.
-fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
+fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
     let image = if method.name == NOISY {
         loaded.noisy.clone()
     } else {
@@ -301,6 +294,12 @@ fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> 
     match metrics::score(&image, &loaded.reference) {
         Ok(scores) => {
             row.set_scores(&scores);
+            let undefined = scores.named().into_iter().filter(|(_, score)| score.is_none());
+            let undefined = undefined.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
+            if !undefined.is_empty() {
+                let why = metrics::why_undefined(&loaded.reference);
+                row.say(&format!("{}: no {undefined}: {why}", pair.id()));
+            }
             Some(image)
         }
         Err(why) => {

@@ -1,10 +1,6 @@
 //! `run.json`: what the rows in a folder were made with, so that a later run keeps those that hold.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    fs,
-    path::Path,
-};
+use std::{collections::BTreeMap, fs, path::Path};
 
 use serde::{Deserialize, Serialize};
 
@@ -27,9 +23,6 @@ pub struct Settings {
     methods: BTreeMap<String, String>,
     /// Stamp of each pair, by its noisy and reference files.
     pairs: BTreeMap<String, String>,
-    /// What each method, by name, said of its treatment of the pairs; what is said of a pair itself is under `noisy`.
-    #[serde(default)]
-    pub notes: BTreeMap<String, BTreeSet<String>>,
 }
 
 impl Settings {
@@ -48,7 +41,6 @@ impl Settings {
                     (name(&p.noisy, &p.reference), stamps)
                 })
                 .collect(),
-            notes: BTreeMap::new(),
         }
     }
 
