@@ -19,6 +19,7 @@ use super::{
 };
 use crate::{
     Error, Result,
+    error::attempt,
     metrics::{self, Incomparable, pairing},
     models::{Denoiser, Run},
     passes::{self, Pass, PassSet},
@@ -187,7 +188,7 @@ pub fn load_listed(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     if !pair.reference.is_file() {
         return Err(pair.no_reference());
     }
-    load(pair, view_layer)
+    attempt(&pair.noisy, || load(pair, view_layer))
 }
 
 /// Memory peaks known so far, by method, width and height.
@@ -247,7 +248,7 @@ fn run_pair(
             let Some(row) = rows[i].as_mut().filter(|row| row.is_valid() && method.name != NOISY) else {
                 continue;
             };
-            match timed_run(&*method.denoiser, &loaded.passes) {
+            match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.passes)) {
                 Ok(run) => times[i].push(run.seconds),
                 Err(error) => row.reason = error.to_string(),
             }
@@ -279,7 +280,7 @@ fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Op
     let image = if method.name == NOISY {
         loaded.noisy.clone()
     } else {
-        match method.denoiser.denoise_timed(&loaded.passes) {
+        match attempt(&pair.noisy, || method.denoiser.denoise_timed(&loaded.passes)) {
             Ok(run) => {
                 row.peak_mib = run.peak_mib;
                 run.image
@@ -305,6 +306,58 @@ fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Op
         Err(why) => {
             row.reason = why.to_string();
             None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{models::Noisy, report::Method};
+
+    /// Fails as no method should.
+    struct Panics;
+
+    impl Denoiser for Panics {
+        fn name(&self) -> &str {
+            "panics"
+        }
+
+        fn passes(&self) -> &[Pass] {
+            &[Pass::Combined]
+        }
+
+        fn denoise(&self, _: &PassSet) -> Result<Planes> {
+            panic!("on purpose")
+        }
+    }
+
+    #[test]
+    fn a_method_that_panics_fails_alone() {
+        let out = tempfile::tempdir().unwrap();
+        let data = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/*_0004spp.exr");
+        let pairs = crate::testset::read(data).unwrap().pairs;
+        let method = |denoiser: Box<dyn Denoiser>| Method {
+            name: denoiser.name().into(),
+            denoiser,
+            peak_mib: Box::new(|_| None),
+            stamp: "1".into(),
+        };
+        let options = Options {
+            out: out.path().into(),
+            repeats: 1,
+            threads: 1,
+            baseline: NOISY.into(),
+            view_layer: None,
+            overwrite: false,
+            sheets: false,
+        };
+        let methods = [method(Box::new(Noisy)), method(Box::new(Panics))];
+        let rows = evaluate(&pairs, &methods, &options, &mut |_| {}).unwrap();
+        assert_eq!(rows.len(), 2 * pairs.len());
+        for row in rows {
+            assert_eq!(row.is_valid(), row.model == NOISY, "{row:?}");
+            assert_eq!(row.reason.contains("internal error"), row.model == "panics", "{row:?}");
         }
     }
 }
