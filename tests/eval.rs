@@ -228,7 +228,55 @@ fn finished_rows_are_kept_and_missing_ones_run() {
     eval(&data(""), out.path(), &["--models", "noisy", "--threads", "1", "--overwrite"])
         .success()
         .stderr(predicate::str::contains("already").not());
-    assert_eq!(table(&scores).len(), 2);
+    let after = table(&scores);
+    assert_eq!(
+        after.iter().map(|r| &r["model"][..]).collect::<Vec<_>>(),
+        ["noisy", "noisy", "oidn-fast", "oidn-fast"]
+    );
+    let fast = |rows: &[Row]| rows.iter().filter(|r| r["model"] == "oidn-fast").cloned().collect::<Vec<_>>();
+    assert_eq!(fast(&after), fast(&rows), "rows that were not asked for are as they were");
+}
+
+#[test]
+fn rows_of_other_methods_and_renders_stay_as_long_as_they_hold() {
+    let out = tempfile::tempdir().unwrap();
+    let run = |set: &str, models: &str, threads: &str| {
+        eval(&data(set), out.path(), &["--models", models, "--no-sheets", "--threads", threads]).success()
+    };
+    let [meadow, room] = ["s0010_outdoor_0004spp.exr", "s0000_room_0004spp.exr"];
+    let read = |file: &str| fs::read_to_string(out.path().join(file)).unwrap();
+    run(meadow, "demc-s", "2");
+    let first = read("scores.csv");
+    run(room, "noisy", "2").stderr(predicate::str::contains("dropped").not());
+    let second = read("scores.csv");
+    assert_eq!(second.lines().count(), 4);
+    assert!(first.lines().all(|line| second.lines().any(|other| other == line)), "{first}{second}");
+    assert_eq!(table(&out.path().join("summary.csv")).len(), 1, "this run's methods");
+    let page = read("report.html");
+    assert!(page.contains("s0000_room") && !page.contains("demc-s") && !page.contains("s0010_outdoor"));
+    // What the rows are known by stays too.
+    run(meadow, "demc-s", "2").stderr(predicate::str::contains("2 of 2 rows are there already"));
+    run(room, "noisy", "2").stderr(predicate::str::contains("1 of 1 rows are there already"));
+    // Rows made with other settings do not belong into one table.
+    run(room, "noisy", "1")
+        .stderr(predicate::str::contains("2 rows of other methods or renders are dropped"));
+    assert_eq!(table(&out.path().join("scores.csv")).len(), 1);
+}
+
+#[test]
+fn a_sheet_shows_the_methods_of_the_last_run() {
+    let out = tempfile::tempdir().unwrap();
+    let sheet = out.path().join("sheets/s0010_outdoor_0004spp.png");
+    let columns = |models: &str| {
+        eval(&data("s0010_outdoor_0004spp.exr"), out.path(), &["--models", models]).success();
+        (image::open(&sheet).unwrap().width() - 6) / 306
+    };
+    assert_eq!((columns("demc-s"), columns("noisy")), (3, 2), "methods and the reference");
+    assert_eq!(columns("demc-s"), 3, "though all rows were there already");
+    let changed = || fs::metadata(&sheet).unwrap().modified().unwrap();
+    let before = changed();
+    columns("demc-s");
+    assert_eq!(changed(), before, "it shows them already");
 }
 
 #[test]

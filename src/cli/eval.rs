@@ -16,7 +16,8 @@ use crate::{
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets
+    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets. Rows of earlier runs into it stay in
+    /// scores.csv as long as they hold, and are not run again
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Method that the summary's ratios refer to [default: the first of --models]
@@ -28,7 +29,7 @@ pub struct Args {
     /// Write no comparison sheets
     #[arg(long)]
     no_sheets: bool,
-    /// Run everything anew instead of keeping finished rows
+    /// Run all that is asked for anew, finished rows too; rows of other methods and renders stay as without it
     #[arg(long)]
     overwrite: bool,
 }

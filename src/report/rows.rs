@@ -218,17 +218,19 @@ pub fn read_rows(path: &Path) -> Result<Vec<Row>> {
 pub struct Table {
     path: PathBuf,
     rows: HashMap<Key, Row>,
+    /// Rows that this run does not ask for; they stay.
+    others: Vec<Row>,
 }
 
 impl Table {
-    /// Starts with the rows kept from an earlier run.
-    pub fn create(path: PathBuf, kept: Vec<Row>) -> Result<Self> {
-        let text = to_csv(&COLUMNS, kept.iter().map(Row::cells));
+    /// Starts with the rows kept from an earlier run, and others that are not asked for now.
+    pub fn create(path: PathBuf, kept: Vec<Row>, others: Vec<Row>) -> Result<Self> {
+        let text = to_csv(&COLUMNS, kept.iter().chain(&others).map(Row::cells));
         write_file(&path, text.as_bytes())?;
-        Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect() })
+        Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect(), others })
     }
 
-    /// The row, where it is finished.
+    /// The row, where it is asked for and finished.
     pub fn get(&self, key: &Key) -> Option<&Row> {
         self.rows.get(key)
     }
@@ -244,10 +246,11 @@ impl Table {
         Ok(())
     }
 
-    /// Rewrites the table in the order of `keys` and gives its rows.
+    /// Rewrites the table in the order of `keys`, the other rows last, and gives the rows that were asked for.
     pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
         let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();
-        write_file(&self.path, to_csv(&COLUMNS, rows.iter().map(Row::cells)).as_bytes())?;
+        let text = to_csv(&COLUMNS, rows.iter().chain(&self.others).map(Row::cells));
+        write_file(&self.path, text.as_bytes())?;
         Ok(rows)
     }
 }
@@ -268,10 +271,10 @@ mod tests {
     }
 
     #[test]
-    fn table_survives_a_cut_line_and_ends_in_order() {
+    fn table_survives_a_cut_line_and_ends_in_order_with_the_other_rows_last() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scores.csv");
-        let mut table = Table::create(path.clone(), vec![row("b", "noisy")]).unwrap();
+        let mut table = Table::create(path.clone(), vec![row("b", "noisy")], vec![row("a", "m")]).unwrap();
         let mut full = row("a", "oidn, \"high\"");
         full.relmse = Some(0.0123);
         full.non_finite = Some(0);
@@ -280,15 +283,15 @@ mod tests {
         full.say("two, three");
         assert_eq!(full.note, "one; two, three");
         table.push(full.clone()).unwrap();
-        assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), full.clone()]);
+        assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), row("a", "m"), full.clone()]);
 
         let mut file = OpenOptions::new().append(true).open(&path).unwrap();
         file.write_all(b"c,noisy,4,12").unwrap();
-        assert_eq!(read_rows(&path).unwrap().len(), 2, "a cut line is no row");
+        assert_eq!(read_rows(&path).unwrap().len(), 3, "a cut line is no row");
 
         let rows = table.finish([full.key(), row("b", "noisy").key(), row("z", "noisy").key()]).unwrap();
         assert_eq!(rows, [full.clone(), row("b", "noisy")]);
-        assert_eq!(read_rows(&path).unwrap(), rows);
+        assert_eq!(read_rows(&path).unwrap(), [full, row("b", "noisy"), row("a", "m")]);
     }
 
     #[test]

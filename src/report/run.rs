@@ -3,7 +3,11 @@
 //! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after one of its own that is
 //! not timed: a machine that slows down slows them all. Memory is measured apart, once for each method and size of frame.
 
-use std::{collections::HashMap, fs, path::PathBuf};
+use std::{
+    collections::{HashMap, HashSet},
+    fs,
+    path::PathBuf,
+};
 
 use super::{
     Method, NOISY, Options,
@@ -13,7 +17,7 @@ use super::{
     page::Page,
     provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
-    settings::Settings,
+    settings::{self, Settings},
     sheet::{self, Shown},
     summary,
 };
@@ -30,7 +34,7 @@ use crate::{
 /// What a run tells while it goes on.
 #[derive(Debug)]
 pub enum Event<'a> {
-    /// Rows in all, and those kept from an earlier run.
+    /// Rows asked for in all, and those of them kept from an earlier run.
     Start {
         /// Rows when all is done.
         rows: usize,
@@ -39,13 +43,13 @@ pub enum Event<'a> {
     },
     /// A pair is being read.
     Pair(&'a Pair),
-    /// What a reader should know of the row that comes next.
+    /// What a reader should know of the rows that come next.
     Note(&'a str),
     /// A row is finished.
     Row(&'a Row),
 }
 
-/// Scores every method on every pair and writes the report into `options.out`. Returns all rows,
+/// Scores every method on every pair and writes the report into `options.out`. Returns the rows of them all,
 /// those kept from an earlier run included, pair by pair in the order of the methods.
 ///
 /// # Errors
@@ -62,21 +66,51 @@ pub fn evaluate(
     fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
     let provenance = Provenance::now();
-    let (before, now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
-    let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
+    let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
+    let keys: Vec<Key> =
+        pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key())).collect();
+    let asked: HashSet<&Key> = keys.iter().collect();
+    let rows = match read_rows(&scores) {
+        Err(_) if options.overwrite => Vec::new(),
+        rows => rows?,
+    };
+    let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
+        rows.into_iter().partition(|row| asked.contains(&row.key()));
     // A row that failed is tried again.
-    kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
-    let keep_sheets = !options.overwrite && before.same_methods(&now);
+    kept.retain(|row| !options.overwrite && row.reason.is_empty() && before.still_holds(row, &now));
+    let count = others.len();
+    others.retain(|row| before.still_holds(row, &now));
+    others.iter().for_each(|row| now.keep(row, &before));
+    if others.len() < count {
+        on(Event::Note(&format!(
+            "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor or files \
+             have changed",
+            scores.display(),
+            count - others.len()
+        )));
+    }
 
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
-    let mut table = Table::create(scores, kept)?;
+    let mut table = Table::create(scores, kept, others)?;
+    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
+    let shows =
+        |pair: &Pair| format!("{} of {}", names.join(", "), settings::name(&pair.noisy, &pair.reference));
+    let sheet_names: Vec<String> = pairs.iter().map(|pair| sheet_name(pairs, pair)).collect();
+    now.sheets = before.sheets;
+    for (pair, sheet) in pairs.iter().zip(&sheet_names) {
+        let is_finished = methods.iter().all(|m| table.get(&Row::new(pair, &m.name).key()).is_some());
+        // Known again when it is drawn: a run that is killed before leaves no sheet of other rows.
+        if !is_finished || now.sheets.get(sheet) != Some(&shows(pair)) {
+            now.sheets.remove(sheet);
+        }
+    }
     now.write(&stored)?;
     let mut peaks = Peaks::new();
-    for pair in pairs {
+    for (pair, name) in pairs.iter().zip(&sheet_names) {
         let finished: Vec<bool> =
             methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
-        let sheet = sheet_path(pairs, pair, options);
-        let sheet = sheet.filter(|path| !(keep_sheets && finished.iter().all(|f| *f) && path.is_file()));
+        let sheet = options.sheets.then(|| sheets.join(name));
+        let sheet = sheet.filter(|path| !(now.sheets.contains_key(name) && path.is_file()));
         if finished.iter().all(|f| *f) && sheet.is_none() {
             continue;
         }
@@ -95,12 +129,12 @@ pub fn evaluate(
                 .filter_map(|m| Some((m.name.as_str(), table.get(&Row::new(pair, &m.name).key())?)))
                 .collect();
             sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
+            now.sheets.insert(name.clone(), shows(pair));
+            now.write(&stored)?;
         }
     }
 
-    let keys = pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key()));
-    let rows = table.finish(keys.collect::<Vec<Key>>())?;
-    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
+    let rows = table.finish(keys)?;
     let summaries = summary::summarise(&rows, &names, &options.baseline);
     write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
     let charts = [
@@ -110,7 +144,11 @@ pub fn evaluate(
     ];
     let scenes: Vec<(&Pair, Option<PathBuf>)> = pairs
         .iter()
-        .map(|pair| (pair, sheet_path(pairs, pair, options).filter(|path| path.is_file())))
+        .zip(&sheet_names)
+        .map(|(pair, name)| {
+            let is_known = options.sheets && now.sheets.contains_key(name);
+            (pair, is_known.then(|| sheets.join(name)).filter(|path| path.is_file()))
+        })
         .collect();
     Page {
         rows: &rows,
@@ -124,16 +162,14 @@ pub fn evaluate(
     Ok(rows)
 }
 
-/// Where the pair's sheet goes, if sheets are wanted: a name that is unique in the test set even where
-/// a manifest repeats a scene.
-fn sheet_path(pairs: &[Pair], pair: &Pair, options: &Options) -> Option<PathBuf> {
+/// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
+fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
     let id = pair.id().replace(['/', '\\'], "_");
-    let name = match twins.iter().position(|p| *p == pair) {
+    match twins.iter().position(|p| *p == pair) {
         Some(at) if at > 0 => format!("{id}_{}.png", at + 1),
         _ => format!("{id}.png"),
-    };
-    options.sheets.then(|| options.out.join("sheets").join(name))
+    }
 }
 
 /// What running a pair gave.
