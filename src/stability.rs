@@ -3,7 +3,8 @@
 //! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene the result is
 //! scored against what the reference then is, and beside the result for the frame as it was rendered: `ratio` is its
 //! RelMSE over that one's, `deviation` the RelMSE between the two. A method that is indifferent to the change has a
-//! ratio of 1 and a deviation of 0.
+//! ratio of 1 and a deviation of 0. Methods see what is in the frame alone: half buffers that lie beside it, which do not have the
+//! change, are not used, not for the frame as it was rendered either.
 
 use std::path::Path;
 
@@ -268,6 +269,8 @@ fn attempt(
 ) -> std::result::Result<[Option<f64>; 3], String> {
     let mut changed = trial.change(&loaded.passes);
     changed.sanitize();
+    // No longer the frame of that file: what lies beside it, such as half buffers, does not have the change.
+    changed.path.as_mut_os_string().push(format!(" ({})", trial.name()));
     let image = trial.undo(method.denoiser.denoise(&changed).map_err(|e| e.to_string())?);
     let reference = trial.seen(&loaded.reference);
     metrics::check(&image, &reference).map_err(|why| why.to_string())?;

@@ -88,3 +88,30 @@ fn one_bad_frame_does_not_stop_the_others() {
         assert!(row["reason"].contains(why), "{row:?}");
     }
 }
+
+/// Half buffers on disk do not have the change: NFOR must not denoise them in place of the changed frame.
+#[test]
+fn half_buffers_beside_a_frame_do_not_stand_in_for_it() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (from, to) in
+        [("0004spp", "0004spp"), ("0004spp", "0004spp_a"), ("0004spp", "0004spp_b"), ("ref", "ref")]
+    {
+        let name = |kind: &str| format!("s0010_outdoor_{kind}.exr");
+        fs::copy(data(&name(from)), set.path().join(name(to))).unwrap();
+    }
+    demc()
+        .args(["stability", "--models", "nfor", "--test-set"])
+        .arg(set.path())
+        .arg("--out")
+        .arg(out.path())
+        .assert()
+        .success();
+    let rows = table(&out.path().join("stability.csv"));
+    for row in rows.iter().filter(|row| row["model"] == "nfor") {
+        match &row["trial"][..] {
+            "as-rendered" => {}
+            "darker" | "brighter" => assert!((value(row, "ratio") - 1.0).abs() < 0.01, "{row:?}"),
+            _ => assert!(value(row, "deviation") > 0.0, "{row:?}"),
+        }
+    }
+}
