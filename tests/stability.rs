@@ -6,7 +6,7 @@ use std::fs;
 
 use common::{
     demc,
-    files::data,
+    files::{data, write_render},
     tables::{Row, table},
 };
 use predicates::prelude::*;
@@ -87,6 +87,42 @@ fn one_bad_frame_does_not_stop_the_others() {
         let why = if row["scene"] == "cut" { "cut_0004spp.exr" } else { "lonely_ref.exr is missing" };
         assert!(row["reason"].contains(why), "{row:?}");
     }
+}
+
+/// A frame that a trial leaves nothing of, and one whose result is exact: no failures, and no made-up numbers.
+#[test]
+fn what_cannot_be_told_is_an_empty_cell_with_a_note() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (scene, (width, height), light) in [("small", (5, 3), 0.25), ("exact", (40, 40), 0.5)] {
+        let path = |kind: &str| set.path().join(format!("{scene}_{kind}.exr"));
+        write_render(&path("0004spp"), width, height, |_, _| 0.5);
+        write_render(&path("ref"), width, height, |_, _| light);
+    }
+    demc()
+        .args(["stability", "--models", "noisy", "--test-set"])
+        .arg(set.path())
+        .arg("--out")
+        .arg(out.path())
+        .assert()
+        .success()
+        .stderr(predicate::str::contains("cropped: skipped"));
+    let rows = table(&out.path().join("stability.csv"));
+    assert_eq!(rows.len(), 2 * 9);
+    for row in &rows {
+        let empty = match (&row["scene"][..], &row["trial"][..]) {
+            ("small", "cropped") => &["relmse", "ratio", "deviation"][..],
+            ("exact", trial) if trial != "as-rendered" => &["ratio"],
+            _ => &[],
+        };
+        for column in ["relmse", "ratio", "deviation"] {
+            assert_eq!(row[column].is_empty(), empty.contains(&column), "{column} of {row:?}");
+            assert!(row[column].is_empty() || value(row, column).is_finite(), "{column} of {row:?}");
+        }
+        assert_eq!((row["reason"].is_empty(), row["note"].is_empty()), (true, empty.is_empty()), "{row:?}");
+    }
+    let summary = table(&out.path().join("stability_summary.csv"));
+    let scenes = |trial: &str| &summary.iter().find(|line| line["trial"] == trial).unwrap()["scenes"][..];
+    assert_eq!([scenes("as-rendered"), scenes("darker"), scenes("cropped")], ["2", "1", "0"]);
 }
 
 /// Half buffers on disk do not have the change: NFOR must not denoise them in place of the changed frame.

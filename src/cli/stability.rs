@@ -33,12 +33,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         done += 1;
         let value =
             |name: &str, v: Option<f64>| v.map(|v| format!("  {name} {}", number(v))).unwrap_or_default();
-        let said = match &row.reason[..] {
-            "" => {
-                value("relmse", row.relmse) + &value("ratio", row.ratio) + &value("deviation", row.deviation)
-            }
-            reason => format!(": {reason}"),
-        };
+        let numbers = [("relmse", row.relmse), ("ratio", row.ratio), ("deviation", row.deviation)];
+        let numbers: String = numbers.map(|(name, number)| value(name, number)).concat();
+        let why = [&row.reason, &row.note].into_iter().filter(|why| !why.is_empty());
+        let said = numbers + &why.map(|why| format!(": {why}")).collect::<String>();
         eprintln!("[{done}/{all}] {} {} spp {} {}{said}", row.scene, row.spp, row.model, row.trial);
     };
     let view_layer = args.asked.view_layer.as_deref();

@@ -26,7 +26,7 @@ mod summary;
 use std::path::{Path, PathBuf};
 
 pub use loss::loss_chart;
-pub use rows::{COLUMNS, Row, read_rows, to_csv, write_file};
+pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
 pub use run::{Event, Loaded, evaluate, load, load_listed};
 pub use settings::file_stamp;
 pub use summary::{Method as MethodSummary, geometric_mean, summarise};

@@ -197,6 +197,17 @@ pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
     atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
 }
 
+/// Appends a row to a CSV file at once.
+///
+/// # Errors
+/// It cannot be written.
+pub fn append_row(path: &Path, cells: &[String]) -> Result<()> {
+    let cells: Vec<&str> = cells.iter().map(String::as_str).collect();
+    let line = to_csv::<Vec<String>>(&cells, []);
+    let mut file = OpenOptions::new().append(true).open(path).map_err(Error::io("write", path))?;
+    file.write_all(line.as_bytes()).map_err(Error::io("write", path))
+}
+
 /// The rows of a `scores.csv`; none where there is no such file. A last line that a killed run cut
 /// short is left out.
 ///
@@ -237,11 +248,7 @@ impl Table {
 
     /// Stores a row at once.
     pub fn push(&mut self, row: Row) -> Result<()> {
-        let text = to_csv(&COLUMNS, [row.cells()]);
-        let line = text.split_once('\n').map_or("", |(_header, line)| line);
-        let mut file =
-            OpenOptions::new().append(true).open(&self.path).map_err(Error::io("write", &self.path))?;
-        file.write_all(line.as_bytes()).map_err(Error::io("write", &self.path))?;
+        append_row(&self.path, &row.cells())?;
         self.rows.insert(row.key(), row);
         Ok(())
     }
