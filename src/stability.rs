@@ -83,6 +83,21 @@ impl Trial {
         }
     }
 
+    /// What it does, for a reader of its name.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            Self::AsRendered => "nothing changes: what the others are measured by",
+            Self::Darker => "radiance is a 256th",
+            Self::Brighter => "radiance is 256 times as high",
+            Self::Mirrored => "left and right change places",
+            Self::Cropped => "the frame begins 5 pixels further right and 3 further down",
+            Self::Fireflies => "one pixel in 1024 has 1000 times the mean radiance",
+            Self::NonFinite => "one pixel in 1024 of every pass is NaN or infinite",
+            Self::ShiftedGuides => "guides are 2 pixels further right than radiance",
+            Self::BlankGuides => "guides hold nothing",
+        }
+    }
+
     /// The change as an augmentation, where it is one.
     fn augment(self) -> Option<Augment> {
         match self {

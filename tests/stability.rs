@@ -151,3 +151,12 @@ fn half_buffers_beside_a_frame_do_not_stand_in_for_it() {
         }
     }
 }
+
+#[test]
+fn help_says_what_each_trial_does() {
+    let help = demc().args(["stability", "--help"]).assert().success();
+    let text = String::from_utf8(help.get_output().stdout.clone()).unwrap();
+    for trial in demc::stability::Trial::ALL {
+        assert!(text.contains(trial.name()) && text.contains(trial.meaning()), "{text}");
+    }
+}

@@ -13,12 +13,23 @@ use crate::{
 
 /// Arguments of `demc stability`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = trials())]
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for stability.csv and stability_summary.csv
+    /// Folder for stability.csv, which grows row by row, and stability_summary.csv; those of an earlier run are replaced
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+}
+
+/// What the trials do, and what the tables tell of them.
+fn trials() -> String {
+    let lines = Trial::ALL.map(|trial| format!("  {:<16}{}\n", trial.name(), trial.meaning()));
+    format!(
+        "Trials:\n{}\nratio: RelMSE over that of the frame as rendered. deviation: RelMSE between the two results.\n\
+         Half buffers beside a frame are not used: nfor works on the frame alone.",
+        lines.concat()
+    )
 }
 
 /// Runs the trials.
