@@ -1,6 +1,10 @@
 //! The error type of the crate: one line that names the file, the pass or the tensor, and the remedy.
 
-use std::{fmt, io, path::PathBuf};
+use std::{
+    fmt, io,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
+};
 
 use crate::passes::Pass;
 
@@ -94,4 +98,15 @@ impl std::error::Error for Error {
             _ => None,
         }
     }
+}
+
+/// What `step` makes of the frame in a file. A defect that shows in one frame must not cost the results of all others: a panic
+/// becomes the failure of its file.
+///
+/// # Errors
+/// Those of `step`, or it panicked.
+pub fn attempt<T>(input: &Path, step: impl FnOnce() -> Result<T>) -> Result<T> {
+    catch_unwind(AssertUnwindSafe(step)).unwrap_or_else(|_| {
+        Err(Error::invalid(input, "an internal error stopped this frame; please report it with the file"))
+    })
 }

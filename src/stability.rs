@@ -3,16 +3,18 @@
 //! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene the result is
 //! scored against what the reference then is, and beside the result for the frame as it was rendered: `ratio` is its
 //! RelMSE over that one's, `deviation` the RelMSE between the two. A method that is indifferent to the change has a
-//! ratio of 1 and a deviation of 0.
+//! ratio of 1 and a deviation of 0. Methods see what is in the frame alone: half buffers that lie beside it, which do not have the
+//! change, are not used, not for the frame as it was rendered either.
 
 use std::path::Path;
 
 use crate::{
-    Result,
+    Error, Result,
+    error::attempt,
     metrics::{self, error::relmse},
     passes::{Pass, PassSet},
     planes::Planes,
-    report::{self, Loaded, Method, cell, geometric_mean, to_csv, write_file},
+    report::{self, Loaded, Method, append_row, cell, geometric_mean, to_csv, write_file},
     testset::Pair,
     train::Augment,
 };
@@ -78,6 +80,21 @@ impl Trial {
             Self::NonFinite => "non-finite",
             Self::ShiftedGuides => "shifted-guides",
             Self::BlankGuides => "blank-guides",
+        }
+    }
+
+    /// What it does, for a reader of its name.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            Self::AsRendered => "nothing changes: what the others are measured by",
+            Self::Darker => "radiance is a 256th",
+            Self::Brighter => "radiance is 256 times as high",
+            Self::Mirrored => "left and right change places",
+            Self::Cropped => "the frame begins 5 pixels further right and 3 further down",
+            Self::Fireflies => "one pixel in 1024 has 1000 times the mean radiance",
+            Self::NonFinite => "one pixel in 1024 of every pass is NaN or infinite",
+            Self::ShiftedGuides => "guides are 2 pixels further right than radiance",
+            Self::BlankGuides => "guides hold nothing",
         }
     }
 
@@ -187,14 +204,17 @@ pub struct Row {
     pub ratio: Option<f64>,
     /// RelMSE between this result and that for the frame as rendered.
     pub deviation: Option<f64>,
-    /// Why numbers are missing; empty where all is well.
+    /// Why the trial failed; empty where all is well.
     pub reason: String,
+    /// Why a number is missing where nothing failed.
+    pub note: String,
 }
 
 /// Columns of `stability.csv`.
-const COLUMNS: [&str; 8] = ["scene", "model", "spp", "trial", "relmse", "ratio", "deviation", "reason"];
+const COLUMNS: [&str; 9] =
+    ["scene", "model", "spp", "trial", "relmse", "ratio", "deviation", "reason", "note"];
 
-/// Columns of `stability_summary.csv`.
+/// Columns of `stability_summary.csv`; `scenes` are those that have a ratio.
 const SUMMARY_COLUMNS: [&str; 8] =
     ["model", "trial", "scenes", "failed", "ratio", "worst_ratio", "worst_scene", "worst_deviation"];
 
@@ -209,12 +229,13 @@ impl Row {
             cell(self.ratio),
             cell(self.deviation),
             self.reason.clone(),
+            self.note.clone(),
         ]
     }
 }
 
-/// Runs every trial of every method on every pair, tells each row, and writes `stability.csv` and
-/// `stability_summary.csv` into `out` at the end. A pair or method that fails has rows that say why.
+/// Runs every trial of every method on every pair. Each row is appended to `stability.csv` in `out`, then told;
+/// `stability_summary.csv` is written at the end. A pair or method that fails has rows that say why.
 ///
 /// # Errors
 /// The tables cannot be written.
@@ -225,65 +246,80 @@ pub fn run(
     out: &Path,
     on: &mut dyn FnMut(&Row),
 ) -> Result<Vec<Row>> {
-    std::fs::create_dir_all(out).map_err(crate::Error::io("create", out))?;
+    std::fs::create_dir_all(out).map_err(Error::io("create", out))?;
+    let table = out.join("stability.csv");
+    write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
     let mut rows = Vec::new();
     for pair in pairs {
-        let loaded = report::load(pair, view_layer);
+        let loaded = report::load_listed(pair, view_layer);
         for method in methods {
             let mut before = None;
             for trial in Trial::ALL {
-                let row = Row {
+                let mut row = Row {
                     scene: pair.label(),
                     model: method.name.clone(),
                     spp: pair.spp,
                     trial: trial.name(),
                     ..Row::default()
                 };
-                let tried = match &loaded {
-                    Ok(loaded) => attempt(trial, method, loaded, &mut before),
-                    Err(error) => Err(error.to_string()),
-                };
-                let row = match tried {
-                    Ok([relmse, ratio, deviation]) => Row { relmse, ratio, deviation, ..row },
-                    Err(reason) => Row { reason, ..row },
-                };
+                match &loaded {
+                    Ok(loaded) => {
+                        let measured =
+                            attempt(&pair.noisy, || measure(trial, method, loaded, &mut before, &mut row));
+                        row.reason = measured.err().map(|error| error.to_string()).unwrap_or_default();
+                    }
+                    Err(error) => row.reason = error.to_string(),
+                }
+                append_row(&table, &row.cells())?;
                 on(&row);
                 rows.push(row);
             }
         }
     }
-    write_file(&out.join("stability.csv"), to_csv(&COLUMNS, rows.iter().map(Row::cells)).as_bytes())?;
     let summary = summarise(&rows, methods);
     write_file(&out.join("stability_summary.csv"), to_csv(&SUMMARY_COLUMNS, &summary).as_bytes())?;
     Ok(rows)
 }
 
-/// RelMSE, ratio and deviation of one trial; `before` is the result for the frame as rendered, which the first
-/// trial leaves there.
-fn attempt(
+/// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial leaves there.
+fn measure(
     trial: Trial,
     method: &Method,
     loaded: &Loaded,
     before: &mut Option<Planes>,
-) -> std::result::Result<[Option<f64>; 3], String> {
+    row: &mut Row,
+) -> Result<()> {
+    let (width, height) = (loaded.noisy.width, loaded.noisy.height);
+    if trial == Trial::Cropped && (width <= CORNER.0 || height <= CORNER.1) {
+        row.note =
+            format!("skipped: {}x{} pixels less leave nothing of {width}x{height}", CORNER.0, CORNER.1);
+        return Ok(());
+    }
     let mut changed = trial.change(&loaded.passes);
     changed.sanitize();
-    let image = trial.undo(method.denoiser.denoise(&changed).map_err(|e| e.to_string())?);
+    // No longer the frame of that file: what lies beside it, such as half buffers, does not have the change.
+    changed.path.as_mut_os_string().push(format!(" ({})", trial.name()));
+    let image = trial.undo(method.denoiser.denoise(&changed)?);
     let reference = trial.seen(&loaded.reference);
-    metrics::check(&image, &reference).map_err(|why| why.to_string())?;
+    metrics::check(&image, &reference).map_err(|why| Error::invalid(&changed.path, why))?;
     let error = relmse(&image, &reference);
-    let (ratio, deviation) = match &*before {
-        _ if trial == Trial::AsRendered => (Some(1.0), Some(0.0)),
-        None => (None, None),
-        Some(before) => {
-            let before = trial.seen(before);
-            (Some(error / relmse(&before, &reference)), Some(relmse(&image, &before)))
-        }
-    };
+    row.relmse = Some(error);
     if trial == Trial::AsRendered {
+        (row.ratio, row.deviation) = (Some(1.0), Some(0.0));
         *before = Some(image);
+        return Ok(());
     }
-    Ok([Some(error), ratio, deviation])
+    let Some(before) = before else {
+        row.note = "no ratio, no deviation: there is no result for the frame as rendered".into();
+        return Ok(());
+    };
+    let before = trial.seen(before);
+    row.deviation = Some(relmse(&image, &before));
+    match relmse(&before, &reference) {
+        0.0 => row.note = "no ratio: the result for the frame as rendered is exact".into(),
+        before => row.ratio = Some(error / before),
+    }
+    Ok(())
 }
 
 /// A line for each method and trial.
@@ -301,7 +337,7 @@ fn summarise(rows: &[Row], methods: &[Method]) -> Vec<[String; SUMMARY_COLUMNS.l
             [
                 method.name.clone(),
                 trial.name().into(),
-                own().count().to_string(),
+                ratios.len().to_string(),
                 failed.to_string(),
                 cell(mean),
                 cell(worst.map(|(ratio, _)| *ratio)),
@@ -315,6 +351,7 @@ fn summarise(rows: &[Row], methods: &[Method]) -> Vec<[String; SUMMARY_COLUMNS.l
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::models::Denoiser;
 
     fn frame() -> PassSet {
         let mut passes = PassSet::new("test.exr", "ViewLayer", 64, 64);
@@ -341,6 +378,54 @@ mod tests {
             let kept = *albedo == trial.seen(before.get(Pass::DenoisingAlbedo).unwrap());
             let moved = [Trial::Mirrored, Trial::NonFinite, Trial::ShiftedGuides, Trial::BlankGuides];
             assert_eq!(kept, !moved.contains(&trial), "{}", trial.name());
+        }
+    }
+
+    /// Fails on fireflies as no method should.
+    struct Delicate;
+
+    impl Denoiser for Delicate {
+        fn name(&self) -> &str {
+            "delicate"
+        }
+
+        fn passes(&self) -> &[Pass] {
+            &[Pass::Combined]
+        }
+
+        fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+            assert!(!passes.path.ends_with("s0000_room_0004spp.exr (fireflies)"), "on purpose");
+            Ok(passes.require(Pass::Combined, "delicate")?.clone())
+        }
+    }
+
+    #[test]
+    fn rows_are_stored_as_they_finish_and_a_panic_costs_one() {
+        let out = tempfile::tempdir().unwrap();
+        let frame = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/s0000_room_0004spp.exr");
+        let pairs = crate::testset::read(frame).unwrap().pairs;
+        let method = Method {
+            name: "delicate".into(),
+            denoiser: Box::new(Delicate),
+            peak_mib: Box::new(|_| None),
+            stamp: String::new(),
+        };
+        let mut told = 0;
+        let rows = run(&pairs, &[method], None, out.path(), &mut |row| {
+            told += 1;
+            let text = std::fs::read_to_string(out.path().join("stability.csv")).unwrap();
+            assert_eq!(text.lines().count(), 1 + told);
+            assert!(text.lines().last().unwrap().contains(row.trial), "{text}");
+        })
+        .unwrap();
+        assert_eq!((rows.len(), told), (Trial::ALL.len(), Trial::ALL.len()));
+        for row in rows {
+            let failed = row.trial == Trial::Fireflies.name();
+            assert_eq!(
+                (row.relmse.is_none(), row.reason.contains("internal error")),
+                (failed, failed),
+                "{row:?}"
+            );
         }
     }
 

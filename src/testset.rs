@@ -6,7 +6,7 @@
 //! relative to itself. Only names are looked at; no image is opened.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, HashMap},
     fmt,
     path::{Path, PathBuf},
 };
@@ -39,6 +39,13 @@ impl Pair {
         }
     }
 
+    /// What to say where there is no reference.
+    pub fn no_reference(&self) -> Error {
+        let wanted = self.reference.display();
+        let remedy = "render it, or take the noisy file out of the set";
+        Error::invalid(&self.noisy, format!("no reference: {wanted} is missing; {remedy}"))
+    }
+
     /// A name that is unique in its test set: `bathroom_0004spp`, `shot_0004spp.0017`.
     pub fn id(&self) -> String {
         let frame = self.frame.as_ref().map(|f| format!(".{f}")).unwrap_or_default();
@@ -49,13 +56,8 @@ impl Pair {
 /// A file of a test set that cannot be scored, and what it lacks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Unmatched {
-    /// A noisy render; the reference it lacks.
-    Noisy {
-        /// The noisy file.
-        path: PathBuf,
-        /// The reference looked for.
-        wanted: PathBuf,
-    },
+    /// A noisy render, with the reference that was looked for.
+    Noisy(Pair),
     /// A reference that no noisy render goes with.
     Reference(PathBuf),
 }
@@ -63,12 +65,7 @@ pub enum Unmatched {
 impl fmt::Display for Unmatched {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Noisy { path, wanted } => write!(
-                f,
-                "{}: no reference: {} is missing; render it, or take the noisy file out of the set",
-                path.display(),
-                wanted.display()
-            ),
+            Self::Noisy(pair) => pair.no_reference().fmt(f),
             Self::Reference(path) => write!(
                 f,
                 "{}: reference without a noisy render named <scene>_<spp>spp.exr beside it",
@@ -87,22 +84,10 @@ pub struct TestSet {
     pub unmatched: Vec<Unmatched>,
 }
 
-/// The pairs of `spec`; a file without its counterpart is named in a warning on stderr.
-///
-/// # Errors
-/// As [`read`].
-pub fn pairs(spec: &str) -> Result<Vec<Pair>> {
-    let set = read(spec)?;
-    for unmatched in &set.unmatched {
-        eprintln!("warning: {unmatched}");
-    }
-    Ok(set.pairs)
-}
-
 /// The test set that `spec` (directory, manifest, glob or one EXR file) names.
 ///
 /// A glob or a file picks noisy renders, references or both; a reference that it leaves out is looked for
-/// beside its noisy render.
+/// beside its noisy render. Directories and globs pass over hidden files.
 ///
 /// # Errors
 /// Nothing is there, the manifest is malformed, or no pair is complete.
@@ -114,7 +99,7 @@ pub fn read(spec: &str) -> Result<TestSet> {
             .map(|entry| entry.map(|e| e.path()))
             .collect::<Result<Vec<_>, _>>()
             .map_err(Error::io("read", path))?;
-        match_files(files.into_iter().filter(|f| f.is_file()), true)
+        match_files(files.into_iter().filter(|f| f.is_file() && !is_hidden(f)), true)
     } else if path.is_file() && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
         match_files([path.to_path_buf()], false)
     } else if path.is_file() {
@@ -128,7 +113,9 @@ pub fn read(spec: &str) -> Result<TestSet> {
                 let path = e.path().to_path_buf();
                 Error::io("read", path)(e.into())
             })?;
-            files.push(file);
+            if !is_hidden(&file) {
+                files.push(file);
+            }
         }
         if files.is_empty() {
             return Err(Error::Usage(format!(
@@ -149,6 +136,11 @@ pub fn read(spec: &str) -> Result<TestSet> {
         return Err(Error::Usage(format!("no render pair in '{spec}': {hint}")));
     }
     Ok(set)
+}
+
+/// Whether a file is other programs' own, such as the `._room_0004spp.exr` that macOS leaves beside a file it copied.
+fn is_hidden(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'))
 }
 
 /// What a file name says about a render.
@@ -207,13 +199,10 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
         let wanted = directory.join(format!("{scene}_ref{suffix}.exr"));
         let key = (directory, scene.clone(), frame.clone());
         let reference = references.get(&key).cloned().or_else(|| wanted.is_file().then(|| wanted.clone()));
-        match reference {
-            Some(reference) => {
-                used.insert(reference.clone());
-                set.pairs.push(Pair { scene, noisy: path, reference, spp, frame });
-            }
-            None => set.unmatched.push(Unmatched::Noisy { path, wanted }),
-        }
+        used.extend(reference.clone());
+        let is_complete = reference.is_some();
+        let pair = Pair { scene, noisy: path, reference: reference.unwrap_or(wanted), spp, frame };
+        set.add(pair, is_complete);
     }
     if report_references {
         let unused = references.into_values().filter(|r| !used.contains(r));
@@ -224,16 +213,39 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
 }
 
 impl TestSet {
-    fn sort(&mut self) {
-        // Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
-        self.pairs.sort_by_cached_key(|p| {
-            let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
-            (p.scene.clone(), number, p.spp, p.noisy.clone())
+    /// Every noisy render, sorted as the pairs are: with those without their reference, which a table must not hide.
+    pub fn all_noisy(&self) -> Vec<Pair> {
+        let lacking = self.unmatched.iter().filter_map(|unmatched| match unmatched {
+            Unmatched::Noisy(pair) => Some(pair),
+            Unmatched::Reference(_) => None,
         });
+        let mut pairs: Vec<Pair> = self.pairs.iter().chain(lacking).cloned().collect();
+        sort(&mut pairs);
+        pairs
+    }
+
+    fn add(&mut self, pair: Pair, is_complete: bool) {
+        if is_complete {
+            self.pairs.push(pair);
+        } else {
+            self.unmatched.push(Unmatched::Noisy(pair));
+        }
+    }
+
+    fn sort(&mut self) {
+        sort(&mut self.pairs);
         self.unmatched.sort_by_cached_key(|u| match u {
-            Unmatched::Noisy { path, .. } | Unmatched::Reference(path) => path.clone(),
+            Unmatched::Noisy(Pair { noisy: path, .. }) | Unmatched::Reference(path) => path.clone(),
         });
     }
+}
+
+/// Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
+fn sort(pairs: &mut [Pair]) {
+    pairs.sort_by_cached_key(|p| {
+        let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
+        (p.scene.clone(), number, p.spp, p.noisy.clone())
+    });
 }
 
 /// A row of a manifest.
@@ -246,7 +258,8 @@ struct Row {
 }
 
 /// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
-/// the reference; a noisy file that is missing is kept, so that the row fails where it is read.
+/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines with the
+/// same files are an error: reports know a pair by its files, and would have rows for one of the two.
 fn manifest(path: &Path) -> Result<TestSet> {
     let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
     let mut reader = csv::ReaderBuilder::new()
@@ -256,6 +269,7 @@ fn manifest(path: &Path) -> Result<TestSet> {
         .map_err(|e| Error::invalid(path, format!("cannot read the manifest: {e}; {remedy}")))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     let mut set = TestSet::default();
+    let mut seen = HashMap::new();
     for row in reader.deserialize::<Row>() {
         let row = row.map_err(|e| Error::invalid(path, format!("{e}; {remedy}")))?;
         let frame = row
@@ -265,11 +279,17 @@ fn manifest(path: &Path) -> Result<TestSet> {
             .and_then(parse_name)
             .and_then(|n| n.frame.map(str::to_string));
         let (noisy, reference) = (directory.join(&row.noisy), directory.join(&row.reference));
-        if reference.is_file() {
-            set.pairs.push(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame });
-        } else {
-            set.unmatched.push(Unmatched::Noisy { path: noisy, wanted: reference });
+        if let Some(before) = seen.insert((noisy.clone(), reference.clone()), row.scene.clone()) {
+            return Err(Error::Usage(format!(
+                "{}: '{}' lists the same two files as '{before}' before it: {} and {}; take one of the lines out",
+                path.display(),
+                row.scene,
+                noisy.display(),
+                reference.display()
+            )));
         }
+        let is_complete = reference.is_file();
+        set.add(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame }, is_complete);
     }
     set.sort();
     Ok(set)
@@ -349,6 +369,8 @@ mod tests {
         assert!(lines[1].contains("c_ref.exr"), "{}", lines[1]);
         assert!(lines[2].contains("d_ref.0001.exr"), "a still reference is not a frame's: {}", lines[2]);
         assert!(lines[3].contains("d_ref.exr"), "{}", lines[3]);
+        let all: Vec<_> = set.all_noisy().iter().map(Pair::id).collect();
+        assert_eq!(all, ["a_0004spp", "b_0004spp", "d_0004spp.0001"]);
     }
 
     #[test]
@@ -371,6 +393,16 @@ mod tests {
     }
 
     #[test]
+    fn hidden_files_are_passed_over() {
+        let dir = folder(&["a_0004spp.exr", "a_ref.exr", "._a_0004spp.exr", "._a_ref.exr", ".b_0004spp.exr"]);
+        for pattern in ["", "*_0004spp.exr", "*.exr"] {
+            let set = read(dir.path().join(pattern).to_str().unwrap()).unwrap();
+            assert_eq!(ids(&set), ["a_0004spp"], "'{pattern}'");
+            assert!(set.unmatched.is_empty(), "'{pattern}': {:?}", set.unmatched);
+        }
+    }
+
+    #[test]
     fn manifest_paths_are_relative_to_it() {
         let dir = folder(&["x.exr", "y.exr", "s_0008spp.0002.exr"]);
         let file = dir.path().join("set.csv");
@@ -380,6 +412,29 @@ mod tests {
         assert_eq!(ids(&set), ["s_0008spp.0002", "z_0004spp"]);
         assert_eq!(set.pairs[1].noisy, dir.path().join("x.exr"));
         assert!(set.unmatched[0].to_string().contains("gone.exr"));
+    }
+
+    #[test]
+    fn files_listed_twice_are_an_error_that_names_both_scenes() {
+        let dir = folder(&["x.exr", "y.exr", "z.exr"]);
+        let file = dir.path().join("set.csv");
+        let list = |lines: &str| {
+            std::fs::write(&file, format!("scene,noisy,reference,spp\n{lines}")).unwrap();
+            read(file.to_str().unwrap())
+        };
+        for twice in
+            ["a,x.exr,y.exr,4\n# comment\nb,./x.exr,y.exr,8\n", "a,x.exr,gone.exr,4\n\nb,x.exr,gone.exr,4\n"]
+        {
+            let Err(Error::Usage(message)) = list(twice) else { panic!("{twice}") };
+            for part in ["set.csv: 'b'", "as 'a'", "x.exr", "take one"] {
+                assert!(message.contains(part), "{message}");
+            }
+        }
+        assert_eq!(
+            list("a,x.exr,y.exr,4\na,z.exr,y.exr,4\n").unwrap().pairs.len(),
+            2,
+            "one reference for two"
+        );
     }
 
     #[test]

@@ -98,7 +98,7 @@ fn exports_every_pass_with_the_averaged_position_and_resumes() {
     );
     assert_eq!(fs::read(&blend).unwrap(), before, "the scene is never saved");
 
-    let pairs = testset::pairs(out.to_str().unwrap()).unwrap();
+    let pairs = testset::read(out.to_str().unwrap()).unwrap().pairs;
     assert_eq!(pairs.iter().map(|p| p.id()).collect::<Vec<_>>(), ["shot_0004spp", "shot_0008spp"]);
 
     let noisy = passes::load(out.join("shot_0004spp.exr"), None).unwrap();
@@ -242,9 +242,9 @@ fn generates_the_same_pixels_for_the_same_seed() {
     }
 
     // The folder holds a pair a crop; the manifest knows the second noisy render of each too.
-    let pairs = testset::pairs(first.to_str().unwrap()).unwrap();
+    let pairs = testset::read(first.to_str().unwrap()).unwrap().pairs;
     assert_eq!(pairs.len(), 4);
-    assert_eq!(testset::pairs(first.join("manifest.csv").to_str().unwrap()).unwrap().len(), 8);
+    assert_eq!(testset::read(first.join("manifest.csv").to_str().unwrap()).unwrap().pairs.len(), 8);
     for pair in &pairs {
         let noisy = passes::load(&pair.noisy, None).unwrap();
         let reference = passes::load(&pair.reference, None).unwrap();
@@ -271,7 +271,8 @@ fn guides_alone_are_the_guides_of_whole_renders() {
         let out = folder.path().join(format!("{kind}{more}"));
         let arguments = format!("--seeds 7:8 --kinds {kind} --size 40 --ref-spp 8 --ref-noise 0 {more}");
         generate(&out, &arguments);
-        let [pair] = testset::pairs(out.to_str().unwrap()).unwrap().try_into().expect("one crop is one pair");
+        let [pair] =
+            testset::read(out.to_str().unwrap()).unwrap().pairs.try_into().expect("one crop is one pair");
         [&pair.noisy, &pair.reference].map(|path| passes::load(path, None).unwrap())
     };
     for kind in ["glass", "materials"] {

@@ -7,7 +7,7 @@ use std::{fs, path::Path};
 use assert_cmd::assert::Assert;
 use common::{
     demc,
-    files::data,
+    files::{data, write_render},
     python,
     tables::{Row, table},
 };
@@ -139,8 +139,12 @@ fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
             .and(predicate::str::contains("cut_0004spp.exr")),
     );
     let rows = table(&out.path().join("scores.csv"));
-    assert_eq!(rows.len(), 3);
-    for (scene, reason) in [("cut", "cut_0004spp.exr"), ("small", "image 128x128, reference 64x64")] {
+    assert_eq!(rows.len(), 4);
+    for (scene, reason) in [
+        ("cut", "cut_0004spp.exr"),
+        ("small", "holds 128x128 pixels at 0,0, its reference"),
+        ("lonely", "lonely_ref.exr is missing; render it"),
+    ] {
         let row = row(&rows, scene, "noisy");
         assert!(row["reason"].contains(reason), "{}", row["reason"]);
         for metric in ["relmse", "ssim", "rmse", "max_error", "seconds", "exposure"] {
@@ -149,8 +153,36 @@ fn failing_scenes_leave_empty_cells_a_reason_and_exit_code_1() {
     }
     assert_ne!(row(&rows, "good", "noisy")["relmse"], "");
     let summary = table(&out.path().join("summary.csv"));
-    assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "2"));
+    assert_eq!((summary[0]["scenes"].as_str(), summary[0]["failed"].as_str()), ("1", "3"));
     assert!(!out.path().join("sheets/cut_0004spp.png").exists());
+}
+
+#[test]
+fn a_score_that_is_not_defined_is_an_empty_cell_with_a_note_and_no_failure() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (scene, size, light) in [("black", 16, 0.0), ("small", 8, 0.5)] {
+        let noisy =
+            |name: &str, at: usize| if name.starts_with("Combined") { 0.4 + (at % 7) as f32 } else { 1.0 };
+        write_render(&set.path().join(format!("{scene}_0004spp.exr")), size, size, noisy);
+        write_render(&set.path().join(format!("{scene}_ref.exr")), size, size, |_, _| light);
+    }
+    let run = || eval(set.path(), out.path(), &["--models", "noisy"]).success();
+    run().stderr(predicate::str::contains("note: small_0004spp: no ssim"));
+    let rows = table(&out.path().join("scores.csv"));
+    for (scene, empty, note) in [
+        ("black", &["ssim", "exposure", "flip"][..], "no ssim, exposure, flip: the reference is black"),
+        ("small", &["ssim"], "no ssim: the images are smaller than its window of 11x11"),
+    ] {
+        let row = row(&rows, scene, "noisy");
+        for metric in ["relmse", "ssim", "rmse", "max_error", "exposure", "smape", "flip"] {
+            assert_eq!(row[metric].is_empty(), empty.contains(&metric), "{scene} {metric}");
+        }
+        assert_eq!(row["reason"], "");
+        assert!(row["note"].starts_with(&format!("{scene}_0004spp: {note}")), "{}", row["note"]);
+    }
+    let page = fs::read_to_string(out.path().join("report.html")).unwrap();
+    assert!(page.contains("the reference is black") && !page.contains("rows failed"));
+    run().stderr(predicate::str::contains("2 of 2 rows are there already"));
 }
 
 #[test]
@@ -196,7 +228,55 @@ fn finished_rows_are_kept_and_missing_ones_run() {
     eval(&data(""), out.path(), &["--models", "noisy", "--threads", "1", "--overwrite"])
         .success()
         .stderr(predicate::str::contains("already").not());
-    assert_eq!(table(&scores).len(), 2);
+    let after = table(&scores);
+    assert_eq!(
+        after.iter().map(|r| &r["model"][..]).collect::<Vec<_>>(),
+        ["noisy", "noisy", "oidn-fast", "oidn-fast"]
+    );
+    let fast = |rows: &[Row]| rows.iter().filter(|r| r["model"] == "oidn-fast").cloned().collect::<Vec<_>>();
+    assert_eq!(fast(&after), fast(&rows), "rows that were not asked for are as they were");
+}
+
+#[test]
+fn rows_of_other_methods_and_renders_stay_as_long_as_they_hold() {
+    let out = tempfile::tempdir().unwrap();
+    let run = |set: &str, models: &str, threads: &str| {
+        eval(&data(set), out.path(), &["--models", models, "--no-sheets", "--threads", threads]).success()
+    };
+    let [meadow, room] = ["s0010_outdoor_0004spp.exr", "s0000_room_0004spp.exr"];
+    let read = |file: &str| fs::read_to_string(out.path().join(file)).unwrap();
+    run(meadow, "demc-s", "2");
+    let first = read("scores.csv");
+    run(room, "noisy", "2").stderr(predicate::str::contains("dropped").not());
+    let second = read("scores.csv");
+    assert_eq!(second.lines().count(), 4);
+    assert!(first.lines().all(|line| second.lines().any(|other| other == line)), "{first}{second}");
+    assert_eq!(table(&out.path().join("summary.csv")).len(), 1, "this run's methods");
+    let page = read("report.html");
+    assert!(page.contains("s0000_room") && !page.contains("demc-s") && !page.contains("s0010_outdoor"));
+    // What the rows are known by stays too.
+    run(meadow, "demc-s", "2").stderr(predicate::str::contains("2 of 2 rows are there already"));
+    run(room, "noisy", "2").stderr(predicate::str::contains("1 of 1 rows are there already"));
+    // Rows made with other settings do not belong into one table.
+    run(room, "noisy", "1")
+        .stderr(predicate::str::contains("2 rows of other methods or renders are dropped"));
+    assert_eq!(table(&out.path().join("scores.csv")).len(), 1);
+}
+
+#[test]
+fn a_sheet_shows_the_methods_of_the_last_run() {
+    let out = tempfile::tempdir().unwrap();
+    let sheet = out.path().join("sheets/s0010_outdoor_0004spp.png");
+    let columns = |models: &str| {
+        eval(&data("s0010_outdoor_0004spp.exr"), out.path(), &["--models", models]).success();
+        (image::open(&sheet).unwrap().width() - 6) / 306
+    };
+    assert_eq!((columns("demc-s"), columns("noisy")), (3, 2), "methods and the reference");
+    assert_eq!(columns("demc-s"), 3, "though all rows were there already");
+    let changed = || fs::metadata(&sheet).unwrap().modified().unwrap();
+    let before = changed();
+    columns("demc-s");
+    assert_eq!(changed(), before, "it shows them already");
 }
 
 #[test]
@@ -324,7 +404,7 @@ fn a_reference_of_another_scene_is_scored_and_said_to_be_one() {
         .stderr(predicate::str::contains("note: swapped_0004spp: ").and(predicate::str::contains(said)))
         .stderr(predicate::str::contains("good_0004spp: ").not());
     assert!(table(&out.path().join("scores.csv")).iter().all(|row| !row["relmse"].is_empty()));
-    for file in ["run.json", "report.html"] {
+    for file in ["scores.csv", "report.html"] {
         assert_eq!(fs::read_to_string(out.path().join(file)).unwrap().matches(said).count(), 1, "{file}");
     }
 }

@@ -6,7 +6,7 @@ use std::fs;
 
 use common::{
     demc,
-    files::data,
+    files::{data, write_render},
     tables::{Row, table},
 };
 use predicates::prelude::*;
@@ -58,7 +58,7 @@ fn tells_what_changes_results_and_what_does_not() {
     }
 }
 
-/// A frame that cannot be read has rows without numbers and with a reason; the others go on.
+/// A frame that cannot be read, or whose reference is missing, has rows without numbers and with a reason; the others go on.
 #[test]
 fn one_bad_frame_does_not_stop_the_others() {
     let folder = tempfile::tempdir().unwrap();
@@ -69,6 +69,7 @@ fn one_bad_frame_does_not_stop_the_others() {
     }
     fs::copy(data("s0000_room_ref.exr"), set.join("cut_ref.exr")).unwrap();
     fs::write(set.join("cut_0004spp.exr"), b"no frame").unwrap();
+    fs::copy(data("s0000_room_0004spp.exr"), set.join("lonely_0004spp.exr")).unwrap();
     let out = folder.path().join("out");
     demc()
         .args(["stability", "--models", "noisy", "--test-set"])
@@ -80,9 +81,82 @@ fn one_bad_frame_does_not_stop_the_others() {
         .stderr(predicate::str::contains("stability.csv"));
     let rows = table(&out.join("stability.csv"));
     let failed: Vec<&Row> = rows.iter().filter(|row| !row["reason"].is_empty()).collect();
-    assert_eq!((rows.len(), failed.len()), (18, 9));
+    assert_eq!((rows.len(), failed.len()), (27, 18));
     for row in failed {
-        assert!(row["scene"] == "cut" && row["relmse"].is_empty() && row["ratio"].is_empty(), "{row:?}");
-        assert!(row["reason"].contains("cut_0004spp.exr"), "{row:?}");
+        assert!(row["relmse"].is_empty() && row["ratio"].is_empty(), "{row:?}");
+        let why = if row["scene"] == "cut" { "cut_0004spp.exr" } else { "lonely_ref.exr is missing" };
+        assert!(row["reason"].contains(why), "{row:?}");
+    }
+}
+
+/// A frame that a trial leaves nothing of, and one whose result is exact: no failures, and no made-up numbers.
+#[test]
+fn what_cannot_be_told_is_an_empty_cell_with_a_note() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (scene, (width, height), light) in [("small", (5, 3), 0.25), ("exact", (40, 40), 0.5)] {
+        let path = |kind: &str| set.path().join(format!("{scene}_{kind}.exr"));
+        write_render(&path("0004spp"), width, height, |_, _| 0.5);
+        write_render(&path("ref"), width, height, |_, _| light);
+    }
+    demc()
+        .args(["stability", "--models", "noisy", "--test-set"])
+        .arg(set.path())
+        .arg("--out")
+        .arg(out.path())
+        .assert()
+        .success()
+        .stderr(predicate::str::contains("cropped: skipped"));
+    let rows = table(&out.path().join("stability.csv"));
+    assert_eq!(rows.len(), 2 * 9);
+    for row in &rows {
+        let empty = match (&row["scene"][..], &row["trial"][..]) {
+            ("small", "cropped") => &["relmse", "ratio", "deviation"][..],
+            ("exact", trial) if trial != "as-rendered" => &["ratio"],
+            _ => &[],
+        };
+        for column in ["relmse", "ratio", "deviation"] {
+            assert_eq!(row[column].is_empty(), empty.contains(&column), "{column} of {row:?}");
+            assert!(row[column].is_empty() || value(row, column).is_finite(), "{column} of {row:?}");
+        }
+        assert_eq!((row["reason"].is_empty(), row["note"].is_empty()), (true, empty.is_empty()), "{row:?}");
+    }
+    let summary = table(&out.path().join("stability_summary.csv"));
+    let scenes = |trial: &str| &summary.iter().find(|line| line["trial"] == trial).unwrap()["scenes"][..];
+    assert_eq!([scenes("as-rendered"), scenes("darker"), scenes("cropped")], ["2", "1", "0"]);
+}
+
+/// Half buffers on disk do not have the change: NFOR must not denoise them in place of the changed frame.
+#[test]
+fn half_buffers_beside_a_frame_do_not_stand_in_for_it() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (from, to) in
+        [("0004spp", "0004spp"), ("0004spp", "0004spp_a"), ("0004spp", "0004spp_b"), ("ref", "ref")]
+    {
+        let name = |kind: &str| format!("s0010_outdoor_{kind}.exr");
+        fs::copy(data(&name(from)), set.path().join(name(to))).unwrap();
+    }
+    demc()
+        .args(["stability", "--models", "nfor", "--test-set"])
+        .arg(set.path())
+        .arg("--out")
+        .arg(out.path())
+        .assert()
+        .success();
+    let rows = table(&out.path().join("stability.csv"));
+    for row in rows.iter().filter(|row| row["model"] == "nfor") {
+        match &row["trial"][..] {
+            "as-rendered" => {}
+            "darker" | "brighter" => assert!((value(row, "ratio") - 1.0).abs() < 0.01, "{row:?}"),
+            _ => assert!(value(row, "deviation") > 0.0, "{row:?}"),
+        }
+    }
+}
+
+#[test]
+fn help_says_what_each_trial_does() {
+    let help = demc().args(["stability", "--help"]).assert().success();
+    let text = String::from_utf8(help.get_output().stdout.clone()).unwrap();
+    for trial in demc::stability::Trial::ALL {
+        assert!(text.contains(trial.name()) && text.contains(trial.meaning()), "{text}");
     }
 }

@@ -5,11 +5,10 @@ use std::{collections::HashSet, io::IsTerminal, path::PathBuf, process::ExitCode
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::methods;
+use super::{methods, print_line, warn_line};
 use crate::{
     Error, Result,
     report::{self, Event, Method, Options, Row},
-    testset,
 };
 
 /// Arguments of `demc eval`.
@@ -17,7 +16,8 @@ use crate::{
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets
+    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets. Rows of earlier runs into it stay in
+    /// scores.csv as long as they hold, and are not run again
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Method that the summary's ratios refer to [default: the first of --models]
@@ -29,7 +29,7 @@ pub struct Args {
     /// Write no comparison sheets
     #[arg(long)]
     no_sheets: bool,
-    /// Run everything anew instead of keeping finished rows
+    /// Run all that is asked for anew, finished rows too; rows of other methods and renders stay as without it
     #[arg(long)]
     overwrite: bool,
 }
@@ -39,11 +39,10 @@ pub struct Args {
 /// # Errors
 /// The test set or a method does not exist, or the output folder cannot be written.
 pub fn run(args: Args) -> Result<ExitCode> {
-    let set = testset::read(&args.asked.test_set)?;
+    let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let threads = args.asked.threads();
     let methods = args.asked.methods()?;
     let baseline = baseline(&args, &methods)?;
-    let mut failed = methods::tell_unmatched(&set);
     let options = Options {
         out: args.out,
         repeats: args.repeats.into(),
@@ -55,12 +54,12 @@ pub fn run(args: Args) -> Result<ExitCode> {
     };
     let pool = methods::pool(threads)?;
     let mut progress = Progress::new();
-    let rows = pool
-        .install(|| report::evaluate(&set.pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
+    let rows =
+        pool.install(|| report::evaluate(&pairs, &methods, &options, &mut |event| progress.tell(&event)))?;
     progress.finish();
-    failed += rows.iter().filter(|row| !row.reason.is_empty()).count();
+    let failed = rows.iter().filter(|row| !row.reason.is_empty()).count();
     for file in ["summary.csv", "report.html"] {
-        println!("{}", options.out.join(file).display());
+        print_line(&options.out.join(file).display().to_string());
     }
     Ok(methods::finish(failed, &options.out.join("scores.csv")))
 }
@@ -100,7 +99,9 @@ impl Progress {
             Event::Start { rows, kept } => {
                 (self.rows, self.done) = (*rows, *kept);
                 if *kept > 0 {
-                    eprintln!("{kept} of {rows} rows are there already (--overwrite runs them anew)");
+                    warn_line(&format!(
+                        "{kept} of {rows} rows are there already (--overwrite runs them anew)"
+                    ));
                 }
                 if std::io::stderr().is_terminal() {
                     let style =
@@ -120,7 +121,7 @@ impl Progress {
                 if self.told.insert((*note).to_owned()) {
                     match &self.bar {
                         Some(bar) => bar.println(format!("note: {note}")),
-                        None => eprintln!("note: {note}"),
+                        None => warn_line(&format!("note: {note}")),
                     }
                 }
             }
@@ -133,7 +134,7 @@ impl Progress {
                         bar.println(line);
                         bar.inc(1);
                     }
-                    None => eprintln!("{line}"),
+                    None => warn_line(&line),
                 }
             }
         }

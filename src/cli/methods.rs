@@ -8,12 +8,12 @@ use std::{
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, peak_memory};
+use super::{SOME_FAILED, peak_memory, warn_line};
 use crate::{
     Error, Result,
     models::{self, Denoiser, oidn::Oidn},
     report::{self, Method, NOISY},
-    testset::{TestSet, Unmatched},
+    testset::{self, Pair, Unmatched},
 };
 
 /// Arguments that both have.
@@ -97,15 +97,17 @@ fn is_file(name: &str) -> bool {
     Path::new(name).is_file()
 }
 
-/// Says which files of a test set have no counterpart. Returns how many frames so go unscored.
-pub fn tell_unmatched(set: &TestSet) -> usize {
-    for unmatched in &set.unmatched {
-        match unmatched {
-            Unmatched::Noisy { .. } => eprintln!("demc: {unmatched}"),
-            Unmatched::Reference(_) => eprintln!("warning: {unmatched}"),
-        }
+/// The noisy renders of a test set. References that go with none are named on stderr; renders without their reference have
+/// rows that say so.
+///
+/// # Errors
+/// As [`testset::read`].
+pub fn noisy_renders(spec: &str) -> Result<Vec<Pair>> {
+    let set = testset::read(spec)?;
+    for unmatched in set.unmatched.iter().filter(|unmatched| matches!(unmatched, Unmatched::Reference(_))) {
+        warn_line(&format!("warning: {unmatched}"));
     }
-    set.unmatched.iter().filter(|unmatched| matches!(unmatched, Unmatched::Noisy { .. })).count()
+    Ok(set.all_noisy())
 }
 
 /// That many threads.
@@ -119,11 +121,11 @@ pub fn pool(count: usize) -> Result<rayon::ThreadPool> {
         .map_err(|e| Error::Usage(format!("cannot start {count} threads: {e}; use fewer")))
 }
 
-/// Says how many rows or frames failed, and which table says why; the exit status that goes with it.
+/// Says how many rows failed, and which table says why; the exit status that goes with it.
 pub fn finish(failed: usize, table: &Path) -> ExitCode {
     if failed == 0 {
         return ExitCode::SUCCESS;
     }
-    eprintln!("demc: {failed} failed; {} says why", table.display());
+    warn_line(&format!("demc: {failed} failed; {} says why", table.display()));
     ExitCode::from(SOME_FAILED)
 }

@@ -1,5 +1,8 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
+// They panic where nobody reads any more: see `print_line`.
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod compare;
 mod denoise;
 mod eval;

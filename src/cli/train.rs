@@ -14,6 +14,7 @@ use std::{
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::warn_line;
 use crate::{
     Error, Result,
     frame::Frame,
@@ -139,11 +140,13 @@ fn usage(message: impl Into<String>) -> Error {
     Error::Usage(message.into())
 }
 
-/// All pairs of several test sets.
+/// All pairs of several test sets; a file without its counterpart is named.
 fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     let mut pairs = Vec::new();
     for spec in specs {
-        pairs.extend(testset::pairs(spec)?);
+        let set = testset::read(spec)?;
+        set.unmatched.iter().for_each(|unmatched| warn_line(&format!("warning: {unmatched}")));
+        pairs.extend(set.pairs);
     }
     Ok(pairs)
 }
@@ -255,10 +258,10 @@ impl Args {
             ));
         }
         if network.architecture == Architecture::Kpcn && !has_light_passes(&training[0])? {
-            eprintln!(
+            warn_line(&format!(
                 "note: {} holds no diffuse light passes: kpcn is trained on Combined, as kpcn-combined",
                 training[0].noisy.display()
-            );
+            ));
             network.architecture = Architecture::KpcnCombined;
         }
         Ok(Options {
@@ -303,14 +306,14 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
         args.options()?
     };
-    eprintln!(
+    warn_line(&format!(
         "{} pairs to train on, {} to validate on; {} steps of {} crops of up to {p}x{p}",
         options.train.len(),
         options.validation.len(),
         options.steps,
         options.batch,
         p = options.patch
-    );
+    ));
 
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
@@ -322,7 +325,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {per_sec} eta {eta} loss {msg}");
     bar.set_style(style.expect("the template is well formed"));
     let mut on = |event| match event {
-        Event::Warning(warning) => bar.suspend(|| eprintln!("warning: {warning}")),
+        Event::Warning(warning) => bar.suspend(|| warn_line(&format!("warning: {warning}"))),
         Event::Step { step, loss } => {
             bar.set_position(step as u64);
             bar.set_message(format!("{loss:.4}"));
@@ -331,7 +334,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             let Some(row) = rows.last() else { return };
             // A chart that cannot be drawn is no reason to lose a run.
             if let Err(e) = report::loss_chart(&args.out.join("loss.png"), &rows) {
-                bar.suspend(|| eprintln!("demc: {e}"));
+                bar.suspend(|| warn_line(&format!("demc: {e}")));
             }
             let optional = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
             let (relmse, ssim) = (optional(row.val_relmse), optional(row.val_ssim));
@@ -339,13 +342,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 "step {} after {:.0} s: loss {:.4}, validation RelMSE {relmse}, SSIM {ssim}",
                 row.step, row.seconds, row.train_loss
             );
-            bar.suspend(|| eprintln!("{line}"));
+            bar.suspend(|| warn_line(&line));
         }
     };
     match train::run(&options, &args.out, args.resume, &stop, &mut on) {
         Err(Error::Interrupted) => {
             let out = args.out.display();
-            eprintln!("stopped; go on with: demc train --out {out} --resume");
+            warn_line(&format!("stopped; go on with: demc train --out {out} --resume"));
             Ok(ExitCode::from(super::stop::INTERRUPTED))
         }
         other => other.map(|()| ExitCode::SUCCESS),

@@ -2,8 +2,9 @@
 //!
 //! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
 //! `summary.csv`, the charts `speed_vs_accuracy`, `bars_relmse` and `bars_ssim` as PNG and SVG,
-//! `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish; the
-//! same command run again keeps those that still hold.
+//! `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish;
+//! those of earlier runs into the folder stay in `scores.csv` as long as they hold, and are not run again. All else shows what
+//! this run asked for.
 
 mod axis;
 mod bars;
@@ -25,8 +26,8 @@ mod summary;
 use std::path::{Path, PathBuf};
 
 pub use loss::loss_chart;
-pub use rows::{COLUMNS, Row, read_rows, to_csv, write_file};
-pub use run::{Event, Loaded, evaluate, load};
+pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
+pub use run::{Event, Loaded, evaluate, load, load_listed};
 pub use settings::file_stamp;
 pub use summary::{Method as MethodSummary, geometric_mean, summarise};
 
@@ -63,7 +64,7 @@ pub struct Options {
     pub baseline: String,
     /// View layer to read; by default the one with the most passes.
     pub view_layer: Option<String>,
-    /// Run everything anew.
+    /// Run everything that is asked for anew.
     pub overwrite: bool,
     /// Write a comparison sheet for each pair.
     pub sheets: bool,

@@ -13,7 +13,7 @@ use super::cell;
 use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
-pub const COLUMNS: [&str; 22] = [
+pub const COLUMNS: [&str; 23] = [
     "scene",
     "model",
     "spp",
@@ -36,6 +36,7 @@ pub const COLUMNS: [&str; 22] = [
     "noisy",
     "reference",
     "reason",
+    "note",
 ];
 
 /// What one method scored on one pair. A number that could not be measured is none; `reason` says why.
@@ -83,8 +84,12 @@ pub struct Row {
     pub noisy: PathBuf,
     /// The reference file.
     pub reference: PathBuf,
-    /// Why scores are missing; empty where all is well.
+    /// Why the method failed here, so that it is tried again; empty where all is well.
     pub reason: String,
+    /// What else a reader should know: why a score is not defined, what the method said of the frame. Of the pair itself that is
+    /// in the row of `noisy`.
+    #[serde(default)]
+    pub note: String,
 }
 
 /// What makes a row the same row in another run.
@@ -106,6 +111,14 @@ impl Row {
     /// What identifies it.
     pub fn key(&self) -> Key {
         (self.noisy.clone(), self.reference.clone(), self.model.clone())
+    }
+
+    /// Adds to the note.
+    pub fn say(&mut self, note: &str) {
+        if !self.note.is_empty() {
+            self.note += "; ";
+        }
+        self.note += note;
     }
 
     /// Whether the method gave scores here.
@@ -160,6 +173,7 @@ impl Row {
             self.noisy.display().to_string(),
             self.reference.display().to_string(),
             self.reason.clone(),
+            self.note.clone(),
         ]
     }
 }
@@ -183,6 +197,17 @@ pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
     atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
 }
 
+/// Appends a row to a CSV file at once.
+///
+/// # Errors
+/// It cannot be written.
+pub fn append_row(path: &Path, cells: &[String]) -> Result<()> {
+    let cells: Vec<&str> = cells.iter().map(String::as_str).collect();
+    let line = to_csv::<Vec<String>>(&cells, []);
+    let mut file = OpenOptions::new().append(true).open(path).map_err(Error::io("write", path))?;
+    file.write_all(line.as_bytes()).map_err(Error::io("write", path))
+}
+
 /// The rows of a `scores.csv`; none where there is no such file. A last line that a killed run cut
 /// short is left out.
 ///
@@ -204,36 +229,35 @@ pub fn read_rows(path: &Path) -> Result<Vec<Row>> {
 pub struct Table {
     path: PathBuf,
     rows: HashMap<Key, Row>,
+    /// Rows that this run does not ask for; they stay.
+    others: Vec<Row>,
 }
 
 impl Table {
-    /// Starts with the rows kept from an earlier run.
-    pub fn create(path: PathBuf, kept: Vec<Row>) -> Result<Self> {
-        let text = to_csv(&COLUMNS, kept.iter().map(Row::cells));
+    /// Starts with the rows kept from an earlier run, and others that are not asked for now.
+    pub fn create(path: PathBuf, kept: Vec<Row>, others: Vec<Row>) -> Result<Self> {
+        let text = to_csv(&COLUMNS, kept.iter().chain(&others).map(Row::cells));
         write_file(&path, text.as_bytes())?;
-        Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect() })
+        Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect(), others })
     }
 
-    /// The row, where it is finished.
+    /// The row, where it is asked for and finished.
     pub fn get(&self, key: &Key) -> Option<&Row> {
         self.rows.get(key)
     }
 
     /// Stores a row at once.
     pub fn push(&mut self, row: Row) -> Result<()> {
-        let text = to_csv(&COLUMNS, [row.cells()]);
-        let line = text.split_once('\n').map_or("", |(_header, line)| line);
-        let mut file =
-            OpenOptions::new().append(true).open(&self.path).map_err(Error::io("write", &self.path))?;
-        file.write_all(line.as_bytes()).map_err(Error::io("write", &self.path))?;
+        append_row(&self.path, &row.cells())?;
         self.rows.insert(row.key(), row);
         Ok(())
     }
 
-    /// Rewrites the table in the order of `keys` and gives its rows.
+    /// Rewrites the table in the order of `keys`, the other rows last, and gives the rows that were asked for.
     pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
         let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();
-        write_file(&self.path, to_csv(&COLUMNS, rows.iter().map(Row::cells)).as_bytes())?;
+        let text = to_csv(&COLUMNS, rows.iter().chain(&self.others).map(Row::cells));
+        write_file(&self.path, text.as_bytes())?;
         Ok(rows)
     }
 }
@@ -254,24 +278,27 @@ mod tests {
     }
 
     #[test]
-    fn table_survives_a_cut_line_and_ends_in_order() {
+    fn table_survives_a_cut_line_and_ends_in_order_with_the_other_rows_last() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scores.csv");
-        let mut table = Table::create(path.clone(), vec![row("b", "noisy")]).unwrap();
+        let mut table = Table::create(path.clone(), vec![row("b", "noisy")], vec![row("a", "m")]).unwrap();
         let mut full = row("a", "oidn, \"high\"");
         full.relmse = Some(0.0123);
         full.non_finite = Some(0);
         full.reason = "line one".into();
+        full.say("one");
+        full.say("two, three");
+        assert_eq!(full.note, "one; two, three");
         table.push(full.clone()).unwrap();
-        assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), full.clone()]);
+        assert_eq!(read_rows(&path).unwrap(), [row("b", "noisy"), row("a", "m"), full.clone()]);
 
         let mut file = OpenOptions::new().append(true).open(&path).unwrap();
         file.write_all(b"c,noisy,4,12").unwrap();
-        assert_eq!(read_rows(&path).unwrap().len(), 2, "a cut line is no row");
+        assert_eq!(read_rows(&path).unwrap().len(), 3, "a cut line is no row");
 
         let rows = table.finish([full.key(), row("b", "noisy").key(), row("z", "noisy").key()]).unwrap();
         assert_eq!(rows, [full.clone(), row("b", "noisy")]);
-        assert_eq!(read_rows(&path).unwrap(), rows);
+        assert_eq!(read_rows(&path).unwrap(), [full, row("b", "noisy"), row("a", "m")]);
     }
 
     #[test]

@@ -3,7 +3,11 @@
 //! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after one of its own that is
 //! not timed: a machine that slows down slows them all. Memory is measured apart, once for each method and size of frame.
 
-use std::{collections::HashMap, fs, path::PathBuf};
+use std::{
+    collections::{HashMap, HashSet},
+    fs,
+    path::PathBuf,
+};
 
 use super::{
     Method, NOISY, Options,
@@ -13,12 +17,13 @@ use super::{
     page::Page,
     provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
-    settings::Settings,
+    settings::{self, Settings},
     sheet::{self, Shown},
     summary,
 };
 use crate::{
     Error, Result,
+    error::attempt,
     metrics::{self, pairing},
     models::{Denoiser, Run},
     passes::{self, Pass, PassSet},
@@ -29,7 +34,7 @@ use crate::{
 /// What a run tells while it goes on.
 #[derive(Debug)]
 pub enum Event<'a> {
-    /// Rows in all, and those kept from an earlier run.
+    /// Rows asked for in all, and those of them kept from an earlier run.
     Start {
         /// Rows when all is done.
         rows: usize,
@@ -38,13 +43,13 @@ pub enum Event<'a> {
     },
     /// A pair is being read.
     Pair(&'a Pair),
-    /// What a method says about its treatment of a pair.
+    /// What a reader should know of the rows that come next.
     Note(&'a str),
     /// A row is finished.
     Row(&'a Row),
 }
 
-/// Scores every method on every pair and writes the report into `options.out`. Returns all rows,
+/// Scores every method on every pair and writes the report into `options.out`. Returns the rows of them all,
 /// those kept from an earlier run included, pair by pair in the order of the methods.
 ///
 /// # Errors
@@ -62,35 +67,59 @@ pub fn evaluate(
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
     let provenance = Provenance::now();
     let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
-    let mut kept = if options.overwrite { Vec::new() } else { read_rows(&scores)? };
+    let keys: Vec<Key> =
+        pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key())).collect();
+    let asked: HashSet<&Key> = keys.iter().collect();
+    let rows = match read_rows(&scores) {
+        Err(_) if options.overwrite => Vec::new(),
+        rows => rows?,
+    };
+    let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
+        rows.into_iter().partition(|row| asked.contains(&row.key()));
     // A row that failed is tried again.
-    kept.retain(|row| row.reason.is_empty() && before.still_holds(row, &now));
-    // What was said of rows that are kept still holds.
-    now.notes = before.notes.clone();
-    now.notes.retain(|method, _| kept.iter().any(|row| row.model == *method));
-    let keep_sheets = !options.overwrite && before.same_methods(&now);
+    kept.retain(|row| !options.overwrite && row.reason.is_empty() && before.still_holds(row, &now));
+    let count = others.len();
+    others.retain(|row| before.still_holds(row, &now));
+    others.iter().for_each(|row| now.keep(row, &before));
+    if others.len() < count {
+        on(Event::Note(&format!(
+            "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor or files \
+             have changed",
+            scores.display(),
+            count - others.len()
+        )));
+    }
 
     on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
-    let mut table = Table::create(scores, kept)?;
+    let mut table = Table::create(scores, kept, others)?;
+    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
+    let shows =
+        |pair: &Pair| format!("{} of {}", names.join(", "), settings::name(&pair.noisy, &pair.reference));
+    let sheet_names: Vec<String> = pairs.iter().map(|pair| sheet_name(pairs, pair)).collect();
+    now.sheets = before.sheets;
+    for (pair, sheet) in pairs.iter().zip(&sheet_names) {
+        let is_finished = methods.iter().all(|m| table.get(&Row::new(pair, &m.name).key()).is_some());
+        // Known again when it is drawn: a run that is killed before leaves no sheet of other rows.
+        if !is_finished || now.sheets.get(sheet) != Some(&shows(pair)) {
+            now.sheets.remove(sheet);
+        }
+    }
     now.write(&stored)?;
     let mut peaks = Peaks::new();
-    for pair in pairs {
+    for (pair, name) in pairs.iter().zip(&sheet_names) {
         let finished: Vec<bool> =
             methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
-        let sheet = sheet_path(pairs, pair, options);
-        let sheet = sheet.filter(|path| !(keep_sheets && finished.iter().all(|f| *f) && path.is_file()));
+        let sheet = options.sheets.then(|| sheets.join(name));
+        let sheet = sheet.filter(|path| !(now.sheets.contains_key(name) && path.is_file()));
         if finished.iter().all(|f| *f) && sheet.is_none() {
             continue;
         }
         on(Event::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
-        for (method, note) in done.notes {
-            on(Event::Note(&note));
-            if now.notes.entry(method).or_default().insert(note) {
-                now.write(&stored)?;
-            }
-        }
         for row in done.rows {
+            if !row.note.is_empty() {
+                on(Event::Note(&row.note));
+            }
             on(Event::Row(&row));
             table.push(row)?;
         }
@@ -100,12 +129,12 @@ pub fn evaluate(
                 .filter_map(|m| Some((m.name.as_str(), table.get(&Row::new(pair, &m.name).key())?)))
                 .collect();
             sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
+            now.sheets.insert(name.clone(), shows(pair));
+            now.write(&stored)?;
         }
     }
 
-    let keys = pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key()));
-    let rows = table.finish(keys.collect::<Vec<Key>>())?;
-    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
+    let rows = table.finish(keys)?;
     let summaries = summary::summarise(&rows, &names, &options.baseline);
     write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
     let charts = [
@@ -115,14 +144,17 @@ pub fn evaluate(
     ];
     let scenes: Vec<(&Pair, Option<PathBuf>)> = pairs
         .iter()
-        .map(|pair| (pair, sheet_path(pairs, pair, options).filter(|path| path.is_file())))
+        .zip(&sheet_names)
+        .map(|(pair, name)| {
+            let is_known = options.sheets && now.sheets.contains_key(name);
+            (pair, is_known.then(|| sheets.join(name)).filter(|path| path.is_file()))
+        })
         .collect();
     Page {
         rows: &rows,
         summaries: &summaries,
         charts: &charts,
         scenes: &scenes,
-        notes: &now.notes,
         options,
         provenance: &provenance,
     }
@@ -130,22 +162,18 @@ pub fn evaluate(
     Ok(rows)
 }
 
-/// Where the pair's sheet goes, if sheets are wanted: a name that is unique in the test set even where
-/// a manifest repeats a scene.
-fn sheet_path(pairs: &[Pair], pair: &Pair, options: &Options) -> Option<PathBuf> {
+/// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
+fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
     let id = pair.id().replace(['/', '\\'], "_");
-    let name = match twins.iter().position(|p| *p == pair) {
+    match twins.iter().position(|p| *p == pair) {
         Some(at) if at > 0 => format!("{id}_{}.png", at + 1),
         _ => format!("{id}.png"),
-    };
-    options.sheets.then(|| options.out.join("sheets").join(name))
+    }
 }
 
 /// What running a pair gave.
 struct Done {
-    /// What the methods, by name, say about their treatment of the pair.
-    notes: Vec<(String, String)>,
     /// Rows of the methods that were not finished.
     rows: Vec<Row>,
     /// Images for the sheet, where the pair could be read.
@@ -183,6 +211,17 @@ pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     Ok(Loaded { noisy, passes, reference })
 }
 
+/// As [`load`], of a pair whose reference may be missing.
+///
+/// # Errors
+/// As [`load`], or there is no reference.
+pub fn load_listed(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
+    if !pair.reference.is_file() {
+        return Err(pair.no_reference());
+    }
+    attempt(&pair.noisy, || load(pair, view_layer))
+}
+
 /// Memory peaks known so far, by method, width and height.
 type Peaks = HashMap<(String, usize, usize), Option<f64>>;
 
@@ -200,11 +239,11 @@ fn run_pair(
         row.threads = options.threads;
         row
     };
-    let loaded = match load(pair, options.view_layer.as_deref()) {
+    let loaded = match load_listed(pair, options.view_layer.as_deref()) {
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
-            return Done { notes: Vec::new(), rows: open().map(fail).collect(), scene: None };
+            return Done { rows: open().map(fail).collect(), scene: None };
         }
     };
     let (width, height) = (loaded.noisy.width, loaded.noisy.height);
@@ -217,7 +256,14 @@ fn run_pair(
         }
         let mut row = new_row(method);
         (row.width, row.height) = (Some(width), Some(height));
-        let image = first_run(method, &loaded, &mut row);
+        let image = first_run(method, pair, &loaded, &mut row);
+        if !finished {
+            method.denoiser.notes(&loaded.passes).iter().for_each(|note| row.say(note));
+        }
+        if !finished && method.name == NOISY {
+            let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
+            warning.iter().for_each(|warning| row.say(warning));
+        }
         if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
             let measure = || (method.peak_mib)(&pair.noisy);
             row.peak_mib = *peaks.entry((method.name.clone(), width, height)).or_insert_with(measure);
@@ -233,7 +279,7 @@ fn run_pair(
             let Some(row) = rows[i].as_mut().filter(|row| row.is_valid() && method.name != NOISY) else {
                 continue;
             };
-            match timed_run(&*method.denoiser, &loaded.passes) {
+            match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.passes)) {
                 Ok(run) => times[i].push(run.seconds),
                 Err(error) => row.reason = error.to_string(),
             }
@@ -245,12 +291,7 @@ fn run_pair(
             row.set_time(times, width * height);
         }
     }
-    let mut notes: Vec<(String, String)> =
-        open().filter_map(|m| Some((m.name.clone(), m.denoiser.notes(&loaded.passes)?))).collect();
-    let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
-    notes.extend(warning.map(|warning| (NOISY.into(), warning)));
     Done {
-        notes,
         rows: rows.into_iter().flatten().collect(),
         scene: shown.then_some(Scene { reference: loaded.reference, images }),
     }
@@ -266,11 +307,11 @@ fn timed_run(denoiser: &dyn Denoiser, passes: &PassSet) -> Result<Run> {
 }
 
 /// The run that is scored. None, with a reason in the row, where it fails.
-fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
+fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
     let image = if method.name == NOISY {
         loaded.noisy.clone()
     } else {
-        match method.denoiser.denoise_timed(&loaded.passes) {
+        match attempt(&pair.noisy, || method.denoiser.denoise_timed(&loaded.passes)) {
             Ok(run) => {
                 row.peak_mib = run.peak_mib;
                 run.image
@@ -285,11 +326,69 @@ fn first_run(method: &Method, loaded: &Loaded, row: &mut Row) -> Option<Planes> 
     match metrics::score(&image, &loaded.reference) {
         Ok(scores) => {
             row.set_scores(&scores);
+            let undefined = scores.named().into_iter().filter(|(_, score)| score.is_none());
+            let undefined = undefined.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
+            if !undefined.is_empty() {
+                let why = metrics::why_undefined(&loaded.reference);
+                row.say(&format!("{}: no {undefined}: {why}", pair.id()));
+            }
             Some(image)
         }
         Err(why) => {
             row.reason = why.to_string();
             None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{models::Noisy, report::Method};
+
+    /// Fails as no method should.
+    struct Panics;
+
+    impl Denoiser for Panics {
+        fn name(&self) -> &str {
+            "panics"
+        }
+
+        fn passes(&self) -> &[Pass] {
+            &[Pass::Combined]
+        }
+
+        fn denoise(&self, _: &PassSet) -> Result<Planes> {
+            panic!("on purpose")
+        }
+    }
+
+    #[test]
+    fn a_method_that_panics_fails_alone() {
+        let out = tempfile::tempdir().unwrap();
+        let data = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/*_0004spp.exr");
+        let pairs = crate::testset::read(data).unwrap().pairs;
+        let method = |denoiser: Box<dyn Denoiser>| Method {
+            name: denoiser.name().into(),
+            denoiser,
+            peak_mib: Box::new(|_| None),
+            stamp: "1".into(),
+        };
+        let options = Options {
+            out: out.path().into(),
+            repeats: 1,
+            threads: 1,
+            baseline: NOISY.into(),
+            view_layer: None,
+            overwrite: false,
+            sheets: false,
+        };
+        let methods = [method(Box::new(Noisy)), method(Box::new(Panics))];
+        let rows = evaluate(&pairs, &methods, &options, &mut |_| {}).unwrap();
+        assert_eq!(rows.len(), 2 * pairs.len());
+        for row in rows {
+            assert_eq!(row.is_valid(), row.model == NOISY, "{row:?}");
+            assert_eq!(row.reason.contains("internal error"), row.model == "panics", "{row:?}");
         }
     }
 }

@@ -1,15 +1,11 @@
 //! `run.json`: what the rows in a folder were made with, so that a later run keeps those that hold.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    fs,
-    path::Path,
-};
+use std::{collections::BTreeMap, fs, path::Path};
 
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Method, Options,
+    Method, NOISY, Options,
     provenance::Provenance,
     rows::{Row, write_file},
 };
@@ -23,13 +19,13 @@ pub struct Settings {
     threads: usize,
     repeats: usize,
     view_layer: Option<String>,
-    /// Stamp of each method, by name.
+    /// Stamp of each method that has rows, by name.
     methods: BTreeMap<String, String>,
-    /// Stamp of each pair, by its noisy and reference files.
+    /// Stamp of each pair that has rows, by its noisy and reference files.
     pairs: BTreeMap<String, String>,
-    /// What each method, by name, said of its treatment of the pairs; what is said of a pair itself is under `noisy`.
+    /// What each comparison sheet shows, by its file's name.
     #[serde(default)]
-    pub notes: BTreeMap<String, BTreeSet<String>>,
+    pub sheets: BTreeMap<String, String>,
 }
 
 impl Settings {
@@ -43,12 +39,9 @@ impl Settings {
             methods: methods.iter().map(|m| (m.name.clone(), m.stamp.clone())).collect(),
             pairs: pairs
                 .iter()
-                .map(|p| {
-                    let stamps = [file_stamp(&p.noisy), file_stamp(&p.reference)].join(" ");
-                    (name(&p.noisy, &p.reference), stamps)
-                })
+                .map(|p| (name(&p.noisy, &p.reference), pair_stamp(&p.noisy, &p.reference)))
                 .collect(),
-            notes: BTreeMap::new(),
+            sheets: BTreeMap::new(),
         }
     }
 
@@ -63,27 +56,46 @@ impl Settings {
         write_file(path, (text + "\n").as_bytes())
     }
 
-    /// Whether `row`, made with the settings `self`, would come out the same with `now`.
+    /// Whether `row`, made with the settings `self`, would come out the same with `now`. What the stamp of a method that `now`
+    /// does not have would be is not known, unless it came with the program, as `noisy` does.
     pub fn still_holds(&self, row: &Row, now: &Self) -> bool {
-        let pair = name(&row.noisy, &row.reference);
+        let pair = self.pairs.get(&name(&row.noisy, &row.reference));
         let (before, after) = (&self.provenance, &now.provenance);
+        let stamp = self.methods.get(&row.model);
+        let program = self.methods.get(NOISY);
+        let expected = match now.methods.get(&row.model) {
+            None if stamp == program => now.methods.get(NOISY),
+            None => stamp,
+            asked => asked,
+        };
         (&before.version, &before.cpu, &before.instructions)
             == (&after.version, &after.cpu, &after.instructions)
             && (self.threads, self.repeats, &self.view_layer) == (now.threads, now.repeats, &now.view_layer)
-            && now.methods.contains_key(&row.model)
-            && self.methods.get(&row.model) == now.methods.get(&row.model)
-            && now.pairs.contains_key(&pair)
-            && self.pairs.get(&pair) == now.pairs.get(&pair)
+            && stamp.is_some()
+            && stamp == expected
+            && pair == Some(&pair_stamp(&row.noisy, &row.reference))
     }
 
-    /// Whether both runs have the same methods, so that comparison sheets show the same.
-    pub fn same_methods(&self, other: &Self) -> bool {
-        self.methods == other.methods
+    /// Takes over from `before` what a row is known by that this run does not ask for.
+    pub fn keep(&mut self, row: &Row, before: &Self) {
+        let pair = name(&row.noisy, &row.reference);
+        for (own, other, key) in
+            [(&mut self.methods, &before.methods, &row.model), (&mut self.pairs, &before.pairs, &pair)]
+        {
+            if let Some(stamp) = other.get(key) {
+                own.entry(key.clone()).or_insert_with(|| stamp.clone());
+            }
+        }
     }
 }
 
-fn name(noisy: &Path, reference: &Path) -> String {
+/// What `run.json` knows a pair by.
+pub fn name(noisy: &Path, reference: &Path) -> String {
     format!("{} {}", noisy.display(), reference.display())
+}
+
+fn pair_stamp(noisy: &Path, reference: &Path) -> String {
+    [file_stamp(noisy), file_stamp(reference)].join(" ")
 }
 
 /// Size and time of change of a file: differs when the file was written again.
@@ -91,4 +103,45 @@ pub fn file_stamp(path: &Path) -> String {
     let Ok(metadata) = fs::metadata(path) else { return "missing".into() };
     let changed = metadata.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok());
     format!("{} {}", metadata.len(), changed.map_or(0, |t| t.as_nanos()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_holds_while_its_stamps_do_asked_for_or_not() {
+        let dir = tempfile::tempdir().unwrap();
+        let [noisy, reference] = ["a_0004spp.exr", "a_ref.exr"].map(|name| dir.path().join(name));
+        fs::write(&noisy, "x").unwrap();
+        fs::write(&reference, "x").unwrap();
+        let settings = |methods: &[(&str, &str)]| Settings {
+            methods: methods.iter().map(|(name, stamp)| (name.to_string(), stamp.to_string())).collect(),
+            pairs: [(name(&noisy, &reference), pair_stamp(&noisy, &reference))].into(),
+            ..Settings::default()
+        };
+        let before = settings(&[("noisy", "1"), ("demc-s", "1"), ("weights", "5")]);
+        let holds = |now: &Settings| {
+            ["noisy", "demc-s", "weights", "unknown"].map(|model| {
+                let (noisy, reference) = (noisy.clone(), reference.clone());
+                before.still_holds(&Row { model: model.into(), noisy, reference, ..Row::default() }, now)
+            })
+        };
+        let asked = [("noisy", "1"), ("demc-s", "1"), ("weights", "5")];
+        assert_eq!(holds(&settings(&asked)), [true, true, true, false]);
+        assert_eq!(holds(&settings(&asked[..1])), [true, true, true, false], "not asked for");
+        assert_eq!(
+            holds(&settings(&[("noisy", "1"), ("weights", "6")])),
+            [true, true, false, false],
+            "other weights"
+        );
+        assert_eq!(holds(&settings(&[("noisy", "2")])), [false, false, true, false], "another program");
+        assert_eq!(
+            holds(&Settings { threads: 1, ..settings(&asked) }),
+            [false; 4],
+            "another number of threads"
+        );
+        fs::write(&reference, "longer").unwrap();
+        assert_eq!(holds(&settings(&asked)), [false; 4], "another reference");
+    }
 }

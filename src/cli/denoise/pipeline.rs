@@ -4,8 +4,6 @@
 //! The threads report to the caller's thread, which alone talks to the user.
 
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
-    path::Path,
     sync::{
         Arc, Mutex, PoisonError,
         mpsc::{Receiver, Sender, SyncSender, channel, sync_channel},
@@ -17,7 +15,7 @@ use super::{
     Job,
     frame_job::{self, Denoised, Frames, Options, Report},
 };
-use crate::{Error, Result, cli::stop, frame::Frame, models::Denoiser, passes::PassSet};
+use crate::{Error, Result, cli::stop, error::attempt, frame::Frame, models::Denoiser, passes::PassSet};
 
 /// What became of one file.
 pub enum Outcome {
@@ -167,12 +165,4 @@ fn pass_on<T>(
             true
         }
     }
-}
-
-/// A defect that shows in one frame must not cost the night's other nine thousand: a panic becomes
-/// the failure of its file.
-fn attempt<T>(input: &Path, step: impl FnOnce() -> Result<T>) -> Result<T> {
-    catch_unwind(AssertUnwindSafe(step)).unwrap_or_else(|_| {
-        Err(Error::invalid(input, "an internal error stopped this frame; please report it with the file"))
-    })
 }

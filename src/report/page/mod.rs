@@ -35,8 +35,6 @@ pub struct Page<'a> {
     pub charts: &'a [(&'a str, String)],
     /// The pairs, each with its sheet where there is one.
     pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
-    /// What each method, by name, said of its treatment of the renders.
-    pub notes: &'a BTreeMap<String, BTreeSet<String>>,
     /// How it was run.
     pub options: &'a Options,
     /// What it was run with and on.
@@ -66,6 +64,8 @@ impl Page<'_> {
     fn document(&self, scenes: &[Markup]) -> Markup {
         let title = format!("demc eval: {}", self.counted());
         let p = self.provenance;
+        let notes: BTreeSet<&str> =
+            self.rows.iter().map(|row| row.note.as_str()).filter(|note| !note.is_empty()).collect();
         html! {
             (DOCTYPE)
             html lang="en" {
@@ -90,8 +90,8 @@ impl Page<'_> {
                          scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
                     }
                     (self.summary())
-                    @if !self.notes.is_empty() {
-                        ul.faint #notes { @for note in self.notes.values().flatten() { li { (note) } } }
+                    @if !notes.is_empty() {
+                        ul.faint #notes { @for note in notes { li { (note) } } }
                     }
                     @for (title, svg) in self.charts {
                         h2 { (title) }
