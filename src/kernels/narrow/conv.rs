@@ -526,13 +526,16 @@ impl Band<'_> {
         let accumulate = self.epilogue.accumulate;
         let mut position = from;
         while position < end {
-            let (y, x) = (position / grid.stride() - grid.pad, position % grid.stride());
-            // Positions run from the left border, over the pixels, to the right border.
-            let skip = grid.pad.saturating_sub(x);
-            let run =
-                (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
-            let (first, column) = (position + skip - from, x + skip - grid.pad);
-            let row = y * spread + phase / spread;
+            // Positions run from the left border, over the pixels, to the right border, and may begin or end in either.
+            let line = position / grid.stride();
+            let left = line * grid.stride() + grid.pad;
+            let pixels = position.max(left)..end.min(left + grid.w);
+            position = (line + 1) * grid.stride();
+            if pixels.is_empty() {
+                continue;
+            }
+            let (run, first, column) = (pixels.len(), pixels.start - from, pixels.start - left);
+            let row = (line - grid.pad) * spread + phase / spread;
             // SAFETY: vectors are the tier's.
             let finish = unsafe { [self.finish::<S>(plane), self.finish::<S>(plane + outputs - 1)] };
             let sums: [&[Block]; 2] = std::array::from_fn(|o| &sums.0[o][first..first + run]);
@@ -587,7 +590,6 @@ impl Band<'_> {
                     }
                 }
             }
-            position += (skip + run).max(1);
         }
     }
 
