@@ -61,7 +61,8 @@ impl Channels {
 /// An output gradient, positions interleaved two by two.
 #[derive(Debug)]
 pub struct Pairs {
-    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the left border of row 0.
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so that no tap
+    /// reaches beyond the first position of the input.
     data: Pooled<Wide>,
     rows: usize,
     grid: Grid,
@@ -76,7 +77,7 @@ impl Pairs {
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
         let mut data = allocate(g.n * g.planes() * grid.phases() * rows);
-        let origin = grid.row(0) - grid.pad;
+        let origin = grid.row(0);
         data.par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
             let (phase, plane) = (i % grid.phases(), i / grid.phases());
             let blocks = &gradient.data[plane * g.plane_stride()..][..g.plane_stride()];
@@ -137,6 +138,11 @@ pub fn weight_gradient(
             }
         })
         .collect();
+    let is_inside = |(shift, _): &(isize, usize)| {
+        let first = signed(grid.row(0)) + shift;
+        first >= 0 && first + signed(2 * output_gradient.rows) <= signed(source.stride)
+    };
+    assert!(shifts.iter().all(is_inside), "rows are too short for {geometry:?}");
 
     let (wide, groups) = (s.c.div_ceil(WIDE), g.planes().div_ceil(2));
     // Few planes leave too few tasks, so images become tasks as well, each with its own sum.
@@ -155,8 +161,8 @@ pub fn weight_gradient(
                 for step in (0..steps).step_by(STEPS) {
                     let count = STEPS.min(steps - step);
                     for (&(shift, phase), sums) in shifts.iter().zip(&mut sums) {
-                        let position = signed(grid.row(0) - grid.pad + step * CHUNK) + shift;
-                        // SAFETY: borders and slack cover the shift; `ready` was called.
+                        let position = signed(grid.row(0) + step * CHUNK) + shift;
+                        // SAFETY: borders and slack cover the shift, as was checked; `ready` was called.
                         unsafe {
                             let channels = source.data.as_ptr().cast::<bf16>().add(channels).offset(position);
                             let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
