@@ -307,7 +307,8 @@ impl Band<'_> {
             for source in self.sources {
                 let s = source.shape;
                 for plane in 0..s.planes() {
-                    let pixel = &source.data[s.row(self.n, plane, y * STEP)] as *const Block;
+                    // Of the whole activation, not of one block of it: taps walk from here over rows.
+                    let pixel = source.data.as_ptr().wrapping_add(s.row(self.n, plane, y * STEP));
                     inputs.push(Plane { pixel, lanes: s.lanes(plane) });
                 }
             }

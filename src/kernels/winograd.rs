@@ -285,7 +285,8 @@ impl Kernel for Rows<'_> {
             for plane in 0..s.planes() {
                 let above = s.row(self.n, plane, self.y) - s.row_stride() - 1;
                 let row = |i: usize| {
-                    (self.y + i <= s.h + 1).then(|| &source.data[above + i * s.row_stride()] as *const Block)
+                    let row = source.data.as_ptr().wrapping_add(above + i * s.row_stride());
+                    (self.y + i <= s.h + 1).then_some(row)
                 };
                 planes.push(Plane { rows: std::array::from_fn(row), lanes: s.lanes(plane) });
             }
