@@ -98,7 +98,7 @@ impl Arithmetic {
         geometry: Geometry,
         bias: &[Block],
         epilogue: Epilogue,
-        output: ViewMut,
+        mut output: ViewMut,
     ) {
         let (weights, inputs, outputs, direction, source) = weights;
         let used = match (direction, geometry) {
@@ -114,7 +114,7 @@ impl Arithmetic {
                 let mut packed = vec![Block::default(); len];
                 pack(weights, inputs, outputs, geometry, direction, source, &mut packed);
                 if matches!(self, Self::Squares(_)) && used == Geometry::Same(3) {
-                    let planes = sources.iter().map(|s| s.shape.planes()).sum();
+                    let planes = sources.iter().map(|s| s.shape().planes()).sum();
                     let weights = winograd::transform(tier, &packed, planes);
                     winograd::convolve(tier, sources, &weights, bias, epilogue, output);
                 } else {
@@ -128,25 +128,25 @@ impl Arithmetic {
                     sources.iter().map(|s| narrow::Operand::narrow(engine, *s, used)).collect();
                 let operands: Vec<_> = operands.iter().collect();
                 if !epilogue.accumulate {
+                    let shape = output.shape();
                     // What it writes in bfloat16 is what it writes in f32, rounded.
-                    let mut rounded = narrow::Operand::new(output.shape, Format::Bf16);
+                    let mut rounded = narrow::Operand::new(shape, Format::Bf16);
                     let to = narrow::conv::Output::Narrow(&mut rounded);
                     narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
-                    let to = narrow::conv::Output::F32(ViewMut::new(output.shape, output.data));
+                    let to = narrow::conv::Output::F32(ViewMut::new(shape, output.data()));
                     narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
-                    let mut widened = vec![Block::default(); output.data.len()];
-                    rounded.widen(ViewMut::new(output.shape, &mut widened));
-                    for (rounded, full) in widened.iter().zip(output.data.iter()) {
+                    let mut widened = vec![Block::default(); shape.blocks()];
+                    rounded.widen(ViewMut::new(shape, &mut widened));
+                    for (rounded, full) in widened.iter().zip(output.data().iter()) {
                         for (rounded, full) in rounded.0.iter().zip(full.0) {
                             assert_eq!(*rounded, half::bf16::from_f32(full).to_f32());
                         }
                     }
                     // What it writes as planes is that, unpacked.
-                    let shape = output.shape;
                     let factors = [1, 2].into_iter().filter(|f| shape.c.is_multiple_of(f * f));
                     for factor in factors.filter(|_| used != Geometry::Transposed) {
                         let mut unpacked = vec![0.0; shape.n * shape.c * shape.h * shape.w];
-                        from_blocked_shuffled(View::new(shape, output.data), 0, factor, &mut unpacked);
+                        from_blocked_shuffled(View::new(shape, output.data()), 0, factor, &mut unpacked);
                         let mut planes = vec![f32::NAN; unpacked.len()];
                         let to = narrow::conv::Output::Planes { shape, factor, values: &mut planes };
                         narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
@@ -306,6 +306,38 @@ proptest! {
 #[test]
 fn chunks_end_inside_borders() {
     check_layer(Geometry::Same(5), Shape { pad: 2, ..Shape::new(1, 3, 61, 61) }, 0, 2, 7);
+}
+
+#[test]
+#[should_panic = "border too small"]
+fn weight_gradients_need_a_border() {
+    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
+    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
+    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
+    weight_gradient(Tier::detect(), x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+}
+
+#[test]
+#[should_panic = "border too small"]
+fn narrow_weight_gradients_need_a_border() {
+    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
+    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
+    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
+    Arithmetic::Bf16(Engine::detect()).weight_gradient(x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+}
+
+#[test]
+#[should_panic = "planes of all channels"]
+fn planes_hold_all_channels() {
+    let shape = Shape::new(1, 40, 4, 5);
+    let engine = Engine::detect();
+    let x = blocked(shape, &[1.0; 40 * 20]);
+    let x = narrow::Operand::narrow(engine, View::new(shape, &x), Geometry::Same(1));
+    let weights = [1.0; 40 * 40];
+    let weights = narrow::conv::Weights::pack(&weights, &[40], 40, Geometry::Same(1), Direction::Forward, 0);
+    let to = narrow::conv::Output::Planes { shape, factor: 1, values: &mut [0.0; 20] };
+    let bias = [Block::default(); 3];
+    narrow::conv::convolve(engine, &[&x], &weights, &bias, Epilogue::default(), to);
 }
 
 /// A layer in 8 bits whose factors are whole steps: exact, whatever the engine.

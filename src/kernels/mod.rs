@@ -119,18 +119,16 @@ impl Shape {
 /// A blocked activation to read.
 #[derive(Clone, Copy)]
 pub struct View<'a> {
-    /// Its extent.
-    pub shape: Shape,
+    shape: Shape,
     /// `shape.blocks()` blocks.
-    pub data: &'a [Block],
+    data: &'a [Block],
 }
 
 /// A blocked activation to write. Kernels write interiors only: borders stay as they are.
 pub struct ViewMut<'a> {
-    /// Its extent.
-    pub shape: Shape,
+    shape: Shape,
     /// `shape.blocks()` blocks.
-    pub data: &'a mut [Block],
+    data: &'a mut [Block],
 }
 
 impl<'a> View<'a> {
@@ -142,6 +140,16 @@ impl<'a> View<'a> {
         assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
         Self { shape, data }
     }
+
+    /// Its extent.
+    pub fn shape(self) -> Shape {
+        self.shape
+    }
+
+    /// As many blocks as its shape has.
+    pub fn data(self) -> &'a [Block] {
+        self.data
+    }
 }
 
 impl<'a> ViewMut<'a> {
@@ -152,6 +160,16 @@ impl<'a> ViewMut<'a> {
     pub fn new(shape: Shape, data: &'a mut [Block]) -> Self {
         assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
         Self { shape, data }
+    }
+
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// As many blocks as its shape has.
+    pub fn data(&mut self) -> &mut [Block] {
+        self.data
     }
 }
 

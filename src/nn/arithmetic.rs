@@ -186,7 +186,7 @@ impl Arithmetic {
                     narrow::weight_grad::weight_gradient(engine, &channels, pairs, (first, total), into);
                 }
             }
-            first += source.shape.c;
+            first += source.shape().c;
         }
     }
 
@@ -200,7 +200,7 @@ impl Arithmetic {
         move |index, into, accumulate| {
             let Self { inputs, outputs, geometry, .. } = self;
             let epilogue = Epilogue { relu: false, accumulate };
-            let zero = vec![Block::default(); into.shape.planes()];
+            let zero = vec![Block::default(); into.shape().planes()];
             match &operand {
                 None => {
                     let mut packed =
@@ -236,8 +236,8 @@ fn convolve_taped(
     epilogue: Epilogue,
     output: ViewMut,
 ) {
-    if geometry == Geometry::Same(3) && winograd::serves(output.shape.w) {
-        let planes = sources.iter().map(|source| source.shape.planes()).sum();
+    if geometry == Geometry::Same(3) && winograd::serves(output.shape().w) {
+        let planes = sources.iter().map(|source| source.shape().planes()).sum();
         let weights = winograd::transform(tier, weights, planes);
         winograd::convolve(tier, sources, &weights, bias, epilogue, output);
     } else {

@@ -490,7 +490,7 @@ impl BatchNorm {
                 // Sums of g and of g * normalised input, each channel.
                 let mut sums = vec![(0.0f64, 0.0f64); shape.c];
                 each_row(shape, |c0, row| {
-                    for (x, g) in source.data.view().data[row.clone()].iter().zip(&gradient[row]) {
+                    for (x, g) in source.data.view().data()[row.clone()].iter().zip(&gradient[row]) {
                         for (l, sum) in sums[c0..].iter_mut().take(LANES).enumerate() {
                             let normal = (x.0[l] - moments[c0 + l].0) * inverse[c0 + l];
                             sum.0 += f64::from(g.0[l]);
@@ -506,7 +506,7 @@ impl BatchNorm {
                     each_row(shape, |c0, row| {
                         let lanes = (shape.c - c0).min(LANES);
                         for at in row {
-                            let (x, g) = (source.data.view().data[at].0, gradient[at].0);
+                            let (x, g) = (source.data.view().data()[at].0, gradient[at].0);
                             for l in 0..lanes {
                                 let c = c0 + l;
                                 let normal = (x[l] - moments[c].0) * inverse[c];

@@ -382,10 +382,7 @@ pub fn convolve(
     let band = grid.h.div_ceil(bands).next_multiple_of(if by_squares { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
     let (target, step) = match output {
-        Output::F32(view) => {
-            assert_eq!(view.data.len(), out.blocks());
-            (Target::F32(Shared(view.data.as_mut_ptr())), 1.0)
-        }
+        Output::F32(view) => (Target::F32(Shared(view.data.as_mut_ptr())), 1.0),
         Output::Narrow(operand) => {
             assert!(!epilogue.accumulate && !operand.grid.split);
             let step = match operand.format {
@@ -399,6 +396,7 @@ pub fn convolve(
         }
         Output::Planes { shape, factor, values } => {
             assert!(!epilogue.accumulate && spread == 1);
+            assert_eq!(values.len(), out.n * out.c * out.h * out.w, "planes of all channels");
             (Target::Planes(Unpacked::new(shape, 0, factor, values)), 1.0)
         }
     };

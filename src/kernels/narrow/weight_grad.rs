@@ -72,7 +72,11 @@ pub struct Pairs {
 
 impl Pairs {
     /// Rounds and interleaves the output gradient of a convolution of `geometry`.
+    ///
+    /// # Panics
+    /// If that is [`Geometry::Strided`].
     pub fn new(engine: Engine, gradient: View, geometry: Geometry) -> Self {
+        assert!(geometry != Geometry::Strided, "the strided convolution has no weights of its own");
         let g = gradient.shape;
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
@@ -107,7 +111,7 @@ impl Pairs {
 /// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
 ///
 /// # Panics
-/// If sizes or lengths do not fit together.
+/// If sizes, borders or lengths do not fit together.
 pub fn weight_gradient(
     engine: Engine,
     source: &Channels,
@@ -119,6 +123,7 @@ pub fn weight_gradient(
     let geometry = output_gradient.geometry;
     assert_eq!((g.n, (g.h, g.w)), (s.n, geometry.output(s.h, s.w)));
     assert_eq!(grid.pad, s.pad, "both factors need one border");
+    assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
     let taps = geometry.taps();
     assert_eq!(gradient.len(), inputs * g.c * taps);
 
