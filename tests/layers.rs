@@ -473,6 +473,22 @@ fn channels_become_planes_as_plain_loops_do() {
     }
 }
 
+/// Channels that two fields read: their gradient is the sum of what both send back.
+#[test]
+fn gradients_of_two_fields_of_the_same_channels_add_up() {
+    let (n, c, h, w) = (2, 20, 2, 19);
+    let layer = |[x]: &[Images; 1]| {
+        let (first, second) = (traced(x), traced(x));
+        let again = first.fork();
+        let product = Field::from_activation(first, 8, 8, 1).product(Field::from_activation(again, 12, 8, 1));
+        product.product(Field::from_activation(second, 0, 8, 1))
+    };
+    check_by_differences([random(1, (n, c, h, w), NONE)], 0, layer, |[x]| {
+        let at = |i: usize, first: usize| x[(i / (8 * h * w) * c + first) * h * w + i % (8 * h * w)];
+        (0..n * 8 * h * w).map(|i| at(i, 8) * at(i, 12) * at(i, 0)).collect()
+    });
+}
+
 /// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.
 #[test]
 fn channels_to_pixels_and_back() {

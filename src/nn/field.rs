@@ -14,7 +14,7 @@ use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     gain::{amplify, amplify_gradient},
-    layout::{from_blocked_shuffled, to_blocked_shuffled},
+    layout::{add_blocked_shuffled, from_blocked_shuffled},
     redivide::{redivide, redivide_gradient},
     simd::Tier,
     vectorised::CHUNK,
@@ -164,7 +164,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                     if fresh {
                         into.fill(Default::default());
                     }
-                    to_blocked_shuffled(&gradient, first, factor, into.view_mut());
+                    add_blocked_shuffled(&gradient, first, factor, into.view_mut());
                 });
                 Ok(())
             });
