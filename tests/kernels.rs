@@ -1,6 +1,8 @@
 //! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
 //! remainders included. The engines of narrow formats get values that these hold, and so must be as exact.
 
+use std::{env, process::Command};
+
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
@@ -442,6 +444,18 @@ proptest! {
         for engine in Engine::available() {
             check_int8(engine, geometry, Shape::new(n, c, h, w), split, outputs, seed % 1000);
         }
+    }
+}
+
+/// The same once more on each tier: what rounds to 8 bits chooses the fastest itself.
+#[test]
+fn all_tiers_round_to_eight_bits() {
+    for tier in Tier::available() {
+        let mut tests = Command::new(env::current_exe().unwrap());
+        tests.arg("eight_bits_equal").env("DEMC_TIER", format!("{tier:?}").to_lowercase());
+        tests.env("PROPTEST_CASES", "32");
+        let run = tests.output().unwrap();
+        assert!(run.status.success(), "{tier:?}: {}", String::from_utf8_lossy(&run.stdout));
     }
 }
 

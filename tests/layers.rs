@@ -4,8 +4,10 @@
 //! the rounding of f32 alone. What acts on planes is held against plain loops in f64 as well, whose rows are longer
 //! than a vector and whose logits are larger than any exponential of f32.
 
+use std::{env, process::Command};
+
 use demc::{
-    kernels::Shape,
+    kernels::{Shape, simd::Tier},
     models::network::Taped,
     nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
 };
@@ -487,6 +489,17 @@ fn gradients_of_two_fields_of_the_same_channels_add_up() {
         let at = |i: usize, first: usize| x[(i / (8 * h * w) * c + first) * h * w + i % (8 * h * w)];
         (0..n * 8 * h * w).map(|i| at(i, 8) * at(i, 12) * at(i, 0)).collect()
     });
+}
+
+/// The other tests once more on each tier: layers choose the fastest themselves.
+#[test]
+fn all_tiers_pass_these_tests() {
+    for tier in Tier::available() {
+        let mut tests = Command::new(env::current_exe().unwrap());
+        tests.args(["--skip", "all_tiers"]).env("DEMC_TIER", format!("{tier:?}").to_lowercase());
+        let run = tests.output().unwrap();
+        assert!(run.status.success(), "{tier:?}: {}", String::from_utf8_lossy(&run.stdout));
+    }
 }
 
 /// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.
