@@ -252,6 +252,12 @@ fn check_layer(geometry: Geometry, shape: Shape, split: usize, outputs: usize, s
     assert_close(&db, &want_db, &format!("{geometry:?} {shape:?} bias gradient"));
 }
 
+#[test]
+#[should_panic = "convolutions are 1x1, 3x3 or 5x5, not 4x4"]
+fn kernels_have_a_centre() {
+    Geometry::same(4);
+}
+
 fn geometry() -> impl Strategy<Value = Geometry> {
     prop_oneof![
         Just(Geometry::Same(1)),

@@ -27,7 +27,7 @@ pub struct Epilogue {
 /// The geometry of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Geometry {
-    /// k x k, stride 1, "same" zero padding; k is odd.
+    /// k x k, stride 1, "same" zero padding, for k of 1, 3 or 5; see [`Geometry::same`].
     Same(usize),
     /// Transposed 4x4, stride 2, padding 1: doubles rows and columns.
     Transposed,
@@ -36,6 +36,15 @@ pub enum Geometry {
 }
 
 impl Geometry {
+    /// [`Geometry::Same`] of a kernel that there are convolutions for.
+    ///
+    /// # Panics
+    /// If `k` is not 1, 3 or 5.
+    pub fn same(k: usize) -> Self {
+        assert!(matches!(k, 1 | 3 | 5), "convolutions are 1x1, 3x3 or 5x5, not {k}x{k}");
+        Self::Same(k)
+    }
+
     /// Taps, which is also how many 16x16 slabs a pair of planes has.
     pub fn taps(self) -> usize {
         match self {

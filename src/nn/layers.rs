@@ -47,8 +47,11 @@ const RANGE_MARGIN: f32 = 2.0;
 
 impl Conv {
     /// A k x k convolution with ReLU from sources of `inputs` channels to `outputs`.
+    ///
+    /// # Panics
+    /// If `k` is not 1, 3 or 5.
     pub fn new(rng: &mut Rng, name: &str, inputs: &[usize], outputs: usize, k: usize, init: Init) -> Self {
-        Self::with_geometry(rng, name, inputs, outputs, Geometry::Same(k), init)
+        Self::with_geometry(rng, name, inputs, outputs, Geometry::same(k), init)
     }
 
     /// A transposed 4x4 convolution of stride 2 with ReLU, beginning as bilinear upsampling.
