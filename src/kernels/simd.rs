@@ -238,13 +238,14 @@ impl Tier {
 
     /// The fastest tier, found once. The environment variable `DEMC_TIER` (`portable`, `avx2`,
     /// `avx512`) chooses a slower one, to compare them.
+    ///
+    /// # Panics
+    /// If the variable names none that this processor has.
     pub fn detect() -> Tier {
         static CHOICE: OnceLock<Tier> = OnceLock::new();
         *CHOICE.get_or_init(|| {
-            let tiers = Tier::available();
-            let wanted = std::env::var("DEMC_TIER").unwrap_or_default().to_lowercase();
-            let named = tiers.iter().find(|t| format!("{t:?}").to_lowercase() == wanted);
-            *named.or(tiers.last()).expect("the portable tier is always available")
+            let wanted = std::env::var("DEMC_TIER").unwrap_or_default();
+            choose("DEMC_TIER", &wanted, &Tier::available())
         })
     }
 
@@ -261,6 +262,20 @@ impl Tier {
             Isa::Avx512 => unsafe { x86::run_avx512(kernel) },
         }
     }
+}
+
+/// The one of `choices` that an environment variable names, or the last where it names nothing.
+///
+/// # Panics
+/// If it names another.
+pub(super) fn choose<T: Copy + fmt::Debug>(variable: &str, wanted: &str, choices: &[T]) -> T {
+    let names: Vec<String> = choices.iter().map(|choice| format!("{choice:?}").to_lowercase()).collect();
+    let place = match names.iter().position(|name| *name == wanted.to_lowercase()) {
+        Some(place) => place,
+        None if wanted.is_empty() => choices.len() - 1,
+        None => panic!("{variable} is \"{wanted}\"; this processor has {}", names.join(", ")),
+    };
+    choices[place]
 }
 
 /// Plain arrays: the oracle of the other tiers.
@@ -878,6 +893,19 @@ mod tests {
                 assert!(got.iter().zip(want).all(near), "{tier:?}, result {i}: {got:?} for {want:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_variable_chooses_the_tier() {
+        let tiers = [Tier::PORTABLE, Tier::detect()];
+        assert_eq!(choose("DEMC_TIER", "Portable", &tiers), tiers[0]);
+        assert_eq!(choose("DEMC_TIER", "", &tiers), tiers[1]);
+    }
+
+    #[test]
+    #[should_panic = "DEMC_TIER is \"avx1024\"; this processor has portable"]
+    fn an_unknown_tier_is_an_error() {
+        choose("DEMC_TIER", "avx1024", &Tier::available());
     }
 
     #[test]

@@ -7,6 +7,7 @@ use half::bf16;
 use super::{Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide, winograd::SQUARES};
 use crate::kernels::{
     conv::Geometry,
+    simd::choose,
     winograd::{PATCH, SIDE},
 };
 
@@ -73,13 +74,14 @@ impl Engine {
 
     /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `avx2`, `avxvnni`, `vnni`,
     /// `avx512`, `amx`) chooses a slower one, to compare them.
+    ///
+    /// # Panics
+    /// If the variable names none that this processor has.
     pub fn detect() -> Engine {
         static CHOICE: OnceLock<Engine> = OnceLock::new();
         *CHOICE.get_or_init(|| {
-            let engines = Engine::available();
-            let wanted = std::env::var("DEMC_ENGINE").unwrap_or_default().to_lowercase();
-            let named = engines.iter().find(|e| format!("{e:?}").to_lowercase() == wanted);
-            *named.or(engines.last()).expect("the portable engine is always available")
+            let wanted = std::env::var("DEMC_ENGINE").unwrap_or_default();
+            choose("DEMC_ENGINE", &wanted, &Engine::available())
         })
     }
 
