@@ -129,7 +129,7 @@ pub trait Simd: Copy {
             [Self::load(&own), Self::load(&near)]
         }
     }
-    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; see [`exp`](super::filter::exp).
+    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See [`exp`](super::filter::exp).
     ///
     /// # Safety
     /// See [`Simd::splat`].
@@ -636,8 +636,9 @@ mod x86 {
         // SAFETY: the caller's promise.
         unsafe {
             let limit = _mm256_set1_ps(LIMIT);
-            let x = _mm256_max_ps(x, _mm256_sub_ps(_mm256_setzero_ps(), limit));
-            let x = _mm256_min_ps(x, limit);
+            // Of a NaN and a number, both return the second.
+            let x = _mm256_max_ps(_mm256_sub_ps(_mm256_setzero_ps(), limit), x);
+            let x = _mm256_min_ps(limit, x);
             let n = _mm256_mul_ps(x, _mm256_set1_ps(std::f32::consts::LOG2_E));
             let n = _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(n);
             let r = _mm256_fnmadd_ps(n, _mm256_set1_ps(LN_2[0]), x);
@@ -794,8 +795,9 @@ mod x86 {
             // SAFETY: the caller's promise.
             unsafe {
                 let limit = _mm512_set1_ps(LIMIT);
-                let x = _mm512_max_ps(x, _mm512_sub_ps(_mm512_setzero_ps(), limit));
-                let x = _mm512_min_ps(x, limit);
+                // Of a NaN and a number, both return the second.
+                let x = _mm512_max_ps(_mm512_sub_ps(_mm512_setzero_ps(), limit), x);
+                let x = _mm512_min_ps(limit, x);
                 let log2_e = _mm512_set1_ps(std::f32::consts::LOG2_E);
                 let n = _mm512_roundscale_ps::<0>(_mm512_mul_ps(x, log2_e));
                 let r = _mm512_fnmadd_ps(n, _mm512_set1_ps(LN_2[0]), x);
@@ -906,6 +908,31 @@ mod tests {
     #[should_panic = "DEMC_TIER is \"avx1024\"; this processor has portable"]
     fn an_unknown_tier_is_an_error() {
         choose("DEMC_TIER", "avx1024", &Tier::available());
+    }
+
+    /// Beyond the limit it stays as it is there; what is no number stays none, so that it is seen.
+    #[test]
+    fn exponentials_end_at_the_limit() {
+        struct Exponentials<'a>(&'a mut [f32; LANES]);
+        impl Kernel for Exponentials<'_> {
+            #[inline(always)]
+            unsafe fn run<S: Simd>(self) {
+                // SAFETY: vectors are the tier's, sixteen values are read and written.
+                unsafe { S::write(self.0.as_mut_ptr(), S::exp(S::read(self.0.as_ptr()))) }
+            }
+        }
+        let mut values = [0.0; LANES];
+        values[..9].copy_from_slice(&[39.0, -39.0, 41.0, -41.0, f32::MAX, f32::INFINITY, 40.0, -40.0, 1.0]);
+        (values[9], values[10]) = (f32::NEG_INFINITY, f32::NAN);
+        for tier in Tier::available() {
+            let mut found = values;
+            tier.run(Exponentials(&mut found));
+            for (found, value) in found.into_iter().zip(values) {
+                let want = f64::from(value).clamp(-40.0, 40.0).exp();
+                let near = (f64::from(found) - want).abs() <= 4e-7 * want;
+                assert!(near || value.is_nan() && found.is_nan(), "{tier:?}: {found} for {value}");
+            }
+        }
     }
 
     #[test]
