@@ -84,8 +84,8 @@ impl Arithmetic {
         }
     }
 
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, rounded to a format or not. `taped` is
-    /// for training.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, of narrow weights rounded to a format or not.
+    /// `taped` is for training.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
@@ -103,10 +103,7 @@ impl Arithmetic {
                 let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
                 let convolve = if taped { convolve_taped } else { conv::convolve };
                 convolve(Tier::detect(), &views, weights, bias, self.geometry, epilogue, output.view_mut());
-                match format {
-                    Some(Format::Int8(steps)) => Data::Narrow(Operand::quantize(output.view(), steps)),
-                    _ => Data::F32(output),
-                }
+                Data::F32(output)
             }
             Packed::Narrow(weights) => {
                 let narrowed = self.narrowed(sources, weights);
