@@ -1,5 +1,6 @@
 //! GFLOP/s of the kernels beside the FMA peak of this machine: `cargo bench --bench kernels`.
-//! One FLOP is one item, so divan's "item/s" column is FLOP/s. `DEMC_TIER=avx2` benches that tier.
+//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by squares, of the FLOPs of the convolution tap by tap.
+//! `DEMC_TIER=avx2` benches that tier.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
@@ -11,6 +12,7 @@ use demc::kernels::{
     peak,
     simd::Tier,
     weight_grad::weight_gradient,
+    winograd,
 };
 use divan::{Bencher, counter::ItemsCount};
 
@@ -118,6 +120,23 @@ fn weight_gradient_of(bencher: Bencher, layer: Layer, geometry: Geometry) {
 #[divan::bench(args = LAYERS)]
 fn conv3x3(bencher: Bencher, layer: Layer) {
     forward(bencher, layer, Geometry::Same(3));
+}
+
+/// As training computes it, whose weights are new in every step.
+#[divan::bench(args = LAYERS.into_iter().filter(|layer| winograd::serves(layer.4)))]
+fn conv3x3_squares(bencher: Bencher, layer: Layer) {
+    let (n, i, o, h, w) = layer;
+    let tier = Tier::detect();
+    let (shape, out_shape) = (Shape::new(n, i, h, w), Shape::new(n, o, h, w));
+    let (x, mut out) = (blocks(shape.blocks()), blocks(out_shape.blocks()));
+    let weights = blocks(packed_len(&[i], o, Geometry::Same(3)));
+    let bias = blocks(o.div_ceil(LANES));
+    let relu = Epilogue { relu: true, accumulate: false };
+    bencher.counter(flops(layer, Geometry::Same(3))).bench_local(|| {
+        let weights = winograd::transform(tier, &weights, shape.planes());
+        let out = ViewMut::new(out_shape, &mut out);
+        winograd::convolve(tier, &[View::new(shape, &x)], &weights, &bias, relu, out);
+    });
 }
 
 #[divan::bench(args = LAYERS)]

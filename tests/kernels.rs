@@ -1,6 +1,8 @@
 //! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
 //! remainders included. The engines of narrow formats get values that these hold, and so must be as exact.
 
+use std::{env, process::Command};
+
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     conv::{Direction, Epilogue, Geometry, convolve, pack, packed_len, weight_index},
@@ -98,7 +100,7 @@ impl Arithmetic {
         geometry: Geometry,
         bias: &[Block],
         epilogue: Epilogue,
-        output: ViewMut,
+        mut output: ViewMut,
     ) {
         let (weights, inputs, outputs, direction, source) = weights;
         let used = match (direction, geometry) {
@@ -114,7 +116,7 @@ impl Arithmetic {
                 let mut packed = vec![Block::default(); len];
                 pack(weights, inputs, outputs, geometry, direction, source, &mut packed);
                 if matches!(self, Self::Squares(_)) && used == Geometry::Same(3) {
-                    let planes = sources.iter().map(|s| s.shape.planes()).sum();
+                    let planes = sources.iter().map(|s| s.shape().planes()).sum();
                     let weights = winograd::transform(tier, &packed, planes);
                     winograd::convolve(tier, sources, &weights, bias, epilogue, output);
                 } else {
@@ -128,25 +130,25 @@ impl Arithmetic {
                     sources.iter().map(|s| narrow::Operand::narrow(engine, *s, used)).collect();
                 let operands: Vec<_> = operands.iter().collect();
                 if !epilogue.accumulate {
+                    let shape = output.shape();
                     // What it writes in bfloat16 is what it writes in f32, rounded.
-                    let mut rounded = narrow::Operand::new(output.shape, Format::Bf16);
+                    let mut rounded = narrow::Operand::new(shape, Format::Bf16);
                     let to = narrow::conv::Output::Narrow(&mut rounded);
                     narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
-                    let to = narrow::conv::Output::F32(ViewMut::new(output.shape, output.data));
+                    let to = narrow::conv::Output::F32(ViewMut::new(shape, output.data()));
                     narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
-                    let mut widened = vec![Block::default(); output.data.len()];
-                    rounded.widen(ViewMut::new(output.shape, &mut widened));
-                    for (rounded, full) in widened.iter().zip(output.data.iter()) {
+                    let mut widened = vec![Block::default(); shape.blocks()];
+                    rounded.widen(ViewMut::new(shape, &mut widened));
+                    for (rounded, full) in widened.iter().zip(output.data().iter()) {
                         for (rounded, full) in rounded.0.iter().zip(full.0) {
                             assert_eq!(*rounded, half::bf16::from_f32(full).to_f32());
                         }
                     }
                     // What it writes as planes is that, unpacked.
-                    let shape = output.shape;
                     let factors = [1, 2].into_iter().filter(|f| shape.c.is_multiple_of(f * f));
                     for factor in factors.filter(|_| used != Geometry::Transposed) {
                         let mut unpacked = vec![0.0; shape.n * shape.c * shape.h * shape.w];
-                        from_blocked_shuffled(View::new(shape, output.data), 0, factor, &mut unpacked);
+                        from_blocked_shuffled(View::new(shape, output.data()), 0, factor, &mut unpacked);
                         let mut planes = vec![f32::NAN; unpacked.len()];
                         let to = narrow::conv::Output::Planes { shape, factor, values: &mut planes };
                         narrow::conv::convolve(engine, &operands, &packed, bias, epilogue, to);
@@ -172,8 +174,8 @@ impl Arithmetic {
     }
 }
 
-/// Forward, input gradient and weight gradient of one layer.
-fn check_layer(tier: Arithmetic, geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
+/// Forward, input gradient and weight gradient of one layer, computed in every way.
+fn check_layer(geometry: Geometry, shape: Shape, split: usize, outputs: usize, seed: u64) {
     let sources = if split == 0 || split >= shape.c { vec![shape.c] } else { vec![split, shape.c - split] };
     let (oh, ow) = geometry.output(shape.h, shape.w);
     let out_shape = shape.with_channels(outputs).with_size(oh, ow);
@@ -214,38 +216,46 @@ fn check_layer(tier: Arithmetic, geometry: Geometry, shape: Shape, split: usize,
     for (i, b) in bias.iter().enumerate() {
         bias_blocks[i / LANES].0[i % LANES] = *b;
     }
-    let mut out = vec![Block::default(); out_shape.blocks()];
-    let what = format!("{tier:?} {geometry:?} {shape:?} -> {outputs}");
-    let output = ViewMut::new(out_shape, &mut out);
-    tier.convolve(&views, forward, geometry, &bias_blocks, Epilogue::default(), output);
-    assert_close(&plain(out_shape, &out), &want, &format!("{what} forward"));
-    let relu = Epilogue { relu: true, accumulate: false };
-    tier.convolve(&views, forward, geometry, &bias_blocks, relu, ViewMut::new(out_shape, &mut out));
-    let rectified: Vec<f64> = want.iter().map(|v| v.max(0.0)).collect();
-    assert_close(&plain(out_shape, &out), &rectified, &format!("{what} relu"));
-
     let g_blocks = blocked(out_shape, &g);
     let g_view = View::new(out_shape, &g_blocks);
-    let mut dw = vec![0.0; w.len()];
-    for (index, (s, data, first)) in parts.iter().enumerate() {
-        tier.weight_gradient(View::new(*s, data), g_view, geometry, (*first, shape.c), &mut dw);
-        let mut dx = blocked(*s, &vec![0.5; s.n * s.c * pixels]);
-        let backward = (&w[..], &sources[..], outputs, Direction::Backward, index);
-        let add = Epilogue { relu: false, accumulate: true };
-        tier.convolve(&[g_view], backward, geometry, &[], add, ViewMut::new(*s, &mut dx));
-        let want: Vec<f64> = (0..shape.n)
-            .flat_map(|n| want_dx[(n * shape.c + first) * pixels..][..s.c * pixels].to_vec())
-            .map(|v| v + 0.5)
-            .collect();
-        assert_close(&plain(*s, &dx), &want, &format!("{what} input gradient {index}"));
+    for tier in Arithmetic::available() {
+        let mut out = vec![Block::default(); out_shape.blocks()];
+        let what = format!("{tier:?} {geometry:?} {shape:?} -> {outputs}");
+        let output = ViewMut::new(out_shape, &mut out);
+        tier.convolve(&views, forward, geometry, &bias_blocks, Epilogue::default(), output);
+        assert_close(&plain(out_shape, &out), &want, &format!("{what} forward"));
+        let relu = Epilogue { relu: true, accumulate: false };
+        tier.convolve(&views, forward, geometry, &bias_blocks, relu, ViewMut::new(out_shape, &mut out));
+        let rectified: Vec<f64> = want.iter().map(|v| v.max(0.0)).collect();
+        assert_close(&plain(out_shape, &out), &rectified, &format!("{what} relu"));
+
+        let mut dw = vec![0.0; w.len()];
+        for (index, (s, data, first)) in parts.iter().enumerate() {
+            tier.weight_gradient(View::new(*s, data), g_view, geometry, (*first, shape.c), &mut dw);
+            let mut dx = blocked(*s, &vec![0.5; s.n * s.c * pixels]);
+            let backward = (&w[..], &sources[..], outputs, Direction::Backward, index);
+            let add = Epilogue { relu: false, accumulate: true };
+            tier.convolve(&[g_view], backward, geometry, &[], add, ViewMut::new(*s, &mut dx));
+            let want: Vec<f64> = (0..shape.n)
+                .flat_map(|n| want_dx[(n * shape.c + first) * pixels..][..s.c * pixels].to_vec())
+                .map(|v| v + 0.5)
+                .collect();
+            assert_close(&plain(*s, &dx), &want, &format!("{what} input gradient {index}"));
+        }
+        assert_close(&dw, &want_dw, &format!("{what} weight gradient"));
     }
-    assert_close(&dw, &want_dw, &format!("{what} weight gradient"));
     let mut db = vec![0.0; outputs];
     bias_gradient(g_view, &mut db);
     let want_db: Vec<f64> = (0..outputs)
         .map(|o| (0..g.len()).filter(|i| i / (oh * ow) % outputs == o).map(|i| f64::from(g[i])).sum())
         .collect();
-    assert_close(&db, &want_db, &format!("{what} bias gradient"));
+    assert_close(&db, &want_db, &format!("{geometry:?} {shape:?} bias gradient"));
+}
+
+#[test]
+#[should_panic = "convolutions are 1x1, 3x3 or 5x5, not 4x4"]
+fn kernels_have_a_centre() {
+    Geometry::same(4);
 }
 
 fn geometry() -> impl Strategy<Value = Geometry> {
@@ -263,13 +273,11 @@ proptest! {
     #[test]
     fn layers_match_the_textbook_sum_on_every_tier(
         geometry in geometry(),
-        n in 1usize..3, c in 1usize..40, outputs in 1usize..50, h in 1usize..9, w in 1usize..56,
+        n in 1usize..3, c in 1usize..40, outputs in 1usize..50, h in 1usize..41, w in 1usize..56,
         split in 0usize..40, seed in any::<u64>(),
     ) {
         let shape = Shape { pad: 2, ..Shape::new(n, c, h, w) };
-        for arithmetic in Arithmetic::available() {
-            check_layer(arithmetic, geometry, shape, split, outputs, seed);
-        }
+        check_layer(geometry, shape, split, outputs, seed);
     }
 
     #[test]
@@ -300,6 +308,44 @@ proptest! {
             }
         }
     }
+}
+
+/// A band has several rows, and positions that are computed together end between two columns of a border.
+#[test]
+fn chunks_end_inside_borders() {
+    check_layer(Geometry::Same(5), Shape { pad: 2, ..Shape::new(1, 3, 61, 61) }, 0, 2, 7);
+}
+
+#[test]
+#[should_panic = "border too small"]
+fn weight_gradients_need_a_border() {
+    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
+    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
+    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
+    weight_gradient(Tier::detect(), x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+}
+
+#[test]
+#[should_panic = "border too small"]
+fn narrow_weight_gradients_need_a_border() {
+    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
+    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
+    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
+    Arithmetic::Bf16(Engine::detect()).weight_gradient(x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+}
+
+#[test]
+#[should_panic = "planes of all channels"]
+fn planes_hold_all_channels() {
+    let shape = Shape::new(1, 40, 4, 5);
+    let engine = Engine::detect();
+    let x = blocked(shape, &[1.0; 40 * 20]);
+    let x = narrow::Operand::narrow(engine, View::new(shape, &x), Geometry::Same(1));
+    let weights = [1.0; 40 * 40];
+    let weights = narrow::conv::Weights::pack(&weights, &[40], 40, Geometry::Same(1), Direction::Forward, 0);
+    let to = narrow::conv::Output::Planes { shape, factor: 1, values: &mut [0.0; 20] };
+    let bias = [Block::default(); 3];
+    narrow::conv::convolve(engine, &[&x], &weights, &bias, Epilogue::default(), to);
 }
 
 /// A layer in 8 bits whose factors are whole steps: exact, whatever the engine.
@@ -404,6 +450,18 @@ proptest! {
         for engine in Engine::available() {
             check_int8(engine, geometry, Shape::new(n, c, h, w), split, outputs, seed % 1000);
         }
+    }
+}
+
+/// The same once more on each tier: what rounds to 8 bits chooses the fastest itself.
+#[test]
+fn all_tiers_round_to_eight_bits() {
+    for tier in Tier::available() {
+        let mut tests = Command::new(env::current_exe().unwrap());
+        tests.arg("eight_bits_equal").env("DEMC_TIER", format!("{tier:?}").to_lowercase());
+        tests.env("PROPTEST_CASES", "32");
+        let run = tests.output().unwrap();
+        assert!(run.status.success(), "{tier:?}: {}", String::from_utf8_lossy(&run.stdout));
     }
 }
 

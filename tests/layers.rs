@@ -1,10 +1,13 @@
 //! Every layer against JAX: outputs, and gradients with respect to inputs and parameters.
 //!
 //! `data/layers.safetensors` holds what `data/make_layers.py` computed in float64; what may differ is
-//! the rounding of f32 alone.
+//! the rounding of f32 alone. What acts on planes is held against plain loops in f64 as well, whose rows are longer
+//! than a vector and whose logits are larger than any exponential of f32.
+
+use std::{env, process::Command};
 
 use demc::{
-    kernels::Shape,
+    kernels::{Shape, simd::Tier},
     models::network::Taped,
     nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
 };
@@ -299,6 +302,204 @@ fn dividing_by_another_albedo() {
     let [image, ratio] = ["image", "ratio"].map(|key| Field::input((n, 3, h, w), &case.images(key).as_vec()));
     let gradients = case.project(image.redivide(ratio, traced_field(&logits)).into_images());
     case.compare_image("d_logits", &gradients, &logits);
+}
+
+/// The extent of a batch and its values, most of them in -2..2. Every `large`th of them is -150 or 150.
+fn random(seed: u64, extent: (usize, usize, usize, usize), large: usize) -> Images {
+    let (n, c, h, w) = extent;
+    let mut rng = Rng::new(seed, 0);
+    let value = |i: usize| {
+        let value = 4.0 * rng.uniform() - 2.0;
+        if i % large == large - 1 { value.signum() * 150.0 } else { value }
+    };
+    Cpu::default().tensor_from_vec((0..n * c * h * w).map(value).collect(), extent)
+}
+
+/// No value of [`random`] is large.
+const NONE: usize = usize::MAX;
+
+#[track_caller]
+fn assert_near(got: &[f32], want: &[f64], what: &str) {
+    assert_eq!(got.len(), want.len(), "{what}");
+    let largest = want.iter().fold(0.0, |m: f64, w| m.max(w.abs()));
+    assert!(largest > 0.01, "{what} is as good as zero");
+    for (i, (g, w)) in got.iter().zip(want).enumerate() {
+        assert!((f64::from(*g) - w).abs() <= TOLERANCE * largest, "{what}[{i}]: {g} for {w}");
+    }
+}
+
+/// A layer's output against plain loops in f64, and its gradients with respect to all but the first `fixed` arguments
+/// against central differences of theirs.
+#[track_caller]
+fn check_by_differences<const N: usize>(
+    arguments: [Images; N],
+    fixed: usize,
+    layer: impl Fn(&[Images; N]) -> Field<Taped>,
+    plain: impl Fn(&[Vec<f64>; N]) -> Vec<f64>,
+) {
+    const STEP: f64 = 1e-4;
+    let mut values =
+        arguments.each_ref().map(|a| a.as_vec().into_iter().map(f64::from).collect::<Vec<f64>>());
+    let output = layer(&arguments).into_images();
+    assert_near(&output.as_vec(), &plain(&values), "output");
+    let r = random(99, *output.shape(), NONE);
+    let weights = r.as_vec();
+    let gradients = (output * r).sum::<Rank0, _>().backward();
+    let loss = |values: &_| -> f64 {
+        plain(values).iter().zip(&weights).map(|(output, r)| output * f64::from(*r)).sum()
+    };
+    for (argument, images) in arguments.iter().enumerate().skip(fixed) {
+        let difference = |at: usize| {
+            let value = values[argument][at];
+            let [up, down] = [STEP, -STEP].map(|step| {
+                values[argument][at] = value + step;
+                loss(&values)
+            });
+            values[argument][at] = value;
+            (up - down) / (2.0 * STEP)
+        };
+        let differences: Vec<f64> = (0..images.as_vec().len()).map(difference).collect();
+        assert_near(&gradients.get(images).as_vec(), &differences, &format!("gradient {argument}"));
+    }
+}
+
+/// `e^x`, flat beyond what the kernels tell apart.
+fn limited_exp(x: f64) -> f64 {
+    x.clamp(-40.0, 40.0).exp()
+}
+
+#[test]
+fn blending_as_plain_loops_do() {
+    let (n, h, w) = (2, 4, 22);
+    let arguments = [
+        random(1, (n, 3, h, w), NONE),
+        random(2, (n, 3, h / 2, w / 2), NONE),
+        random(3, (n, 1, h, w), 5),
+        random(4, (n, 4, h, w), 3),
+    ];
+    let layer = |images: &[Images; 4]| {
+        let [fine, coarse, alpha, corners] = images.each_ref().map(traced_field);
+        fine.blend(coarse, alpha, corners)
+    };
+    check_by_differences(arguments, 0, layer, |[fine, coarse, alpha, corners]| {
+        let near = |i: usize, len: usize| {
+            (i / 2, if i.is_multiple_of(2) { (i / 2).saturating_sub(1) } else { (i / 2 + 1).min(len - 1) })
+        };
+        let mut output = Vec::new();
+        for (image, c) in (0..n).flat_map(|image| (0..3).map(move |c| (image, c))) {
+            for (y, x) in (0..h).flat_map(|y| (0..w).map(move |x| (y, x))) {
+                let ((own_y, other_y), (own_x, other_x)) = (near(y, h / 2), near(x, w / 2));
+                let places = [(own_y, own_x), (own_y, other_x), (other_y, own_x), (other_y, other_x)];
+                let (mut sum, mut total) = (0.0, 0.0);
+                for (i, ((cy, cx), bilinear)) in places.into_iter().zip([9.0, 3.0, 3.0, 1.0]).enumerate() {
+                    let weight = bilinear * limited_exp(corners[((image * 4 + i) * h + y) * w + x]);
+                    sum += weight * coarse[((image * 3 + c) * (h / 2) + cy) * (w / 2) + cx];
+                    total += weight;
+                }
+                let share = 1.0 / (1.0 + limited_exp(-alpha[(image * h + y) * w + x]));
+                let fine = fine[((image * 3 + c) * h + y) * w + x];
+                output.push((1.0 - share) * fine + share * sum / total);
+            }
+        }
+        output
+    });
+}
+
+#[test]
+fn reducing_as_plain_loops_do() {
+    let (n, h, w) = (2, 4, 38);
+    let arguments = [random(1, (n, 3, h, w), NONE), random(2, (n, 1, h, w), 3)];
+    let layer = |[image, confidence]: &[Images; 2]| traced_field(image).reduce(traced_field(confidence));
+    check_by_differences(arguments, 0, layer, |[image, confidence]| {
+        let mut output = Vec::new();
+        for plane in 0..n * 3 {
+            for (y, x) in (0..h / 2).flat_map(|y| (0..w / 2).map(move |x| (y, x))) {
+                let (mut sum, mut total) = (0.0, 0.0);
+                for (y, x) in [(2 * y, 2 * x), (2 * y, 2 * x + 1), (2 * y + 1, 2 * x), (2 * y + 1, 2 * x + 1)]
+                {
+                    let weight = limited_exp(confidence[(plane / 3 * h + y) * w + x]);
+                    sum += weight * image[(plane * h + y) * w + x];
+                    total += weight;
+                }
+                output.push(sum / total);
+            }
+        }
+        output
+    });
+}
+
+#[test]
+fn amplifying_as_plain_loops_do() {
+    let extent = (2, 3, 3, 21);
+    let arguments = [random(1, extent, NONE), random(2, extent, 7)];
+    let layer = |[image, logits]: &[Images; 2]| traced_field(image).amplify(traced_field(logits));
+    check_by_differences(arguments, 0, layer, |[image, logits]| {
+        image.iter().zip(logits).map(|(value, logit)| value * (2.0 * (logit / 2.0).tanh()).exp()).collect()
+    });
+}
+
+#[test]
+fn redividing_as_plain_loops_do() {
+    let (n, h, w) = (2, 3, 21);
+    let arguments =
+        [random(1, (n, 3, h, w), NONE), random(2, (n, 3, h, w), NONE), random(3, (n, 1, h, w), 7)];
+    let layer = |[image, ratio, logits]: &[Images; 3]| {
+        let [image, ratio] = [image, ratio].map(|images| Field::input(*images.shape(), &images.as_vec()));
+        image.redivide(ratio, traced_field(logits))
+    };
+    check_by_differences(arguments, 2, layer, |[image, ratio, logits]| {
+        let divided = |(i, value): (usize, &f64)| {
+            let logit = logits[i / (3 * h * w) * h * w + i % (h * w)];
+            value * (ratio[i] / (1.0 + limited_exp(-logit))).exp()
+        };
+        image.iter().enumerate().map(divided).collect()
+    });
+}
+
+/// Channels of several blocks as planes, each its own and each four in a row a square.
+#[test]
+fn channels_become_planes_as_plain_loops_do() {
+    let (n, c, h, w) = (2, 37, 2, 19);
+    for (first, channels, factor) in [(3, 30, 1), (4, 32, 2)] {
+        let layer = |[x]: &[Images; 1]| Field::from_activation(traced(x), first, channels, factor);
+        check_by_differences([random(1, (n, c, h, w), NONE)], 0, layer, |[x]| {
+            let (planes, h2, w2) = (channels / (factor * factor), factor * h, factor * w);
+            let value = |i: usize| {
+                let (image, plane, y, x2) =
+                    (i / (planes * h2 * w2), i / (h2 * w2) % planes, i / w2 % h2, i % w2);
+                let channel = first + plane * factor * factor + y % factor * factor + x2 % factor;
+                x[((image * c + channel) * h + y / factor) * w + x2 / factor]
+            };
+            (0..n * planes * h2 * w2).map(value).collect()
+        });
+    }
+}
+
+/// Channels that two fields read: their gradient is the sum of what both send back.
+#[test]
+fn gradients_of_two_fields_of_the_same_channels_add_up() {
+    let (n, c, h, w) = (2, 20, 2, 19);
+    let layer = |[x]: &[Images; 1]| {
+        let (first, second) = (traced(x), traced(x));
+        let again = first.fork();
+        let product = Field::from_activation(first, 8, 8, 1).product(Field::from_activation(again, 12, 8, 1));
+        product.product(Field::from_activation(second, 0, 8, 1))
+    };
+    check_by_differences([random(1, (n, c, h, w), NONE)], 0, layer, |[x]| {
+        let at = |i: usize, first: usize| x[(i / (8 * h * w) * c + first) * h * w + i % (8 * h * w)];
+        (0..n * 8 * h * w).map(|i| at(i, 8) * at(i, 12) * at(i, 0)).collect()
+    });
+}
+
+/// The other tests once more on each tier: layers choose the fastest themselves.
+#[test]
+fn all_tiers_pass_these_tests() {
+    for tier in Tier::available() {
+        let mut tests = Command::new(env::current_exe().unwrap());
+        tests.args(["--skip", "all_tiers"]).env("DEMC_TIER", format!("{tier:?}").to_lowercase());
+        let run = tests.output().unwrap();
+        assert!(run.status.success(), "{tier:?}: {}", String::from_utf8_lossy(&run.stdout));
+    }
 }
 
 /// Channels 3..15 of 17 to planes of twice the size, and what they would be halved from.

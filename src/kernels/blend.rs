@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::{
     LANES,
-    filter::{Size, exp, logistic},
+    filter::{Size, exp, limited, logistic},
     simd::{Kernel, Simd, Tier},
 };
 
@@ -43,7 +43,7 @@ fn weights(logits: &[f32], pixels: usize, at: usize) -> [f32; CORNERS] {
     raw.map(|w| w * inverse)
 }
 
-/// What the network predicts for a blend.
+/// What the network predicts for a blend. Logits beyond +-40 count as that, and have no gradient.
 #[derive(Clone, Copy)]
 pub struct Masks<'a> {
     /// The share of the coarse level before its logistic, (1, H, W).
@@ -189,10 +189,11 @@ pub fn blend_gradient(
                     into.coarse[from] += weights[i] * g * share;
                 }
             }
-            into.alpha[at] += by_share * share * (1.0 - share);
+            into.alpha[at] += by_share * limited(masks.alpha[at], share * (1.0 - share));
             let mean: f32 = (0..CORNERS).map(|i| weights[i] * by_weight[i]).sum();
             for i in 0..CORNERS {
-                into.corners[i * n + at] += weights[i] * (by_weight[i] - mean);
+                let slope = limited(masks.corners[i * n + at], weights[i]);
+                into.corners[i * n + at] += slope * (by_weight[i] - mean);
             }
         }
     }

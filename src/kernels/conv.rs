@@ -27,7 +27,7 @@ pub struct Epilogue {
 /// The geometry of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Geometry {
-    /// k x k, stride 1, "same" zero padding; k is odd.
+    /// k x k, stride 1, "same" zero padding, for k of 1, 3 or 5; see [`Geometry::same`].
     Same(usize),
     /// Transposed 4x4, stride 2, padding 1: doubles rows and columns.
     Transposed,
@@ -36,6 +36,15 @@ pub enum Geometry {
 }
 
 impl Geometry {
+    /// [`Geometry::Same`] of a kernel that there are convolutions for.
+    ///
+    /// # Panics
+    /// If `k` is not 1, 3 or 5.
+    pub fn same(k: usize) -> Self {
+        assert!(matches!(k, 1 | 3 | 5), "convolutions are 1x1, 3x3 or 5x5, not {k}x{k}");
+        Self::Same(k)
+    }
+
     /// Taps, which is also how many 16x16 slabs a pair of planes has.
     pub fn taps(self) -> usize {
         match self {
@@ -58,6 +67,32 @@ impl Geometry {
         if self == Geometry::Transposed { Geometry::Strided } else { self }
     }
 
+    /// Output phases along each axis.
+    pub(super) fn spread(self) -> usize {
+        if self == Geometry::Transposed { 2 } else { 1 }
+    }
+
+    /// The taps of an output phase.
+    pub(super) fn taps_of(self, phase: usize) -> Vec<Tap> {
+        let tap = |side: usize, centre: usize, t: usize| {
+            let (ky, kx) = (t / side, t % side);
+            Tap { dy: signed(ky) - signed(centre), dx: signed(kx) - signed(centre), index: t }
+        };
+        match self {
+            Geometry::Same(k) => (0..k * k).map(|t| tap(k, k / 2, t)).collect(),
+            Geometry::Strided => (0..16).map(|t| tap(4, 1, t)).collect(),
+            // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
+            Geometry::Transposed => (0..4)
+                .map(|t| {
+                    let (py, px) = (phase / 2, phase % 2);
+                    let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
+                    let shift = |p: usize, k: usize| (signed(p) + 1 - signed(k)) / 2;
+                    Tap { dy: shift(py, ky), dx: shift(px, kx), index: 4 * ky + kx }
+                })
+                .collect(),
+        }
+    }
+
     /// The border an input needs so that no tap leaves it.
     pub(super) fn reach(self) -> usize {
         match self {
@@ -65,6 +100,18 @@ impl Geometry {
             Geometry::Transposed | Geometry::Strided => 1,
         }
     }
+}
+
+/// One tap of one output phase: the input pixel's offset from the output's place, and its place in the unpacked kernel.
+#[derive(Clone, Copy)]
+pub(super) struct Tap {
+    pub dy: isize,
+    pub dx: isize,
+    pub index: usize,
+}
+
+fn signed(v: usize) -> isize {
+    isize::try_from(v).expect("buffers fit in memory")
 }
 
 /// Blocks that packed weights take.
@@ -157,13 +204,6 @@ pub fn pack(
     }
 }
 
-/// One tap: where the input pixel lies, in blocks from the output pixel's, and which slab it uses.
-#[derive(Clone, Copy)]
-struct Tap {
-    input: isize,
-    slab: usize,
-}
-
 /// `output = epilogue(bias + conv(sources, weights))`, or `output += ...` when accumulating.
 ///
 /// `sources` are the input channels one after another, each with the same size; `weights` come from
@@ -184,11 +224,9 @@ pub fn convolve(
     let channels: Vec<usize> = sources.iter().map(|s| s.shape.c).collect();
     for source in sources {
         assert_eq!((source.shape.n, source.shape.h, source.shape.w), (input.n, input.h, input.w));
-        assert_eq!(source.data.len(), source.shape.blocks());
         assert!(source.shape.pad >= geometry.reach(), "border too small for {geometry:?}");
     }
     let out = output.shape;
-    assert_eq!(output.data.len(), out.blocks());
     assert_eq!((out.n, (out.h, out.w)), (input.n, geometry.output(input.h, input.w)));
     assert_eq!(weights.len(), packed_len(&channels, out.c, geometry));
     assert!(epilogue.accumulate || bias.len() == out.planes());
@@ -196,8 +234,7 @@ pub fn convolve(
     // Two output planes share every broadcast input where the tier has registers for both. Bands of
     // rows make enough tasks to keep every thread busy without cutting the rows themselves.
     let groups = out.planes().div_ceil(2);
-    let phases = if geometry == Geometry::Transposed { 2 } else { 1 };
-    let rows = out.h / phases;
+    let rows = out.h / geometry.spread();
     let bands = (64 / (out.n * groups).max(1)).clamp(1, rows.div_ceil(2).max(1));
     let band = rows.div_ceil(bands).max(1);
     let bands = rows.div_ceil(band);
@@ -234,6 +271,13 @@ struct Band<'a> {
     rows: (usize, usize),
 }
 
+/// A tap of the current phase: where the input pixel lies, in blocks from the output pixel's, and its slab of weights.
+#[derive(Clone, Copy)]
+struct Offset {
+    input: isize,
+    slab: usize,
+}
+
 /// An input plane of the current row and how many of its lanes are in use.
 #[derive(Clone, Copy)]
 struct Plane {
@@ -244,70 +288,42 @@ struct Plane {
 impl Kernel for Band<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        // SAFETY: `convolve` checked that every buffer has its shape's length and that the inputs'
+        // SAFETY: views are as long as their shapes say, and `convolve` checked all else, and that the inputs'
         // borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
         unsafe {
             // Every geometry goes through one of two loops: each further call site would compile all
             // tile widths again.
             if self.geometry == Geometry::Strided {
-                let taps = self.taps(0..16, |t| (t / 4, t % 4, (t / 4) as isize - 1, (t % 4) as isize - 1));
-                self.rows::<S, 2>(&taps, 1, (0, 0));
+                self.rows::<S, 2>(&self.offsets(0), 1, (0, 0));
                 return;
             }
-            let spread = if self.geometry == Geometry::Transposed { 2 } else { 1 };
-            for (py, px) in (0..spread).flat_map(|py| (0..spread).map(move |px| (py, px))) {
-                let taps = match self.geometry {
-                    Geometry::Same(k) => {
-                        let r = (k / 2) as isize;
-                        self.taps(0..k * k, |t| (t / k, t % k, (t / k) as isize - r, (t % k) as isize - r))
-                    }
-                    // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
-                    _ => self.taps(0..4, |t| {
-                        let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
-                        (ky, kx, (py as isize + 1 - ky as isize) / 2, (px as isize + 1 - kx as isize) / 2)
-                    }),
-                };
-                self.rows::<S, 1>(&taps, spread, (py, px));
+            let spread = self.geometry.spread();
+            for phase in 0..spread * spread {
+                self.rows::<S, 1>(&self.offsets(phase), spread, (phase / spread, phase % spread));
             }
         }
     }
 }
 
 impl Band<'_> {
-    /// Taps from `(ky, kx, dy, dx)`: the slab's place in the kernel and the input's offset.
-    #[inline(always)]
-    fn taps(
-        &self,
-        range: std::ops::Range<usize>,
-        place: impl Fn(usize) -> (usize, usize, isize, isize),
-    ) -> ([Tap; 25], usize) {
-        let k = if let Geometry::Same(k) = self.geometry { k } else { 4 };
-        let stride = self.sources[0].shape.row_stride() as isize;
-        let mut taps = [Tap { input: 0, slab: 0 }; 25];
-        let len = range.len();
-        for t in range {
-            let (ky, kx, dy, dx) = place(t);
-            taps[t] = Tap { input: dy * stride + dx, slab: (ky * k + kx) * LANES };
-        }
-        (taps, len)
+    /// The taps of an output phase.
+    fn offsets(&self, phase: usize) -> Vec<Offset> {
+        let stride = signed(self.sources[0].shape.row_stride());
+        let offset = |tap: Tap| Offset { input: tap.dy * stride + tap.dx, slab: tap.index * LANES };
+        self.geometry.taps_of(phase).into_iter().map(offset).collect()
     }
 
     /// Every row of the band for one output phase; `STEP` input pixels an output pixel.
     #[inline(always)]
-    unsafe fn rows<S: Simd, const STEP: usize>(
-        &self,
-        taps: &([Tap; 25], usize),
-        spread: usize,
-        phase: (usize, usize),
-    ) {
-        let taps = &taps.0[..taps.1];
+    unsafe fn rows<S: Simd, const STEP: usize>(&self, taps: &[Offset], spread: usize, phase: (usize, usize)) {
         let mut inputs: Vec<Plane> = Vec::with_capacity(64);
         for y in self.rows.0..self.rows.1 {
             inputs.clear();
             for source in self.sources {
                 let s = source.shape;
                 for plane in 0..s.planes() {
-                    let pixel = &source.data[s.row(self.n, plane, y * STEP)] as *const Block;
+                    // Of the whole activation, not of one block of it: taps walk from here over rows.
+                    let pixel = source.data.as_ptr().wrapping_add(s.row(self.n, plane, y * STEP));
                     inputs.push(Plane { pixel, lanes: s.lanes(plane) });
                 }
             }
@@ -331,7 +347,7 @@ impl Band<'_> {
     #[inline(always)]
     unsafe fn row<S: Simd, const STEP: usize, const OUT: usize>(
         &self,
-        taps: &[Tap],
+        taps: &[Offset],
         inputs: &[Plane],
         plane: usize,
         output: [*mut Block; OUT],
@@ -364,7 +380,7 @@ impl Band<'_> {
 /// `PX` neighbouring pixels of `OUT` output planes.
 struct Tile<'a, const OUT: usize> {
     band: &'a Band<'a>,
-    taps: &'a [Tap],
+    taps: &'a [Offset],
     inputs: &'a [Plane],
     plane: usize,
     output: [*mut Block; OUT],

@@ -66,7 +66,7 @@ pub struct FilterGradient<'a> {
     pub confidence: Option<&'a mut [f32]>,
 }
 
-/// `e^x` to 2e-7 relative within +-[`LIMIT`]: 2^n times a polynomial on +-0.5 ln 2.
+/// `e^x` to 2e-7 relative within +-[`LIMIT`], and as at that limit beyond: 2^n times a polynomial on +-0.5 ln 2.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-LIMIT, LIMIT);
@@ -79,6 +79,12 @@ pub fn exp(x: f32) -> f32 {
     let e = (p * r * r + r) + 1.0;
     let bits = (shifted.to_bits() << 23).wrapping_add(127 << 23);
     e * f32::from_bits(bits)
+}
+
+/// The slope of what has this slope as long as [`exp`] of `x` has one: beyond its limit it has none.
+#[inline(always)]
+pub(super) fn limited(x: f32, slope: f32) -> f32 {
+    if x.abs() <= LIMIT { slope } else { 0.0 }
 }
 
 /// The logistic function.
@@ -408,8 +414,8 @@ impl Kernel for Backward<'_, '_> {
     }
 }
 
-/// Halves (3, H, W): each 2x2 square weighted by `exp(confidence)`. `total` (1, H/2, W/2) gets the sums
-/// of weights.
+/// Halves (3, H, W): each 2x2 square weighted by `exp(confidence)`, where confidence beyond +-40 counts as that and
+/// has no gradient. `total` (1, H/2, W/2) gets the sums of weights.
 ///
 /// # Panics
 /// If lengths do not fit, or rows or columns are odd.
@@ -479,9 +485,10 @@ pub fn reduce_gradient(
         for x in 0..size.w {
             let (at, to) = (y * size.w + x, (y / 2) * w + x / 2);
             let weight = exp(confidence[at]) / total[to];
+            let slope = limited(confidence[at], weight);
             for c in 0..3 {
                 let g = output_gradient[c * h * w + to];
-                into_confidence[at] += g * weight * (image[c * n + at] - output[c * h * w + to]);
+                into_confidence[at] += g * slope * (image[c * n + at] - output[c * h * w + to]);
                 if let Some(into) = &mut into_image {
                     into[c * n + at] += g * weight;
                 }

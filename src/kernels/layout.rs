@@ -86,19 +86,19 @@ pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &
     each_band(to.map, |n, plane, rows| Tier::detect().run(Unpack { to, input, n, plane, rows }));
 }
 
-/// The inverse of [`from_blocked_shuffled`], which leaves every other channel as it is.
+/// Adds planes to the channels that [`from_blocked_shuffled`] makes planes of; every other channel stays as it is.
 ///
 /// # Panics
 /// As [`from_blocked_shuffled`].
-pub fn to_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: ViewMut) {
+pub fn add_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: ViewMut) {
     pack(input, first, factor, output, true);
 }
 
-/// What both of them do; `keep` the other lanes of a block as they are, or else they become zero.
-fn pack(input: &[f32], first: usize, factor: usize, output: ViewMut, keep: bool) {
+/// What both of them do: `add` to what a block holds, or else lanes without a value become zero.
+fn pack(input: &[f32], first: usize, factor: usize, output: ViewMut, add: bool) {
     let map = Map::new(output.shape, first, factor, input.len());
     let blocks = Shared(output.data.as_mut_ptr());
-    each_band(map, |n, plane, rows| Tier::detect().run(Pack { map, input, blocks, n, plane, rows, keep }));
+    each_band(map, |n, plane, rows| Tier::detect().run(Pack { map, input, blocks, n, plane, rows, add }));
 }
 
 /// Runs `work(image, blocked plane, rows)` over everything that `map` covers.
@@ -265,22 +265,22 @@ struct Pack<'a> {
     n: usize,
     plane: usize,
     rows: std::ops::Range<usize>,
-    /// Whether the lanes of other channels stay as they are.
-    keep: bool,
+    /// Whether to add to what is there.
+    add: bool,
 }
 
 impl Kernel for Pack<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Self { map, input, blocks, n, plane, rows, keep } = self;
+        let Self { map, input, blocks, n, plane, rows, add } = self;
         let s = map.shape;
         for y in rows {
             // SAFETY: vectors are the tier's; the row's blocks belong to this task.
             unsafe {
                 let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y)), s.w);
                 match map.factor {
-                    1 => map.gather::<S, LANES>(input, (n, plane), (y, 0), keep, row),
-                    _ => map.gather::<S, PAIRS>(input, (n, plane), (y, 0), keep, row),
+                    1 => map.gather::<S, LANES>(input, (n, plane), (y, 0), add, row),
+                    _ => map.gather::<S, PAIRS>(input, (n, plane), (y, 0), add, row),
                 }
             }
         }
@@ -289,8 +289,8 @@ impl Kernel for Pack<'_> {
 
 impl Map {
     /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the planes hold of its
-    /// channels; `keep` the lanes of other channels as they are, or else they become zero. Each of the `N` groups of
-    /// channels of a blocked plane is a run of values in its row.
+    /// channels, other lanes with zeros; or does `add` it to what the blocks hold. Each of the `N` groups of channels of a
+    /// blocked plane is a run of values in its row.
     ///
     /// # Safety
     /// The processor has the instructions of `S`.
@@ -300,24 +300,24 @@ impl Map {
         input: &[f32],
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
-        keep: bool,
+        add: bool,
         blocks: &mut [Block],
     ) where
         Channels: Groups<S, N>,
     {
         let lanes = self.lanes(plane);
-        let keep = keep && lanes.len() < LANES;
         for (blocks, x) in blocks.chunks_mut(N).zip((x..).step_by(N)) {
             let count = blocks.len() * self.factor;
             // SAFETY: the caller's promise; as many values are read as there are.
             unsafe {
                 let mut groups = [S::splat(0.0); N];
-                if keep {
+                if add {
                     groups = Channels::transpose(load::<S, N>(blocks, &Unchanged));
                 }
                 for group in lanes.start / self.factor..lanes.end / self.factor {
                     let from = &input[self.value(n, plane, group * self.factor, y, x)..][..count];
-                    groups[group] = S::read_some(from.as_ptr(), 0..count, 0.0);
+                    let values = S::read_some(from.as_ptr(), 0..count, 0.0);
+                    groups[group] = if add { S::add(groups[group], values) } else { values };
                 }
                 for (block, vector) in blocks.iter_mut().zip(Channels::transpose(groups)) {
                     S::store(block, vector);

@@ -1,8 +1,9 @@
-//! Convolution arithmetic on `f32`: slices in, slices out, no type of the project.
+//! The arithmetic of networks and image filters: slices in, slices out, no type of the project.
 //!
-//! Activations are stored channel-blocked and padded (NCHW16c): a [`Block`] is 16 consecutive channels
+//! Activations of networks are stored channel-blocked and padded (NCHW16c): a [`Block`] is 16 consecutive channels
 //! of one pixel, a plane is `(h + 2 pad) x (w + 2 pad)` blocks whose border is zero, and an image is
-//! `ceil(c / 16)` planes. Lanes beyond `c` are zero in every activation.
+//! `ceil(c / 16)` planes. Lanes beyond `c` are zero in every activation. Images that are filtered are planar. Values are
+//! f32; those of [`narrow`] convolutions have 16 or 8 bits.
 //!
 //! Each kernel is written once, generic over [`simd::Simd`]; the portable instance is the oracle of
 //! the AVX2 and AVX-512 ones, and [`simd::Tier`] chooses among them once at run time.
@@ -119,18 +120,16 @@ impl Shape {
 /// A blocked activation to read.
 #[derive(Clone, Copy)]
 pub struct View<'a> {
-    /// Its extent.
-    pub shape: Shape,
+    shape: Shape,
     /// `shape.blocks()` blocks.
-    pub data: &'a [Block],
+    data: &'a [Block],
 }
 
 /// A blocked activation to write. Kernels write interiors only: borders stay as they are.
 pub struct ViewMut<'a> {
-    /// Its extent.
-    pub shape: Shape,
+    shape: Shape,
     /// `shape.blocks()` blocks.
-    pub data: &'a mut [Block],
+    data: &'a mut [Block],
 }
 
 impl<'a> View<'a> {
@@ -142,6 +141,16 @@ impl<'a> View<'a> {
         assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
         Self { shape, data }
     }
+
+    /// Its extent.
+    pub fn shape(self) -> Shape {
+        self.shape
+    }
+
+    /// As many blocks as its shape has.
+    pub fn data(self) -> &'a [Block] {
+        self.data
+    }
 }
 
 impl<'a> ViewMut<'a> {
@@ -152,6 +161,16 @@ impl<'a> ViewMut<'a> {
     pub fn new(shape: Shape, data: &'a mut [Block]) -> Self {
         assert_eq!(data.len(), shape.blocks(), "data must hold {shape:?}");
         Self { shape, data }
+    }
+
+    /// Its extent.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// As many blocks as its shape has.
+    pub fn data(&mut self) -> &mut [Block] {
+        self.data
     }
 }
 

@@ -129,7 +129,7 @@ pub trait Simd: Copy {
             [Self::load(&own), Self::load(&near)]
         }
     }
-    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; see [`exp`](super::filter::exp).
+    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See [`exp`](super::filter::exp).
     ///
     /// # Safety
     /// See [`Simd::splat`].
@@ -238,13 +238,14 @@ impl Tier {
 
     /// The fastest tier, found once. The environment variable `DEMC_TIER` (`portable`, `avx2`,
     /// `avx512`) chooses a slower one, to compare them.
+    ///
+    /// # Panics
+    /// If the variable names none that this processor has.
     pub fn detect() -> Tier {
         static CHOICE: OnceLock<Tier> = OnceLock::new();
         *CHOICE.get_or_init(|| {
-            let tiers = Tier::available();
-            let wanted = std::env::var("DEMC_TIER").unwrap_or_default().to_lowercase();
-            let named = tiers.iter().find(|t| format!("{t:?}").to_lowercase() == wanted);
-            *named.or(tiers.last()).expect("the portable tier is always available")
+            let wanted = std::env::var("DEMC_TIER").unwrap_or_default();
+            choose("DEMC_TIER", &wanted, &Tier::available())
         })
     }
 
@@ -261,6 +262,20 @@ impl Tier {
             Isa::Avx512 => unsafe { x86::run_avx512(kernel) },
         }
     }
+}
+
+/// The one of `choices` that an environment variable names, or the last where it names nothing.
+///
+/// # Panics
+/// If it names another.
+pub(super) fn choose<T: Copy + fmt::Debug>(variable: &str, wanted: &str, choices: &[T]) -> T {
+    let names: Vec<String> = choices.iter().map(|choice| format!("{choice:?}").to_lowercase()).collect();
+    let place = match names.iter().position(|name| *name == wanted.to_lowercase()) {
+        Some(place) => place,
+        None if wanted.is_empty() => choices.len() - 1,
+        None => panic!("{variable} is \"{wanted}\"; this processor has {}", names.join(", ")),
+    };
+    choices[place]
 }
 
 /// Plain arrays: the oracle of the other tiers.
@@ -621,8 +636,9 @@ mod x86 {
         // SAFETY: the caller's promise.
         unsafe {
             let limit = _mm256_set1_ps(LIMIT);
-            let x = _mm256_max_ps(x, _mm256_sub_ps(_mm256_setzero_ps(), limit));
-            let x = _mm256_min_ps(x, limit);
+            // Of a NaN and a number, both return the second.
+            let x = _mm256_max_ps(_mm256_sub_ps(_mm256_setzero_ps(), limit), x);
+            let x = _mm256_min_ps(limit, x);
             let n = _mm256_mul_ps(x, _mm256_set1_ps(std::f32::consts::LOG2_E));
             let n = _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(n);
             let r = _mm256_fnmadd_ps(n, _mm256_set1_ps(LN_2[0]), x);
@@ -779,8 +795,9 @@ mod x86 {
             // SAFETY: the caller's promise.
             unsafe {
                 let limit = _mm512_set1_ps(LIMIT);
-                let x = _mm512_max_ps(x, _mm512_sub_ps(_mm512_setzero_ps(), limit));
-                let x = _mm512_min_ps(x, limit);
+                // Of a NaN and a number, both return the second.
+                let x = _mm512_max_ps(_mm512_sub_ps(_mm512_setzero_ps(), limit), x);
+                let x = _mm512_min_ps(limit, x);
                 let log2_e = _mm512_set1_ps(std::f32::consts::LOG2_E);
                 let n = _mm512_roundscale_ps::<0>(_mm512_mul_ps(x, log2_e));
                 let r = _mm512_fnmadd_ps(n, _mm512_set1_ps(LN_2[0]), x);
@@ -876,6 +893,44 @@ mod tests {
             for (i, (got, want)) in of(tier).iter().zip(&want).enumerate() {
                 let near = |(a, b): (&f32, &f32)| (a - b).abs() <= 4e-7 * b.abs();
                 assert!(got.iter().zip(want).all(near), "{tier:?}, result {i}: {got:?} for {want:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_variable_chooses_the_tier() {
+        let tiers = [Tier::PORTABLE, Tier::detect()];
+        assert_eq!(choose("DEMC_TIER", "Portable", &tiers), tiers[0]);
+        assert_eq!(choose("DEMC_TIER", "", &tiers), tiers[1]);
+    }
+
+    #[test]
+    #[should_panic = "DEMC_TIER is \"avx1024\"; this processor has portable"]
+    fn an_unknown_tier_is_an_error() {
+        choose("DEMC_TIER", "avx1024", &Tier::available());
+    }
+
+    /// Beyond the limit it stays as it is there; what is no number stays none, so that it is seen.
+    #[test]
+    fn exponentials_end_at_the_limit() {
+        struct Exponentials<'a>(&'a mut [f32; LANES]);
+        impl Kernel for Exponentials<'_> {
+            #[inline(always)]
+            unsafe fn run<S: Simd>(self) {
+                // SAFETY: vectors are the tier's, sixteen values are read and written.
+                unsafe { S::write(self.0.as_mut_ptr(), S::exp(S::read(self.0.as_ptr()))) }
+            }
+        }
+        let mut values = [0.0; LANES];
+        values[..9].copy_from_slice(&[39.0, -39.0, 41.0, -41.0, f32::MAX, f32::INFINITY, 40.0, -40.0, 1.0]);
+        (values[9], values[10]) = (f32::NEG_INFINITY, f32::NAN);
+        for tier in Tier::available() {
+            let mut found = values;
+            tier.run(Exponentials(&mut found));
+            for (found, value) in found.into_iter().zip(values) {
+                let want = f64::from(value).clamp(-40.0, 40.0).exp();
+                let near = (f64::from(found) - want).abs() <= 4e-7 * want;
+                assert!(near || value.is_nan() && found.is_nan(), "{tier:?}: {found} for {value}");
             }
         }
     }

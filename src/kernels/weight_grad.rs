@@ -34,7 +34,7 @@ pub fn clear() {
 /// of threads.
 ///
 /// # Panics
-/// If sizes or lengths do not fit together.
+/// If sizes, borders or lengths do not fit together.
 pub fn weight_gradient(
     tier: Tier,
     source: View,
@@ -46,7 +46,9 @@ pub fn weight_gradient(
     let (s, g) = (source.shape, output_gradient.shape);
     assert!(geometry != Geometry::Strided, "the strided convolution has no weights of its own");
     assert_eq!((g.n, (g.h, g.w)), (s.n, geometry.output(s.h, s.w)));
-    assert_eq!((source.data.len(), output_gradient.data.len()), (s.blocks(), g.blocks()));
+    // Taps move over the input, or over the gradient where that has more pixels.
+    let moved = if geometry == Geometry::Transposed { g } else { s };
+    assert!(moved.pad >= geometry.reach(), "border too small for {geometry:?}");
     let taps = geometry.taps();
     assert_eq!(gradient.len(), inputs * g.c * taps);
 
@@ -138,7 +140,7 @@ struct Pair<'a> {
 impl Kernel for Pair<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        // SAFETY: `weight_gradient` checked the lengths; every task owns its slabs.
+        // SAFETY: `weight_gradient` checked sizes and borders; every task owns its slabs.
         unsafe {
             let (first, end) = self.outputs;
             // Accumulators stay in registers: of 2 output planes x 8 lanes of the input or of 1 x 8, or of
@@ -217,7 +219,7 @@ impl Pair<'_> {
         } else {
             (0, (ky - 1) * g.row_stride() as isize + kx - 1)
         };
-        // SAFETY: borders cover the taps' reach; `weight_gradient` checked the lengths.
+        // SAFETY: borders cover the taps' reach, as `weight_gradient` checked; views are as long as their shapes say.
         unsafe {
             let mut acc: [[S::V; CHUNK]; OUT] =
                 std::array::from_fn(|o| std::array::from_fn(|c| S::load(slabs[o].add(c))));

@@ -191,7 +191,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
     /// The largest of the values, or 0.
     pub(super) fn peak(&self) -> f32 {
         let values = self.fork().into_f32();
-        values.saved.data.view().data.iter().flat_map(|block| block.0).fold(0.0, f32::max)
+        values.saved.data.view().data().iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
     /// Wraps the output of an operation.

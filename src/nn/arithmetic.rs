@@ -84,8 +84,8 @@ impl Arithmetic {
         }
     }
 
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, rounded to a format or not. `taped` is
-    /// for training.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, of narrow weights rounded to a format or not.
+    /// `taped` is for training.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
@@ -103,10 +103,7 @@ impl Arithmetic {
                 let views: Vec<View> = sources.iter().map(|s| s.view()).collect();
                 let convolve = if taped { convolve_taped } else { conv::convolve };
                 convolve(Tier::detect(), &views, weights, bias, self.geometry, epilogue, output.view_mut());
-                match format {
-                    Some(Format::Int8(steps)) => Data::Narrow(Operand::quantize(output.view(), steps)),
-                    _ => Data::F32(output),
-                }
+                Data::F32(output)
             }
             Packed::Narrow(weights) => {
                 let narrowed = self.narrowed(sources, weights);
@@ -186,7 +183,7 @@ impl Arithmetic {
                     narrow::weight_grad::weight_gradient(engine, &channels, pairs, (first, total), into);
                 }
             }
-            first += source.shape.c;
+            first += source.shape().c;
         }
     }
 
@@ -200,7 +197,7 @@ impl Arithmetic {
         move |index, into, accumulate| {
             let Self { inputs, outputs, geometry, .. } = self;
             let epilogue = Epilogue { relu: false, accumulate };
-            let zero = vec![Block::default(); into.shape.planes()];
+            let zero = vec![Block::default(); into.shape().planes()];
             match &operand {
                 None => {
                     let mut packed =
@@ -236,8 +233,8 @@ fn convolve_taped(
     epilogue: Epilogue,
     output: ViewMut,
 ) {
-    if geometry == Geometry::Same(3) && winograd::serves(output.shape.w) {
-        let planes = sources.iter().map(|source| source.shape.planes()).sum();
+    if geometry == Geometry::Same(3) && winograd::serves(output.shape().w) {
+        let planes = sources.iter().map(|source| source.shape().planes()).sum();
         let weights = winograd::transform(tier, weights, planes);
         winograd::convolve(tier, sources, &weights, bias, epilogue, output);
     } else {

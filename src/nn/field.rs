@@ -14,7 +14,7 @@ use crate::kernels::{
     blend::{BlendGradient, CORNERS, Masks, Place, blend, blend_gradient},
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     gain::{amplify, amplify_gradient},
-    layout::{from_blocked_shuffled, to_blocked_shuffled},
+    layout::{add_blocked_shuffled, from_blocked_shuffled},
     redivide::{redivide, redivide_gradient},
     simd::Tier,
     vectorised::CHUNK,
@@ -164,7 +164,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
                     if fresh {
                         into.fill(Default::default());
                     }
-                    to_blocked_shuffled(&gradient, first, factor, into.view_mut());
+                    add_blocked_shuffled(&gradient, first, factor, into.view_mut());
                 });
                 Ok(())
             });
@@ -174,6 +174,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 
     /// Filters the field, (N, 3, H, W), by k x k kernels: `logits` (N, k*k, H, W) and, where neighbours
     /// are not all to be trusted alike, `confidence` (N, 1, H, W). See [`Filter`].
+    ///
+    /// # Panics
+    /// If extents do not fit together, or k is even.
     pub fn filter(self, logits: Self, confidence: Option<Self>) -> Self {
         let (images, _, h, w) = self.extent();
         let k = logits.extent().1.isqrt();
@@ -226,6 +229,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
 
     /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each 2x2 square weighted by
     /// `exp(confidence)`, (N, 1, H, W). See [`reduce`].
+    ///
+    /// # Panics
+    /// If extents do not fit together, or rows or columns are odd.
     pub fn reduce(self, confidence: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let quarter = h * w / 4;
@@ -425,6 +431,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic is
     /// `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W).
     /// See [`crate::kernels::blend`].
+    ///
+    /// # Panics
+    /// If extents do not fit together.
     pub fn blend(self, coarse: Self, alpha: Self, corners: Self) -> Self {
         let (images, _, h, w) = self.extent();
         let (pixels, quarter) = (h * w, h * w / 4);
@@ -518,6 +527,9 @@ impl Field<NoneTape> {
 
     /// [`Field::filter`], all alike, of some rows of fields that hold more rows of one image each: `logits` are of
     /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
+    ///
+    /// # Panics
+    /// As [`Field::filter`], or if there are not as many rows.
     pub fn filter_rows<const N: usize>(
         fields: [&Self; N],
         rows: (usize, usize),
@@ -536,6 +548,9 @@ impl Field<NoneTape> {
     }
 
     /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)
+    ///
+    /// # Panics
+    /// As [`Field::blend`], or if a coarse row next to a fine one is not there.
     pub fn blend_rows(&self, place: Place, coarse: &Self, alpha: &Self, corners: &Self) -> Self {
         let (_, _, h, w) = self.extent();
         let mut output = plane_buffer(3 * h * w);

@@ -47,8 +47,11 @@ const RANGE_MARGIN: f32 = 2.0;
 
 impl Conv {
     /// A k x k convolution with ReLU from sources of `inputs` channels to `outputs`.
+    ///
+    /// # Panics
+    /// If `k` is not 1, 3 or 5.
     pub fn new(rng: &mut Rng, name: &str, inputs: &[usize], outputs: usize, k: usize, init: Init) -> Self {
-        Self::with_geometry(rng, name, inputs, outputs, Geometry::Same(k), init)
+        Self::with_geometry(rng, name, inputs, outputs, Geometry::same(k), init)
     }
 
     /// A transposed 4x4 convolution of stride 2 with ReLU, beginning as bilinear upsampling.
@@ -490,7 +493,7 @@ impl BatchNorm {
                 // Sums of g and of g * normalised input, each channel.
                 let mut sums = vec![(0.0f64, 0.0f64); shape.c];
                 each_row(shape, |c0, row| {
-                    for (x, g) in source.data.view().data[row.clone()].iter().zip(&gradient[row]) {
+                    for (x, g) in source.data.view().data()[row.clone()].iter().zip(&gradient[row]) {
                         for (l, sum) in sums[c0..].iter_mut().take(LANES).enumerate() {
                             let normal = (x.0[l] - moments[c0 + l].0) * inverse[c0 + l];
                             sum.0 += f64::from(g.0[l]);
@@ -506,7 +509,7 @@ impl BatchNorm {
                     each_row(shape, |c0, row| {
                         let lanes = (shape.c - c0).min(LANES);
                         for at in row {
-                            let (x, g) = (source.data.view().data[at].0, gradient[at].0);
+                            let (x, g) = (source.data.view().data()[at].0, gradient[at].0);
                             for l in 0..lanes {
                                 let c = c0 + l;
                                 let normal = (x[l] - moments[c].0) * inverse[c];

@@ -16,7 +16,7 @@ use super::{
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
-    conv::{Direction, Epilogue, Geometry, weight_index},
+    conv::{self, Direction, Epilogue, Geometry, weight_index},
     layout::{Finish, Unpacked},
     simd::{Kernel, Simd, Tier},
     winograd::SIDE,
@@ -32,45 +32,19 @@ struct Tap {
     index: usize,
 }
 
-/// Output phases along each axis.
-fn spread(geometry: Geometry) -> usize {
-    if geometry == Geometry::Transposed { 2 } else { 1 }
-}
-
 /// The taps of an output phase, those of the first input phase first.
 fn taps_of(geometry: Geometry, phase: usize) -> Vec<Tap> {
-    let (py, px) = (phase / spread(geometry), phase % spread(geometry));
-    let signed = |v: usize| isize::try_from(v).expect("kernels are small");
-    match geometry {
-        Geometry::Same(k) => (0..k * k)
-            .map(|t| Tap {
-                phase: 0,
-                dy: signed(t / k) - signed(k / 2),
-                dx: signed(t % k) - signed(k / 2),
-                index: t,
-            })
-            .collect(),
-        // out[2m + p] = sum over k in {1, 3} (p = 0) or {0, 2} (p = 1) of w[k] in[m + (p + 1 - k) / 2].
-        Geometry::Transposed => (0..4)
-            .map(|t| {
-                let (ky, kx) = (1 - py + 2 * (t / 2), 1 - px + 2 * (t % 2));
-                let shift = |p: usize, k: usize| (signed(p) + 1 - signed(k)) / 2;
-                Tap { phase: 0, dy: shift(py, ky), dx: shift(px, kx), index: 4 * ky + kx }
-            })
-            .collect(),
-        // out[m] = sum over k of w[k] in[2m + k - 1]: pixel (k - 1) mod 2 of the square at m + (k - 1) div 2.
-        Geometry::Strided => {
-            let mut taps: Vec<Tap> = (0..16)
-                .map(|t| {
-                    let (ky, kx) = (signed(t / 4) - 1, signed(t % 4) - 1);
-                    let phase = (2 * ky.rem_euclid(2) + kx.rem_euclid(2)).unsigned_abs();
-                    Tap { phase, dy: ky.div_euclid(2), dx: kx.div_euclid(2), index: t }
-                })
-                .collect();
-            taps.sort_by_key(|t| t.phase);
-            taps
-        }
-    }
+    // Of steps of two, the input at 2m + d is pixel d mod 2 of the square at m + d div 2.
+    let step = if geometry == Geometry::Strided { 2 } else { 1 };
+    let of_phase = |tap: conv::Tap| Tap {
+        phase: (step * tap.dy.rem_euclid(step) + tap.dx.rem_euclid(step)).unsigned_abs(),
+        dy: tap.dy.div_euclid(step),
+        dx: tap.dx.div_euclid(step),
+        index: tap.index,
+    };
+    let mut taps: Vec<Tap> = geometry.taps_of(phase).into_iter().map(of_phase).collect();
+    taps.sort_by_key(|tap| tap.phase);
+    taps
 }
 
 /// The terms of a phase over all planes of an operand: `(plane without phase, tap)`.
@@ -157,7 +131,7 @@ impl Weights {
         let channels: Vec<Steps> = channels.collect();
         let total = channels.len();
         assert_eq!(weights.len(), total * outputs * taps);
-        let spread = spread(geometry);
+        let spread = geometry.spread();
         assert!(spread == 1 || channels.iter().all(|steps| steps.zero == 0), "phases have sums of their own");
         let phases: Vec<Vec<Tap>> = (0..spread * spread).map(|phase| taps_of(geometry, phase)).collect();
         let in_16_bits = engine.adds_in_16_bits(geometry);
@@ -223,7 +197,7 @@ impl Weights {
         let format = inputs[0].1;
         // Channels of a row of weights.
         let side = WORD * format.channels() / size_of::<Wide>();
-        let spread = spread(geometry);
+        let spread = geometry.spread();
         let terms: Vec<(usize, Tap)> =
             (0..spread * spread).flat_map(|phase| terms(geometry, planes.len(), phase)).collect();
         let mut rows = vec![Wide::ZERO; outputs.div_ceil(LANES) * terms.len() * LANES];
@@ -338,7 +312,7 @@ pub fn convolve(
 ) {
     let (grid, out) = (sources[0].grid, output.shape());
     let geometry = weights.geometry;
-    let spread = spread(geometry);
+    let spread = geometry.spread();
     assert!(sources.iter().all(|s| s.grid == grid && s.shape.n == out.n), "sources differ in size");
     assert!(
         sources.iter().map(|s| (s.shape.c, s.format)).eq(weights.inputs.iter().copied()),
@@ -382,10 +356,7 @@ pub fn convolve(
     let band = grid.h.div_ceil(bands).next_multiple_of(if by_squares { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
     let (target, step) = match output {
-        Output::F32(view) => {
-            assert_eq!(view.data.len(), out.blocks());
-            (Target::F32(Shared(view.data.as_mut_ptr())), 1.0)
-        }
+        Output::F32(view) => (Target::F32(Shared(view.data.as_mut_ptr())), 1.0),
         Output::Narrow(operand) => {
             assert!(!epilogue.accumulate && !operand.grid.split);
             let step = match operand.format {
@@ -399,6 +370,7 @@ pub fn convolve(
         }
         Output::Planes { shape, factor, values } => {
             assert!(!epilogue.accumulate && spread == 1);
+            assert_eq!(values.len(), out.n * out.c * out.h * out.w, "planes of all channels");
             (Target::Planes(Unpacked::new(shape, 0, factor, values)), 1.0)
         }
     };
@@ -522,17 +494,20 @@ impl Band<'_> {
         phase: usize,
         (from, end): (usize, usize),
     ) {
-        let (grid, spread) = (self.grid, spread(self.weights.geometry));
+        let (grid, spread) = (self.grid, self.weights.geometry.spread());
         let accumulate = self.epilogue.accumulate;
         let mut position = from;
         while position < end {
-            let (y, x) = (position / grid.stride() - grid.pad, position % grid.stride());
-            // Positions run from the left border, over the pixels, to the right border.
-            let skip = grid.pad.saturating_sub(x);
-            let run =
-                (grid.pad + grid.w).saturating_sub(x.max(grid.pad)).min(end.saturating_sub(position + skip));
-            let (first, column) = (position + skip - from, x + skip - grid.pad);
-            let row = y * spread + phase / spread;
+            // Positions run from the left border, over the pixels, to the right border, and may begin or end in either.
+            let line = position / grid.stride();
+            let left = line * grid.stride() + grid.pad;
+            let pixels = position.max(left)..end.min(left + grid.w);
+            position = (line + 1) * grid.stride();
+            if pixels.is_empty() {
+                continue;
+            }
+            let (run, first, column) = (pixels.len(), pixels.start - from, pixels.start - left);
+            let row = (line - grid.pad) * spread + phase / spread;
             // SAFETY: vectors are the tier's.
             let finish = unsafe { [self.finish::<S>(plane), self.finish::<S>(plane + outputs - 1)] };
             let sums: [&[Block]; 2] = std::array::from_fn(|o| &sums.0[o][first..first + run]);
@@ -587,7 +562,6 @@ impl Band<'_> {
                     }
                 }
             }
-            position += (skip + run).max(1);
         }
     }
 
@@ -624,7 +598,7 @@ impl Band<'_> {
                 low,
                 (finish.len() == 2).then_some(high),
                 at,
-                spread(self.weights.geometry),
+                self.weights.geometry.spread(),
             );
         }
     }

@@ -7,6 +7,7 @@ use half::bf16;
 use super::{Block, CHUNK, Format, GROUP, LANES, Sums, Term, WIDE, WORD, Wide, winograd::SQUARES};
 use crate::kernels::{
     conv::Geometry,
+    simd::choose,
     winograd::{PATCH, SIDE},
 };
 
@@ -73,13 +74,14 @@ impl Engine {
 
     /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `avx2`, `avxvnni`, `vnni`,
     /// `avx512`, `amx`) chooses a slower one, to compare them.
+    ///
+    /// # Panics
+    /// If the variable names none that this processor has.
     pub fn detect() -> Engine {
         static CHOICE: OnceLock<Engine> = OnceLock::new();
         *CHOICE.get_or_init(|| {
-            let engines = Engine::available();
-            let wanted = std::env::var("DEMC_ENGINE").unwrap_or_default().to_lowercase();
-            let named = engines.iter().find(|e| format!("{e:?}").to_lowercase() == wanted);
-            *named.or(engines.last()).expect("the portable engine is always available")
+            let wanted = std::env::var("DEMC_ENGINE").unwrap_or_default();
+            choose("DEMC_ENGINE", &wanted, &Engine::available())
         })
     }
 
@@ -340,10 +342,18 @@ impl Engine {
     }
 }
 
+/// What the processor says of itself.
+#[cfg(target_arch = "x86_64")]
+#[allow(unused_unsafe)] // Newer versions of Rust hold the intrinsic to be safe.
+fn cpuid(leaf: u32) -> std::arch::x86_64::CpuidResult {
+    // SAFETY: every processor of this architecture has the instruction.
+    unsafe { std::arch::x86_64::__cpuid_count(leaf, 0) }
+}
+
 /// Whether Intel made the processor.
 #[cfg(target_arch = "x86_64")]
 fn is_intel() -> bool {
-    let vendor = std::arch::x86_64::__cpuid(0);
+    let vendor = cpuid(0);
     [vendor.ebx, vendor.edx, vendor.ecx].map(u32::to_le_bytes).concat() == b"GenuineIntel"
 }
 
@@ -1075,13 +1085,7 @@ mod avx512 {
 
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod amx {
-    use std::{
-        arch::{
-            asm,
-            x86_64::{__cpuid, __cpuid_count},
-        },
-        sync::OnceLock,
-    };
+    use std::{arch::asm, sync::OnceLock};
 
     use super::*;
 
@@ -1095,10 +1099,10 @@ mod amx {
         const ARCH_REQ_XCOMP_PERM: libc::c_ulong = 0x1023;
         static PERMITTED: OnceLock<bool> = OnceLock::new();
         *PERMITTED.get_or_init(|| {
-            if __cpuid(0).eax < 7 {
+            if cpuid(0).eax < 7 {
                 return false;
             }
-            let features = __cpuid_count(7, 0).edx;
+            let features = cpuid(7).edx;
             // SAFETY: the call only sets a permission of this process; older kernels refuse it.
             features & AMX_BF16 != 0
                 && features & AMX_TILE != 0

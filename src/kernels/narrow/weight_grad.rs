@@ -61,7 +61,8 @@ impl Channels {
 /// An output gradient, positions interleaved two by two.
 #[derive(Debug)]
 pub struct Pairs {
-    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the left border of row 0.
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so that no tap
+    /// reaches beyond the first position of the input.
     data: Pooled<Wide>,
     rows: usize,
     grid: Grid,
@@ -71,12 +72,16 @@ pub struct Pairs {
 
 impl Pairs {
     /// Rounds and interleaves the output gradient of a convolution of `geometry`.
+    ///
+    /// # Panics
+    /// If that is [`Geometry::Strided`].
     pub fn new(engine: Engine, gradient: View, geometry: Geometry) -> Self {
+        assert!(geometry != Geometry::Strided, "the strided convolution has no weights of its own");
         let g = gradient.shape;
         let grid = Grid::new(g, geometry == Geometry::Transposed);
         let rows = (grid.h * grid.stride()).next_multiple_of(CHUNK) / 2;
         let mut data = allocate(g.n * g.planes() * grid.phases() * rows);
-        let origin = grid.row(0) - grid.pad;
+        let origin = grid.row(0);
         data.par_chunks_mut(rows).enumerate().for_each(|(i, out)| {
             let (phase, plane) = (i % grid.phases(), i / grid.phases());
             let blocks = &gradient.data[plane * g.plane_stride()..][..g.plane_stride()];
@@ -106,7 +111,7 @@ impl Pairs {
 /// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
 ///
 /// # Panics
-/// If sizes or lengths do not fit together.
+/// If sizes, borders or lengths do not fit together.
 pub fn weight_gradient(
     engine: Engine,
     source: &Channels,
@@ -118,6 +123,7 @@ pub fn weight_gradient(
     let geometry = output_gradient.geometry;
     assert_eq!((g.n, (g.h, g.w)), (s.n, geometry.output(s.h, s.w)));
     assert_eq!(grid.pad, s.pad, "both factors need one border");
+    assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
     let taps = geometry.taps();
     assert_eq!(gradient.len(), inputs * g.c * taps);
 
@@ -137,6 +143,11 @@ pub fn weight_gradient(
             }
         })
         .collect();
+    let is_inside = |(shift, _): &(isize, usize)| {
+        let first = signed(grid.row(0)) + shift;
+        first >= 0 && first + signed(2 * output_gradient.rows) <= signed(source.stride)
+    };
+    assert!(shifts.iter().all(is_inside), "rows are too short for {geometry:?}");
 
     let (wide, groups) = (s.c.div_ceil(WIDE), g.planes().div_ceil(2));
     // Few planes leave too few tasks, so images become tasks as well, each with its own sum.
@@ -155,8 +166,8 @@ pub fn weight_gradient(
                 for step in (0..steps).step_by(STEPS) {
                     let count = STEPS.min(steps - step);
                     for (&(shift, phase), sums) in shifts.iter().zip(&mut sums) {
-                        let position = signed(grid.row(0) - grid.pad + step * CHUNK) + shift;
-                        // SAFETY: borders and slack cover the shift; `ready` was called.
+                        let position = signed(grid.row(0) + step * CHUNK) + shift;
+                        // SAFETY: borders and slack cover the shift, as was checked; `ready` was called.
                         unsafe {
                             let channels = source.data.as_ptr().cast::<bf16>().add(channels).offset(position);
                             let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
