@@ -29,8 +29,8 @@ import sys
 import numpy as np
 import OpenImageIO as oiio
 
-# What follows from the channels and their compression.
-DERIVED = {"openexr:chunkCount", "oiio:subimages", "compression", "openexr:dwaCompressionLevel"}
+# What follows from the channels and their compression, and the list of layers that were added.
+DERIVED = {"openexr:chunkCount", "oiio:subimages", "compression", "openexr:dwaCompressionLevel", "demc"}
 
 def attributes(spec):
     return {a.name: str(a.value) for a in spec.extra_attribs if a.name not in DERIVED}
