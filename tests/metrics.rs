@@ -205,7 +205,7 @@ fn compare_refuses_other_sizes_and_values_that_are_not_finite() {
                      b.open(sys.argv[1], o.ImageSpec(16, 16, 3, o.FLOAT)); b.write_image(a); b.close()";
     python::run(Command::new(python::python()).args(["-c", write_nan]).arg(&bad));
     for (a, b, expected) in [
-        (&small, &large, "image 16x16, reference 16x17"),
+        (&small, &large, "large.exr 16x17 pixels at 0,0; render both at one size"),
         (&bad, &small, "2 in the image, 0 in the reference"),
         (&small, &bad, "0 in the image, 2 in the reference"),
     ] {
