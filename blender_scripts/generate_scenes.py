@@ -280,6 +280,8 @@ def render_scene(options, library, records, seed, kind, scene_name):
         built = time.perf_counter() - start
         write_position(edits, list(stage.scene.view_layers))
         for region, crop in zip(regions, crop_names(options, scene_name)):
+            if crop in records.done:  # before the script was stopped
+                continue
             render_crop(options, stage.scene, region, crop, seed, os.path.join(options.out, f"{scene_name}.tmp"))
             records.add_crop(options, crop)
     objects = sum(o.type == "MESH" for o in stage.scene.objects)

@@ -258,8 +258,8 @@ struct Row {
 }
 
 /// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
-/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines with the
-/// same files are an error: reports know a pair by its files, and would have rows for one of the two.
+/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines of one
+/// meaning count once; two that say different things of the same files are an error, as reports know a pair by its files.
 fn manifest(path: &Path) -> Result<TestSet> {
     let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
     let mut reader = csv::ReaderBuilder::new()
@@ -279,7 +279,11 @@ fn manifest(path: &Path) -> Result<TestSet> {
             .and_then(parse_name)
             .and_then(|n| n.frame.map(str::to_string));
         let (noisy, reference) = (directory.join(&row.noisy), directory.join(&row.reference));
-        if let Some(before) = seen.insert((noisy.clone(), reference.clone()), row.scene.clone()) {
+        let said = (row.scene.clone(), row.spp);
+        if let Some((before, spp)) = seen.insert((noisy.clone(), reference.clone()), said) {
+            if (before.as_str(), spp) == (row.scene.as_str(), row.spp) {
+                continue;
+            }
             return Err(Error::Usage(format!(
                 "{}: '{}' lists the same two files as '{before}' before it: {} and {}; take one of the lines out",
                 path.display(),
@@ -435,6 +439,7 @@ mod tests {
             2,
             "one reference for two"
         );
+        assert_eq!(list("a,x.exr,y.exr,4\na,./x.exr,y.exr,4\n").unwrap().pairs.len(), 1, "said twice");
     }
 
     #[test]

@@ -43,8 +43,19 @@ fn a_view_layer_is_held_against_its_namesake() {
     let told = contains("no view layer 'Foreground'").and(contains("'Background', 'Sky'"));
     compare(&a, &other).assert().code(1).stdout("").stderr(told);
 
-    // The only one there is will do, and is named.
+    // What the compositor made is nobody's namesake, and a file without view layers takes what there is.
+    let composed = dir.path().join("composed.exr");
+    write(&composed, (0, 0), &[("Composite.Combined", 9.0), ("View.Combined", 2.0)]);
     write(&plain, (0, 0), &[("Combined", 2.0)]);
+    for image in [&a, &plain] {
+        compare(image, &composed)
+            .assert()
+            .success()
+            .stdout(contains("rmse 0\n"))
+            .stderr(contains("'View' of B"));
+    }
+
+    // The only one there is will do, and is named.
     let told = contains("view layer 'Foreground' of A with '' of B");
     compare(&a, &plain).assert().success().stdout(contains("rmse 0\n")).stderr(told);
 }
@@ -70,6 +81,7 @@ fn both_layers_can_be_named() {
         (&[][..], "rmse 2\n"), // its Denoised against its Combined
         (&["--layer", "Combined"], "rmse 0\n"),
         (&["--layer", "Other"], "rmse 5\n"),
+        (&["--layer", "V.Other"], "rmse 5\n"),
         (&["--reference-layer", "Denoised"], "rmse 0\n"),
         (&["--layer", "Combined", "--reference-layer", "Other"], "rmse 5\n"),
     ] {

@@ -243,6 +243,13 @@ fn previews_are_made_up_for_and_kept() {
         run(&["--preview"]).stderr(contains("blender4.png: kept; --overwrite"));
         assert_eq!(fs::read(out.join(pngs[0])).unwrap(), b"another program's");
     }
+
+    // A beauty that was not replaced is no preview of one that was.
+    let (_dir, out) = self::out();
+    demc(&out).arg(data(files[0])).assert().success();
+    let again = demc(&out).arg(data(files[0])).args(["--replace", "--preview"]).assert().code(1);
+    again.stderr(contains("blender4.exr: lacks the layer to preview; --overwrite"));
+    assert!(!out.join(pngs[0]).exists());
 }
 
 #[test]
@@ -313,7 +320,7 @@ fn replaces_the_layers_it_added_and_no_others() {
     for (file, layer) in [("blender4.exr", "AO"), ("blender5_stereo.exr", "cryptoobject00")] {
         let (_dir, out) = out();
         let run = demc(&out).arg(data(file)).args(["--layer", layer]).assert().code(1);
-        run.stderr(contains(format!("'ViewLayer.{layer}' that demc did not add; give --layer another name")));
+        run.stderr(contains(format!("'ViewLayer.{layer}' without demc's mark; give --layer another name")));
         assert_eq!(fs::read_dir(&out).unwrap().count(), 0);
     }
     for file in ["blender4.exr", "blender5.exr", "blender4_stereo.exr", "blender5_stereo.exr"] {
@@ -340,7 +347,7 @@ fn a_part_with_bare_channels_is_not_added_twice() {
     };
     let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
     Image::from_layers(shared, vec![part("rgba"), part("Denoised")]).write().to_file(&input).unwrap();
-    demc(&out).arg(&input).assert().code(1).stderr(contains("'Denoised' that demc did not add"));
+    demc(&out).arg(&input).assert().code(1).stderr(contains("'Denoised' without demc's mark"));
     demc(&out).arg(&input).args(["--layer", "Clean"]).assert().success();
     assert_kept(&input, &out.join("in.exr"));
 }

@@ -241,7 +241,7 @@ fn replacing_channels_changes_no_others() {
             let planes = ramp();
             let channels: Vec<(usize, &[f32])> =
                 changed.iter().zip(&planes).map(|(n, v)| (index(n), v.as_slice())).collect();
-            let recoded = frame.replace(0, &channels).unwrap();
+            let recoded = frame.replace(0, "ViewLayer.Combined", &channels).unwrap();
             frame.write(&output).unwrap();
             let (before, after) = (read(&input), read(&output));
             assert_kept(&before, &after, &changed);

@@ -337,10 +337,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 bar.suspend(|| warn_line(&format!("demc: {e}")));
             }
             let optional = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
-            let (relmse, ssim) = (optional(row.val_relmse), optional(row.val_ssim));
+            let [loss, relmse, ssim] = [row.train_loss, row.val_relmse, row.val_ssim].map(optional);
             let line = format!(
-                "step {} after {:.0} s: loss {:.4}, validation RelMSE {relmse}, SSIM {ssim}",
-                row.step, row.seconds, row.train_loss
+                "step {} after {:.0} s: loss {loss}, validation RelMSE {relmse}, SSIM {ssim}",
+                row.step, row.seconds
             );
             bar.suspend(|| warn_line(&line));
         }

@@ -25,7 +25,7 @@ use crate::Result;
 /// Largest finite half.
 pub(crate) const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
-/// Attribute that names the layers of its part that demc added, one a line: those alone may be replaced.
+/// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is replaced.
 const MARK: &str = "demc";
 
 /// A channel to store: values of the whole data window, row-major.
@@ -102,13 +102,23 @@ impl Frame {
             }
             None => (beside, self.set_channels(beside, &named)?),
         };
+        self.mark(part, name);
+        Ok(recoded)
+    }
+
+    /// Lists a layer among those that demc made.
+    fn mark(&mut self, part: usize, name: &str) {
         let mut marked = self.marked(part);
         if !marked.iter().any(|layer| layer == name) {
             marked.push(name.into());
             let list = AttributeValue::Text(text(&marked.join("\n")));
             self.meta.headers[part].own_attributes.other.insert(text(MARK), list);
         }
-        Ok(recoded)
+    }
+
+    /// Whether demc made the layer of that name: [`Frame::set_layer`] added it, or [`Frame::replace`] overwrote it.
+    pub fn is_own_layer(&self, name: &str) -> bool {
+        (0..self.parts.len()).any(|part| self.marked(part).iter().any(|layer| layer == name))
     }
 
     /// Whether a layer of that name, in any letter case, is there that [`Frame::set_layer`] did not add.
@@ -132,7 +142,7 @@ impl Frame {
         self.parts.iter().enumerate().any(is_foreign)
     }
 
-    /// The layers of a part that [`Frame::set_layer`] added.
+    /// The layers of a part that demc made.
     fn marked(&self, part: usize) -> Vec<String> {
         match self.meta.headers[part].own_attributes.other.get(&text(MARK)) {
             Some(AttributeValue::Text(list)) => super::string(list).lines().map(str::to_owned).collect(),
@@ -140,14 +150,19 @@ impl Frame {
         }
     }
 
-    /// Overwrites existing channels of a part, by index.
+    /// Overwrites existing channels of a part, by index: those of the layer `name`, such as `ViewLayer.Combined`.
     ///
     /// # Errors
     /// The part cannot be decoded or encoded.
     ///
     /// # Panics
     /// If a channel has not as many values as the part has pixels.
-    pub fn replace(&mut self, part: usize, channels: &[(usize, &[f32])]) -> Result<Option<Recoded>> {
+    pub fn replace(
+        &mut self,
+        part: usize,
+        name: &str,
+        channels: &[(usize, &[f32])],
+    ) -> Result<Option<Recoded>> {
         let header = self.header(part)?;
         let named: Named<'_> = channels
             .iter()
@@ -157,7 +172,9 @@ impl Frame {
                 (stored.name.clone(), NewChannel { component: "", kind: stored.kind, values })
             })
             .collect();
-        self.set_channels(part, &named)
+        let recoded = self.set_channels(part, &named)?;
+        self.mark(part, name);
+        Ok(recoded)
     }
 
     /// Blender 5 writes one part per pass: a file of several parts, or of one that is named like all of

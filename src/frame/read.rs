@@ -68,9 +68,17 @@ impl Frame {
         Ok(frame)
     }
 
-    /// Whether a file is there whose headers say that it is an EXR; its pixels are not looked at.
-    pub fn exists(path: impl AsRef<Path>) -> bool {
-        open(path.as_ref()).is_ok()
+    /// Reads a file's headers alone: what it holds, none of its pixels.
+    ///
+    /// # Errors
+    /// As [`Frame::read`], but for damaged pixels.
+    pub fn read_headers(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let (reader, byte_len) = open(path)?;
+        let meta = reader.meta_data().clone();
+        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks: Vec::new() };
+        frame.describe();
+        Ok(frame)
     }
 }
 

@@ -209,17 +209,23 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
         Error::invalid(path, format!("no network in its metadata ({e}); use a run's best.safetensors"))
     })?;
     super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
-    let inputs = metadata.network.architecture.inputs();
-    if let Some(held) = metadata.inputs.as_deref().filter(|held| *held != inputs) {
-        return Err(Error::invalid(
-            path,
-            format!(
-                "was trained on inputs {held}, but this version of demc makes {inputs}; run the version that wrote \
-                 it, or train it anew"
-            ),
-        ));
-    }
+    check_inputs(metadata.inputs.as_deref(), metadata.network.architecture.inputs())
+        .map_err(|reason| Error::invalid(path, reason))?;
     Ok((metadata, tensors))
+}
+
+/// Whether a network that was trained on the inputs `held` reads those that are made `now`; why not, if it does not. Files that do
+/// not say hold the first of their kind.
+fn check_inputs(held: Option<&str>, now: &str) -> Result<(), String> {
+    let (kind, _) = now.rsplit_once('/').expect("inputs end in a number");
+    let first = format!("{kind}/1");
+    let held = held.unwrap_or(&first);
+    if held == now {
+        return Ok(());
+    }
+    Err(format!(
+        "was trained on inputs {held}, but this version of demc makes {now}; run the version that wrote it, or train it anew"
+    ))
 }
 
 /// Parses the bytes of a weights file; `path` is for messages.
@@ -299,6 +305,7 @@ mod tests {
             metadata.as_object_mut().unwrap().remove("inputs");
         });
         assert_eq!(read(&path).unwrap().1.inputs, None);
+        assert!(check_inputs(None, "guides/logarithm/2").is_err(), "of the first kind, which is past");
     }
 
     #[test]

@@ -46,6 +46,9 @@ struct Unassigned {
     full_name: String,
 }
 
+/// What Blender calls the layer that its compositor made.
+const COMPOSITE: &str = "Composite";
+
 /// A view layer's name and stereo view.
 type LayerKey = (String, Option<String>);
 
@@ -89,12 +92,13 @@ pub fn layers(frame: &Frame) -> Vec<Layer> {
     found.map(|((name, view), channels)| assign(name, view, channels)).collect()
 }
 
-/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised`: each with those as
-/// its Combined and nothing else, in file order, once for each stereo view.
+/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised` or
+/// `ViewLayer.Denoised`: each with those as its Combined and nothing else, in file order, once for each stereo view.
 pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<Layer> {
     let found = channels_by_pass(frame).into_iter();
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
     let as_combined = |((layer, view), channels): (LayerKey, BTreeMap<String, Vec<Unassigned>>)| {
+        let name = name.strip_prefix(&format!("{layer}.")).unwrap_or(name);
         let at = match_components(channels.get(name)?, &["R", "G", "B"])?;
         let passes = [(Pass::Combined, PassChannels { name: name.into(), ..at })].into();
         Some(Layer { name: layer, view, passes, position_averaged: false, unrecognised: Vec::new() })
@@ -163,7 +167,7 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
             .iter()
             .rev() // `max_by_key` keeps the last of equals
             .filter(|l| l.passes.contains_key(&Pass::Combined))
-            .max_by_key(|l| l.passes.len())
+            .max_by_key(|l| (l.passes.len(), l.name != COMPOSITE))
             .ok_or_else(|| {
                 let setting = Pass::Combined.blender_setting();
                 let why = format!("no layer has a Combined pass; {}; {setting}", listed(layers));
@@ -172,17 +176,19 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
     }
 }
 
-/// The view layer to hold against one of that name in another file: its namesake, or the only one with Combined.
+/// The view layer to hold against one of that name in another file: its namesake, or the only one with Combined besides the
+/// compositor's. A file without view layers, whose name is empty, has nothing to choose by: see [`choose`].
 ///
 /// # Errors
-/// Neither exists; the message lists what there is.
+/// There is none; the message lists what there is.
 pub fn choose_like<'a>(frame: &Frame, layers: &'a [Layer], name: &str) -> Result<&'a Layer> {
-    let mut candidates = layers.iter().filter(|l| l.passes.contains_key(&Pass::Combined)).peekable();
-    let Some(&first) = candidates.peek() else { return choose(frame, layers, None) };
     if let Some(namesake) = layers.iter().find(|l| l.name == name) {
         return Ok(namesake);
     }
-    if candidates.any(|l| l.name != first.name) {
+    let first = choose(frame, layers, None)?;
+    let mut rendered =
+        layers.iter().filter(|l| l.name != COMPOSITE && l.passes.contains_key(&Pass::Combined));
+    if !name.is_empty() && rendered.any(|l| l.name != first.name) {
         let why = format!("has no view layer '{name}', which it is to be held against; {}", listed(layers));
         return Err(Error::invalid(frame.path(), format!("{why}; render or save that one alone")));
     }

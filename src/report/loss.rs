@@ -33,7 +33,7 @@ fn draw<B: DrawingBackend>(canvas: &Canvas<B>, rows: &[Row]) -> Result<()> {
         points.filter(|p| p.1 > 0.0 && p.1.is_finite()).collect()
     };
     let lines = [
-        ("training loss", TRAINING, series(|r| Some(r.train_loss))),
+        ("training loss", TRAINING, series(|r| r.train_loss)),
         ("validation RelMSE (geometric mean)", VALIDATION, series(|r| r.val_relmse)),
     ];
     let points = || lines.iter().flat_map(|l| &l.2);

@@ -11,9 +11,8 @@ use super::{
 };
 use crate::{Result, testset::Pair};
 
-/// The settings of a run, and stamps of what it read.
+/// The settings of a run, and stamps of what it read. Fields of other versions are passed over.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Settings {
     provenance: Provenance,
     threads: usize,
@@ -143,5 +142,18 @@ mod tests {
         );
         fs::write(&reference, "longer").unwrap();
         assert_eq!(holds(&settings(&asked)), [false; 4], "another reference");
+    }
+
+    #[test]
+    fn a_run_of_another_version_is_read() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("run.json");
+        let settings = Settings { methods: [("weights".into(), "5".into())].into(), ..Settings::default() };
+        settings.write(&path).unwrap();
+        let mut stored: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        stored["notes"] = serde_json::json!({ "noisy": ["does not show the same scene"] });
+        stored.as_object_mut().unwrap().remove("sheets");
+        fs::write(&path, stored.to_string()).unwrap();
+        assert_eq!(Settings::read(&path), settings);
     }
 }

@@ -15,8 +15,8 @@ pub struct Row {
     pub seconds: f64,
     /// Learning rate of the last step.
     pub lr: f64,
-    /// Mean training loss since the row before.
-    pub train_loss: f64,
+    /// Mean training loss since the row before; none where every step since was skipped.
+    pub train_loss: Option<f64>,
     /// Geometric mean of the validation frames' RelMSE (the mean would follow the worst one).
     pub val_relmse: Option<f64>,
     /// Mean of the validation frames' SSIM.

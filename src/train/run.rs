@@ -91,6 +91,9 @@ pub enum Event {
     Logged(Vec<log::Row>),
 }
 
+/// Steps in a row that may be skipped before a run is given up.
+const MOST_SKIPPED: usize = 10;
+
 /// Seconds between checkpoints: what a kill costs at most.
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
@@ -99,8 +102,7 @@ const CHECKPOINT_SECONDS: f64 = 60.0;
 /// that was skipped: where all are, the weights of the one before are good.
 ///
 /// # Errors
-/// A pair is unusable, the run folder cannot be read or written, or no step between two rows of the log had a finite
-/// gradient.
+/// A pair is unusable, the run folder cannot be read or written, or step after step had no finite gradient.
 pub fn run(
     options: &Options,
     out: &Path,
@@ -138,6 +140,8 @@ pub fn run(
     if !resume {
         let config = out.join("config.json");
         let text = serde_json::to_string_pretty(options).expect("options serialise");
+        // First what the other promises: --resume needs none of the files that this run began with.
+        checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
         atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
     }
     training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
@@ -159,13 +163,16 @@ pub fn run(
         if progress.step % options.every == 0 || last {
             progress.seconds += since.elapsed().as_secs_f64();
             let (sum, count) = std::mem::take(&mut progress.losses);
-            report_skipped(std::mem::take(&mut progress.skipped), count, out, on)?;
+            report_skipped(progress.skipped, count, out, on)?;
+            if count > 0 {
+                progress.skipped = 0;
+            }
             let score = validate(&mut *average, &validation)?;
             let row = log::Row {
                 step: progress.step,
                 seconds: (progress.seconds * 10.0).round() / 10.0,
                 lr,
-                train_loss: sum / count as f64,
+                train_loss: (count > 0).then(|| sum / count as f64),
                 val_relmse: score.map(|s| s.0),
                 val_ssim: score.and_then(|s| s.1),
             };
@@ -194,12 +201,12 @@ pub fn run(
     Ok(())
 }
 
-/// Warns of steps that were skipped beside the `taken` ones since the last row of the log.
+/// Warns of steps that were skipped beside the `taken` ones since the last row of the log before which some were.
 ///
 /// # Errors
-/// None was taken.
+/// None was taken, in [`MOST_SKIPPED`] steps or more.
 fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(Event)) -> Result<()> {
-    if taken == 0 {
+    if taken == 0 && skipped >= MOST_SKIPPED {
         return Err(Error::invalid(
             out,
             format!(

@@ -15,6 +15,9 @@ use crate::{
     planes::Planes,
 };
 
+/// The layer that `--replace` overwrites.
+const BEAUTY: &str = "Combined";
+
 /// What the user chose for every frame of the batch.
 pub struct Options {
     /// `--view-layer`.
@@ -65,7 +68,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
     if let Some(added) = &options.layer {
         let name = layer_name(&chosen.name, added);
         if frame.has_foreign_layer(&name) {
-            let why = format!("holds a layer '{name}' that demc did not add; give --layer another name");
+            let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
             return Err(Error::invalid(input, why));
         }
     }
@@ -173,7 +176,7 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
                 if let (Some(alpha), Some(at)) = (alpha, layer.passes.get(&Pass::Alpha)) {
                     channels.push((at.channels[0], alpha.channel(0)));
                 }
-                frame.replace(at.part, &channels)?
+                frame.replace(at.part, &layer_name(&layer.name, BEAUTY), &channels)?
             }
         };
         if let Some(recoded) = recoded {
@@ -197,19 +200,26 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
     Ok(report)
 }
 
+/// Whether a file of that name is there and reads as an EXR: results are written whole.
+pub fn is_finished(output: &Path) -> bool {
+    Frame::read_headers(output).is_ok()
+}
+
 /// Writes what previews of a finished result are wanted and missing.
 pub fn add_previews(output: &Path, options: &Options) -> Result<()> {
     if !options.preview {
         return Ok(());
     }
+    let headers = Frame::read_headers(output)?;
+    let layers = passes::layers(&headers);
+    let chosen = &passes::choose(&headers, &layers, options.view_layer.as_deref())?.name;
+    let name = options.layer.as_deref().unwrap_or(BEAUTY);
+    let views = passes::rgb_layers(&headers, Some(chosen), name);
+    if views.iter().all(|layer| preview::path(output, layer, views.len()).exists()) && !views.is_empty() {
+        return Ok(());
+    }
     let frame = Frame::read(output)?;
-    let layers = passes::layers(&frame);
-    let chosen = &passes::choose(&frame, &layers, options.view_layer.as_deref())?.name;
-    let views = match &options.layer {
-        Some(name) => passes::rgb_layers(&frame, Some(chosen), name),
-        None => layers.iter().filter(|layer| layer.name == *chosen).cloned().collect(),
-    };
-    if views.is_empty() {
+    if views.is_empty() || !frame.is_own_layer(&layer_name(chosen, name)) {
         return Err(Error::invalid(
             output,
             "lacks the layer to preview; --overwrite denoises the frame again",

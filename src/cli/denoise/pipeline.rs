@@ -15,7 +15,7 @@ use super::{
     Job,
     frame_job::{self, Denoised, Frames, Options, Report},
 };
-use crate::{Error, Result, cli::stop, error::attempt, frame::Frame, models::Denoiser, passes::PassSet};
+use crate::{Error, Result, cli::stop, error::attempt, models::Denoiser, passes::PassSet};
 
 /// What became of one file.
 pub enum Outcome {
@@ -109,7 +109,8 @@ fn spawn(
 
 fn load_all(batch: &Batch, next: &SyncSender<(usize, Frames<PassSet>)>, events: &Sender<Event>) {
     for (index, job) in batch.jobs.iter().enumerate() {
-        if !batch.options.overwrite && Frame::exists(&job.output) {
+        if !batch.options.overwrite && frame_job::is_finished(&job.output) {
+            let _writing = batch.writing.lock().unwrap_or_else(PoisonError::into_inner);
             let previewed = attempt(&job.output, || frame_job::add_previews(&job.output, &batch.options));
             let outcome = previewed.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
             let _ = events.send(Event::Finished(index, outcome));
