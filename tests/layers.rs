@@ -162,6 +162,28 @@ fn gradients_of_two_readers_add_up() {
     case.compare("d_bias", &half(gradients.get(&conv.bias.tensor).as_vec()));
 }
 
+/// Layers that are not trained hand on gradients to those that are, and take none themselves.
+#[test]
+fn gradients_reach_trained_layers_alone() {
+    let shape = Shape::new(1, 5, 6, 8);
+    let values: Vec<f32> = (0..5 * 6 * 8).map(|v| (v % 13) as f32 / 13.0).collect();
+    let gradients = |trained: [bool; 2]| {
+        let mut layers = [same(&[5], 5, 3), same(&[5], 5, 3)];
+        for (layer, trained) in layers.iter_mut().zip(trained) {
+            layer.params().into_iter().for_each(|param| param.trainable = trained);
+        }
+        let pooled = MaxPool.forward(layers[0].forward(vec![Activation::<Taped>::input(shape, &values)]));
+        let output = layers[1].forward(vec![pooled]).into_images();
+        let mut gradients = output.sum::<Rank0, _>().backward();
+        layers.map(|layer| gradients.get_or_alloc_mut(&layer.weight.tensor).unwrap().to_vec())
+    };
+    let both = gradients([true, true]);
+    let none = vec![0.0; both[0].len()];
+    assert!(both.iter().all(|gradient| *gradient != none));
+    assert_eq!(gradients([false, true]), [none.clone(), both[1].clone()]);
+    assert_eq!(gradients([true, false]), [both[0].clone(), none]);
+}
+
 #[test]
 fn max_pool() {
     let case = Case::new("max_pool");

@@ -220,6 +220,26 @@ fn a_resumed_run_needs_none_of_the_weights_it_began_with() {
 }
 
 #[test]
+fn heads_alone_are_trained_where_that_is_asked_for() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let [first, second, third] = ["first", "second", "third"].map(|name| dir.path().join(name));
+    run(&mut train(&first, 2)).success();
+    let begin = first.join("last.safetensors");
+    run(train(&second, 2).args(["--heads-only", "--init"]).arg(&begin)).success();
+    let (_, began) = weights::read(&begin).expect("weights");
+    let trained = tensors(&second);
+    for before in &began {
+        let after = trained.iter().find(|tensor| tensor.name == before.name).expect("the same tensors");
+        assert_eq!(before.values != after.values, before.name.starts_with("head."), "{}", before.name);
+    }
+    let moments = |name: &&Tensor| name.name.starts_with("first.");
+    assert!(trained.iter().filter(moments).all(|tensor| tensor.name.starts_with("first.head.")));
+    let mut refused = train_with("demc", "64", &third, 1);
+    let refused = run(refused.args(["--heads-only", "--init"]).arg(&begin)).code(2);
+    refused.stderr(predicate::str::contains("--heads-only: demc normalises"));
+}
+
+#[test]
 fn a_run_goes_on_from_any_folder_to_as_many_steps_as_its_configuration_says() {
     let dir = tempfile::tempdir().expect("a folder");
     let out = dir.path().join("run");

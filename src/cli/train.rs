@@ -86,6 +86,10 @@ pub struct Args {
     /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
+    /// Train the heads of --init alone, the last layers before what is predicted: takes less time, and the layers before
+    /// them forget nothing
+    #[arg(long, requires = "init")]
+    heads_only: bool,
     /// Weights that denoise albedo and normal first: a file of `demc train --model prefilter`, or of a network that has a
     /// prefilter; without it those of --init, or the built-in ones
     #[arg(long)]
@@ -94,7 +98,7 @@ pub struct Args {
     /// them there
     #[arg(long, conflicts_with_all = [
         "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "optimizer",
-        "weight_decay", "precision", "average", "val", "every", "seed", "init", "prefilter",
+        "weight_decay", "precision", "average", "val", "every", "seed", "init", "heads_only", "prefilter",
     ])]
     resume: bool,
     /// Threads to use; all processors without it
@@ -203,7 +207,11 @@ impl Args {
             network.prefilter = weights_file::prefilter_widths(path)?;
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
-        let built = models::build(&network, 0);
+        let mut built = models::build(&network, 0);
+        if self.heads_only && !built.batch_norms().is_empty() {
+            let reason = "normalises by what it sees in training, so that all of it changes; leave it out";
+            return Err(usage(format!("--heads-only: {} {reason}", self.model)));
+        }
         if !built.makes_radiance() {
             if self.raw_references {
                 let reason =
@@ -281,6 +289,7 @@ impl Args {
             every: self.every,
             seed: self.seed,
             init: self.init.clone(),
+            heads_only: self.heads_only,
             prefilter: self.prefilter.clone(),
         })
     }

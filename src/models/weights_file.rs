@@ -54,6 +54,9 @@ pub struct Facts {
     /// The weights file whose prefilter it got, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<String>,
+    /// Whether its heads alone were trained.
+    #[serde(default)]
+    pub heads_only: bool,
     /// Seconds of training.
     pub seconds: f64,
     /// Pairs validated on.

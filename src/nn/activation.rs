@@ -75,7 +75,7 @@ impl Data {
 #[derive(Clone, Debug)]
 pub(super) struct Saved {
     pub data: Arc<Data>,
-    /// `None` for network inputs, whose gradient nobody asks for.
+    /// `None` for network inputs and what untrained layers make of them, whose gradient nobody asks for.
     pub gradient: Option<Gradient<Buffer>>,
 }
 
@@ -194,9 +194,9 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         values.saved.data.view().data().iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
-    /// Wraps the output of an operation.
-    pub(super) fn output(data: Data, tape: T) -> (Self, Saved) {
-        let saved = Saved { data: Arc::new(data), gradient: Some(Gradient::default()) };
+    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a gradient.
+    pub(super) fn output(data: Data, tape: T, learns: bool) -> (Self, Saved) {
+        let saved = Saved { data: Arc::new(data), gradient: learns.then(Gradient::default) };
         (Self { saved: saved.clone(), tape }, saved)
     }
 }

@@ -96,6 +96,11 @@ impl Conv {
         self.linear()
     }
 
+    /// Whether it is a [`Conv::head`].
+    pub fn is_head(&self) -> bool {
+        !self.weight.hidden
+    }
+
     /// The same layer with every bias at `value`.
     pub fn with_bias(mut self, value: f32) -> Self {
         self.bias.set(&vec![value; self.arithmetic.outputs]);
@@ -263,18 +268,20 @@ impl Conv {
         let made = (shape_out, format);
         let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, made, T::OWNS_TAPE);
 
+        let is_trained = self.weight.trainable;
+        let learns = is_trained || sources.iter().any(|source| source.saved.gradient.is_some());
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();
         for source in sources {
             saved.push(source.saved);
             tape = tape.merge(source.tape);
         }
-        let (mut activation, out) = Activation::output(output, tape);
+        let (mut activation, out) = Activation::output(output, tape, learns);
         if let Some(observed) = &self.observed {
             // The bits of non-negative values are ordered as the values are.
             observed.fetch_max(activation.peak().max(0.0).to_bits(), Ordering::Relaxed);
         }
-        if T::OWNS_TAPE {
+        if T::OWNS_TAPE && learns {
             let (weight, bias) = (self.weight.tensor.clone(), self.bias.tensor.clone());
             let (arithmetic, relu) = (self.arithmetic.clone(), self.relu);
             activation.tape.add_backward_op(move |gradients| {
@@ -282,9 +289,14 @@ impl Conv {
                 if relu {
                     relu_mask(out.data.view(), gradient.view_mut());
                 }
-                bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
-                let views: Vec<_> = saved.iter().map(|s| s.data.view()).collect();
-                arithmetic.weight_gradient(&views, gradient.view(), gradients.get_or_alloc_mut(&weight)?);
+                if is_trained {
+                    bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
+                    let views: Vec<_> = saved.iter().map(|s| s.data.view()).collect();
+                    arithmetic.weight_gradient(&views, gradient.view(), gradients.get_or_alloc_mut(&weight)?);
+                }
+                if saved.iter().all(|source| source.gradient.is_none()) {
+                    return Ok(());
+                }
                 let weights = weight.as_vec();
                 let input_gradient = arithmetic.input_gradient(gradient.view(), &weights);
                 for (index, source) in saved.iter().enumerate() {
@@ -362,8 +374,9 @@ impl MaxPool {
                 Data::F32(output)
             }
         };
-        let (mut activation, out) = Activation::output(output, input.tape);
-        if T::OWNS_TAPE {
+        let learns = input.saved.gradient.is_some();
+        let (mut activation, out) = Activation::output(output, input.tape, learns);
+        if T::OWNS_TAPE && learns {
             let source = input.saved;
             activation.tape.add_backward_op(move |_| {
                 let Some(gradient) = out.take_gradient() else { return Ok(()) };
@@ -482,7 +495,7 @@ impl BatchNorm {
         scale_shift(input.saved.data.view(), &scale, &shift, true, output.view_mut());
 
         let batch = matches!(stats, Stats::Batch(_));
-        let (mut activation, out) = Activation::output(Data::F32(output), input.tape);
+        let (mut activation, out) = Activation::output(Data::F32(output), input.tape, true);
         if T::OWNS_TAPE {
             let source = input.saved;
             let (scale_tensor, shift_tensor) = (self.scale.tensor.clone(), self.shift.tensor.clone());

@@ -70,6 +70,9 @@ pub struct Options {
     pub seed: u64,
     /// A weights file to begin with, instead of weights drawn from the seed.
     pub init: Option<PathBuf>,
+    /// Whether the heads alone are trained, and all that they read stays as it began.
+    #[serde(default)]
+    pub heads_only: bool,
     /// The weights file whose prefilter the network gets, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<PathBuf>,
@@ -122,6 +125,11 @@ pub fn run(
         set_prefilter(&mut *network, options)?;
     }
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
+    if options.heads_only {
+        for conv in network.convolutions().into_iter().filter(|conv| !conv.is_head()) {
+            conv.params().into_iter().for_each(|param| param.trainable = false);
+        }
+    }
     let mut average = network.duplicate();
     let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
     let mut progress = Progress::default();
@@ -366,6 +374,7 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         seed: options.seed,
         init: path(&options.init),
         prefilter: path(&options.prefilter),
+        heads_only: options.heads_only,
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,
