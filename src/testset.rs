@@ -138,8 +138,8 @@ pub fn read(spec: &str) -> Result<TestSet> {
     Ok(set)
 }
 
-/// Whether a file is other programs' own, such as the `._room_0004spp.exr` that macOS leaves beside a file it copied.
-fn is_hidden(file: &Path) -> bool {
+/// Whether a file is other programs' own: unfinished work, or such as the `._room_0004spp.exr` that macOS leaves beside a file it copied.
+pub fn is_hidden(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'))
 }
 

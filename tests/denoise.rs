@@ -10,7 +10,7 @@ use std::{
 };
 
 use assert_cmd::Command;
-use common::files::{bits, data, read_exr, samples, values, write_render};
+use common::files::{bits, data, read_exr, samples, values, write_bare_parts, write_render};
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
 
@@ -337,16 +337,9 @@ fn replaces_the_layers_it_added_and_no_others() {
 
 #[test]
 fn a_part_with_bare_channels_is_not_added_twice() {
-    use exr::prelude::*;
     let (dir, out) = out();
     let input = dir.path().join("in.exr");
-    let part = |name: &str| {
-        let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
-        let channels = AnyChannels::sort(list.into_iter().collect());
-        Layer::new((4, 3), LayerAttributes::named(name), Encoding::SMALL_LOSSLESS, channels)
-    };
-    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
-    Image::from_layers(shared, vec![part("rgba"), part("Denoised")]).write().to_file(&input).unwrap();
+    write_bare_parts(&input, &["rgba", "Denoised"]);
     demc(&out).arg(&input).assert().code(1).stderr(contains("'Denoised' without demc's mark"));
     demc(&out).arg(&input).args(["--layer", "Clean"]).assert().success();
     assert_kept(&input, &out.join("in.exr"));
@@ -354,13 +347,9 @@ fn a_part_with_bare_channels_is_not_added_twice() {
 
 #[test]
 fn a_part_name_with_a_dot_is_no_layer() {
-    use exr::prelude::*;
     let (dir, out) = out();
     let input = dir.path().join("in.exr");
-    let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
-    let channels = AnyChannels::sort(list.into_iter().collect());
-    let layer = Layer::new((4, 3), LayerAttributes::named("shot.v001"), Encoding::SMALL_LOSSLESS, channels);
-    Image::from_layer(layer).write().to_file(&input).unwrap();
+    write_bare_parts(&input, &["shot.v001"]);
     demc(&out).arg(&input).assert().success();
     assert_same_values(&out.join("in.exr"), "R", "Denoised.R");
 }

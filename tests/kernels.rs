@@ -316,22 +316,26 @@ fn chunks_end_inside_borders() {
     check_layer(Geometry::Same(5), Shape { pad: 2, ..Shape::new(1, 3, 61, 61) }, 0, 2, 7);
 }
 
+/// An activation whose border is too small for taps of 5x5.
+fn with_a_border_of_one() -> (Shape, Vec<Block>) {
+    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
+    (shape, blocked(shape, &[1.0; 60]))
+}
+
 #[test]
 #[should_panic = "border too small"]
 fn weight_gradients_need_a_border() {
-    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
-    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
-    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
-    weight_gradient(Tier::detect(), x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+    let (shape, x) = with_a_border_of_one();
+    let x = View::new(shape, &x);
+    weight_gradient(Tier::detect(), x, x, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
 }
 
 #[test]
 #[should_panic = "border too small"]
 fn narrow_weight_gradients_need_a_border() {
-    let shape = Shape { pad: 1, ..Shape::new(1, 3, 4, 5) };
-    let (x, g) = (blocked(shape, &[1.0; 60]), blocked(shape, &[1.0; 60]));
-    let (x, g) = (View::new(shape, &x), View::new(shape, &g));
-    Arithmetic::Bf16(Engine::detect()).weight_gradient(x, g, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
+    let (shape, x) = with_a_border_of_one();
+    let x = View::new(shape, &x);
+    Arithmetic::Bf16(Engine::detect()).weight_gradient(x, x, Geometry::Same(5), (0, 3), &mut [0.0; 9 * 25]);
 }
 
 #[test]

@@ -2,14 +2,21 @@
 
 mod common;
 
-use std::fs;
+use std::{fs, path::Path};
 
+use assert_cmd::Command;
 use common::{
     demc,
     files::{data, write_render},
     tables::{Row, table},
 };
 use predicates::prelude::*;
+
+fn stability(models: &str, set: &Path, out: &Path) -> Command {
+    let mut command = demc();
+    command.args(["stability", "--models", models, "--test-set"]).arg(set).arg("--out").arg(out);
+    command
+}
 
 fn value(row: &Row, column: &str) -> f64 {
     row[column].parse().unwrap_or_else(|_| panic!("{column} of {row:?}"))
@@ -21,11 +28,7 @@ fn value(row: &Row, column: &str) -> f64 {
 #[test]
 fn tells_what_changes_results_and_what_does_not() {
     let out = tempfile::tempdir().unwrap();
-    demc()
-        .args(["stability", "--models", "demc-s:f32", "--test-set"])
-        .arg(data(""))
-        .arg("--out")
-        .arg(out.path())
+    stability("demc-s:f32", &data(""), out.path())
         .assert()
         .success()
         .stdout(predicate::str::contains("stability_summary.csv"));
@@ -71,14 +74,7 @@ fn one_bad_frame_does_not_stop_the_others() {
     fs::write(set.join("cut_0004spp.exr"), b"no frame").unwrap();
     fs::copy(data("s0000_room_0004spp.exr"), set.join("lonely_0004spp.exr")).unwrap();
     let out = folder.path().join("out");
-    demc()
-        .args(["stability", "--models", "noisy", "--test-set"])
-        .arg(&set)
-        .arg("--out")
-        .arg(&out)
-        .assert()
-        .code(1)
-        .stderr(predicate::str::contains("stability.csv"));
+    stability("noisy", &set, &out).assert().code(1).stderr(predicate::str::contains("stability.csv"));
     let rows = table(&out.join("stability.csv"));
     let failed: Vec<&Row> = rows.iter().filter(|row| !row["reason"].is_empty()).collect();
     assert_eq!((rows.len(), failed.len()), (27, 18));
@@ -98,11 +94,7 @@ fn what_cannot_be_told_is_an_empty_cell_with_a_note() {
         write_render(&path("0004spp"), width, height, |_, _| 0.5);
         write_render(&path("ref"), width, height, |_, _| light);
     }
-    demc()
-        .args(["stability", "--models", "noisy", "--test-set"])
-        .arg(set.path())
-        .arg("--out")
-        .arg(out.path())
+    stability("noisy", set.path(), out.path())
         .assert()
         .success()
         .stderr(predicate::str::contains("cropped: skipped"));
@@ -135,13 +127,7 @@ fn half_buffers_beside_a_frame_do_not_stand_in_for_it() {
         let name = |kind: &str| format!("s0010_outdoor_{kind}.exr");
         fs::copy(data(&name(from)), set.path().join(name(to))).unwrap();
     }
-    demc()
-        .args(["stability", "--models", "nfor", "--test-set"])
-        .arg(set.path())
-        .arg("--out")
-        .arg(out.path())
-        .assert()
-        .success();
+    stability("nfor", set.path(), out.path()).assert().success();
     let rows = table(&out.path().join("stability.csv"));
     for row in rows.iter().filter(|row| row["model"] == "nfor") {
         match &row["trial"][..] {

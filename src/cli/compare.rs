@@ -9,15 +9,12 @@ use crate::{
     Error, Result,
     frame::Frame,
     metrics,
-    passes::{self, Layer, Pass, PassSet},
+    passes::{self, COMBINED, Layer, Pass, PassSet},
     report::number,
 };
 
 /// Layer that `demc denoise` adds: where A holds one, it is what the user wants judged.
 const DENOISED: &str = "Denoised";
-
-/// The renderer's image.
-const COMBINED: &str = "Combined";
 
 /// Arguments of `demc compare`.
 #[derive(Debug, ClapArgs)]

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::{Error, Result};
+use crate::{Error, Result, testset::is_hidden};
 
 /// What the user's inputs name.
 #[derive(Default)]
@@ -59,9 +59,7 @@ fn directory(path: &Path, all: &mut Inputs) {
         match entry {
             Ok(entry) => {
                 let file = entry.path();
-                // Hidden files are other programs' unfinished work.
-                let hidden = file.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
-                if !hidden && is_exr(&file) && file.is_file() {
+                if !is_hidden(&file) && is_exr(&file) && file.is_file() {
                     all.files.push(file);
                 }
             }

@@ -80,6 +80,6 @@ fn print_line(line: &str) {
 }
 
 /// One line on stderr. Nobody who reads it is no reason to stop either.
-pub(crate) fn warn_line(line: &str) {
+fn warn_line(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }

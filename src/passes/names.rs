@@ -10,6 +10,9 @@ pub const POSITION_AOV: &str = "DEMC Position";
 /// Pass that Blender adds when it denoises the render itself: the render before that.
 pub const NOISY_IMAGE: &str = "Noisy Image";
 
+/// The renderer's image.
+pub const COMBINED: &str = "Combined";
+
 /// How the components of a pass are named; alternatives are tried in order.
 type Components = &'static [&'static [&'static str]];
 
@@ -44,8 +47,8 @@ macro_rules! row {
 
 /// Every pass demc knows. Where two names of one row are in a file, the first wins.
 pub const TABLE: &[Row] = &[
-    row!(Combined, ["Combined"], RGB, "Data > Combined"),
-    row!(Alpha, ["Combined"], ALPHA, "Data > Combined and set Output Properties > Output > Color to RGBA"),
+    row!(Combined, [COMBINED], RGB, "Data > Combined"),
+    row!(Alpha, [COMBINED], ALPHA, "Data > Combined and set Output Properties > Output > Color to RGBA"),
     row!(NoisyImage, [NOISY_IMAGE], RGB, "Data > Denoising Data and keep Render Properties > Denoise on"),
     row!(Depth, ["Depth"], DEPTH, "Data > Z"),
     row!(Position, [POSITION_AOV, "Position"], XYZ, "Data > Position"),

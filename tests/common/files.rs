@@ -61,3 +61,15 @@ pub fn write_render(path: &Path, width: usize, height: usize, value: impl Fn(&st
     let layer = Layer::new((width, height), LayerAttributes::default(), encoding, channels);
     Image::from_layer(layer).write().to_file(path).unwrap();
 }
+
+/// Parts of 4x3 pixels of these names, whose channels are called R, G and B and no more.
+pub fn write_bare_parts(path: &Path, names: &[&str]) {
+    let part = |name: &&str| {
+        let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
+        let channels = AnyChannels::sort(list.into_iter().collect());
+        Layer::new((4, 3), LayerAttributes::named(*name), Encoding::SMALL_LOSSLESS, channels)
+    };
+    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
+    let parts: Vec<_> = names.iter().map(part).collect();
+    Image::from_layers(shared, parts).write().to_file(path).unwrap();
+}

@@ -11,12 +11,9 @@ use crate::{
     Error, Result,
     frame::{Frame, NewChannel},
     models::Denoiser,
-    passes::{self, Layer, Pass, PassSet},
+    passes::{self, COMBINED, Layer, Pass, PassSet},
     planes::Planes,
 };
-
-/// The layer that `--replace` overwrites.
-const BEAUTY: &str = "Combined";
 
 /// What the user chose for every frame of the batch.
 pub struct Options {
@@ -176,7 +173,7 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
                 if let (Some(alpha), Some(at)) = (alpha, layer.passes.get(&Pass::Alpha)) {
                     channels.push((at.channels[0], alpha.channel(0)));
                 }
-                frame.replace(at.part, &layer_name(&layer.name, BEAUTY), &channels)?
+                frame.replace(at.part, &layer_name(&layer.name, COMBINED), &channels)?
             }
         };
         if let Some(recoded) = recoded {
@@ -200,21 +197,21 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
     Ok(report)
 }
 
-/// Whether a file of that name is there and reads as an EXR: results are written whole.
-pub fn is_finished(output: &Path) -> bool {
-    Frame::read_headers(output).is_ok()
+/// The headers of a result, where it is finished: a file that reads as an EXR, since results are written whole.
+pub fn finished(output: &Path) -> Option<Frame> {
+    Frame::read_headers(output).ok()
 }
 
-/// Writes what previews of a finished result are wanted and missing.
-pub fn add_previews(output: &Path, options: &Options) -> Result<()> {
+/// Writes what previews of a finished result, of which these are the headers, are wanted and missing.
+pub fn add_previews(headers: &Frame, options: &Options) -> Result<()> {
     if !options.preview {
         return Ok(());
     }
-    let headers = Frame::read_headers(output)?;
-    let layers = passes::layers(&headers);
-    let chosen = &passes::choose(&headers, &layers, options.view_layer.as_deref())?.name;
-    let name = options.layer.as_deref().unwrap_or(BEAUTY);
-    let views = passes::rgb_layers(&headers, Some(chosen), name);
+    let output = headers.path();
+    let layers = passes::layers(headers);
+    let chosen = &passes::choose(headers, &layers, options.view_layer.as_deref())?.name;
+    let name = options.layer.as_deref().unwrap_or(COMBINED);
+    let views = passes::rgb_layers(headers, Some(chosen), name);
     if views.iter().all(|layer| preview::path(output, layer, views.len()).exists()) && !views.is_empty() {
         return Ok(());
     }

@@ -109,9 +109,10 @@ fn spawn(
 
 fn load_all(batch: &Batch, next: &SyncSender<(usize, Frames<PassSet>)>, events: &Sender<Event>) {
     for (index, job) in batch.jobs.iter().enumerate() {
-        if !batch.options.overwrite && frame_job::is_finished(&job.output) {
+        let finished = if batch.options.overwrite { None } else { frame_job::finished(&job.output) };
+        if let Some(headers) = finished {
             let _writing = batch.writing.lock().unwrap_or_else(PoisonError::into_inner);
-            let previewed = attempt(&job.output, || frame_job::add_previews(&job.output, &batch.options));
+            let previewed = attempt(&job.output, || frame_job::add_previews(&headers, &batch.options));
             let outcome = previewed.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
             let _ = events.send(Event::Finished(index, outcome));
             continue;
