@@ -376,7 +376,7 @@ fn facts() -> Facts {
         seed: 5,
         init: None,
         prefilter: None,
-        heads_only: false,
+        only: Vec::new(),
         seconds: 0.0,
         validation_frames: 0,
         validation_relmse: None,

@@ -220,23 +220,31 @@ fn a_resumed_run_needs_none_of_the_weights_it_began_with() {
 }
 
 #[test]
-fn heads_alone_are_trained_where_that_is_asked_for() {
+fn parameters_alone_are_trained_that_were_asked_for() {
     let dir = tempfile::tempdir().expect("a folder");
     let [first, second, third] = ["first", "second", "third"].map(|name| dir.path().join(name));
     run(&mut train(&first, 2)).success();
     let begin = first.join("last.safetensors");
-    run(train(&second, 2).args(["--heads-only", "--init"]).arg(&begin)).success();
+    run(train(&second, 2).args(["--only", "head.*,decoder.0.*.bias", "--init"]).arg(&begin)).success();
     let (_, began) = weights::read(&begin).expect("weights");
     let trained = tensors(&second);
+    let asked_for =
+        |name: &str| name.starts_with("head.") || name.starts_with("decoder.0.") && name.ends_with(".bias");
     for before in &began {
         let after = trained.iter().find(|tensor| tensor.name == before.name).expect("the same tensors");
-        assert_eq!(before.values != after.values, before.name.starts_with("head."), "{}", before.name);
+        assert_eq!(before.values != after.values, asked_for(&before.name), "{}", before.name);
     }
-    let moments = |name: &&Tensor| name.name.starts_with("first.");
-    assert!(trained.iter().filter(moments).all(|tensor| tensor.name.starts_with("first.head.")));
+    let mut moments = trained.iter().filter_map(|tensor| tensor.name.strip_prefix("first."));
+    assert!(moments.all(asked_for));
     let mut refused = train_with("demc", "64", &third, 1);
-    let refused = run(refused.args(["--heads-only", "--init"]).arg(&begin)).code(2);
-    refused.stderr(predicate::str::contains("--heads-only: demc normalises"));
+    let refused = run(refused.args(["--only", "*.bias", "--init"]).arg(&begin)).code(2);
+    refused.stderr(predicate::str::contains("--only: demc normalises"));
+    for (names, reason) in [("heads.*", "no parameter that is trained"), ("head.***", "wildcards")] {
+        let refused = run(train(&third, 1).args(["--only", names, "--init"]).arg(&begin)).code(2);
+        refused.stderr(
+            predicate::str::contains(format!("--only '{names}'")).and(predicate::str::contains(reason)),
+        );
+    }
 }
 
 #[test]

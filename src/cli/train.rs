@@ -86,10 +86,10 @@ pub struct Args {
     /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
-    /// Train the heads of --init alone, the last layers before what is predicted: takes less time, and the layers before
-    /// them forget nothing
-    #[arg(long, requires = "init")]
-    heads_only: bool,
+    /// Train parameters of these names alone and keep the others as --init has them, which then forget nothing; * is any
+    /// part of a name: 'head.*' are the last layers before what is predicted, which takes the least time, '*.bias' all biases
+    #[arg(long, requires = "init", value_delimiter = ',', value_name = "NAME,...")]
+    only: Vec<String>,
     /// Weights that denoise albedo and normal first: a file of `demc train --model prefilter`, or of a network that has a
     /// prefilter; without it those of --init, or the built-in ones
     #[arg(long)]
@@ -98,7 +98,7 @@ pub struct Args {
     /// them there
     #[arg(long, conflicts_with_all = [
         "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "optimizer",
-        "weight_decay", "precision", "average", "val", "every", "seed", "init", "heads_only", "prefilter",
+        "weight_decay", "precision", "average", "val", "every", "seed", "init", "only", "prefilter",
     ])]
     resume: bool,
     /// Threads to use; all processors without it
@@ -208,10 +208,11 @@ impl Args {
         }
         models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
         let mut built = models::build(&network, 0);
-        if self.heads_only && !built.batch_norms().is_empty() {
+        if !self.only.is_empty() && !built.batch_norms().is_empty() {
             let reason = "normalises by what it sees in training, so that all of it changes; leave it out";
-            return Err(usage(format!("--heads-only: {} {reason}", self.model)));
+            return Err(usage(format!("--only: {} {reason}", self.model)));
         }
+        train::train_only(&mut *built, &self.only)?;
         if !built.makes_radiance() {
             if self.raw_references {
                 let reason =
@@ -289,7 +290,7 @@ impl Args {
             every: self.every,
             seed: self.seed,
             init: self.init.clone(),
-            heads_only: self.heads_only,
+            only: self.only.clone(),
             prefilter: self.prefilter.clone(),
         })
     }

@@ -54,9 +54,9 @@ pub struct Facts {
     /// The weights file whose prefilter it got, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<String>,
-    /// Whether its heads alone were trained.
+    /// The names of the parameters that alone were trained, `*` for any part of one; if there are none, all were.
     #[serde(default)]
-    pub heads_only: bool,
+    pub only: Vec<String>,
     /// Seconds of training.
     pub seconds: f64,
     /// Pairs validated on.

@@ -96,11 +96,6 @@ impl Conv {
         self.linear()
     }
 
-    /// Whether it is a [`Conv::head`].
-    pub fn is_head(&self) -> bool {
-        !self.weight.hidden
-    }
-
     /// The same layer with every bias at `value`.
     pub fn with_bias(mut self, value: f32) -> Self {
         self.bias.set(&vec![value; self.arithmetic.outputs]);
@@ -268,8 +263,9 @@ impl Conv {
         let made = (shape_out, format);
         let output = self.arithmetic.forward(&data, &weights, &bias, self.relu, made, T::OWNS_TAPE);
 
-        let is_trained = self.weight.trainable;
-        let learns = is_trained || sources.iter().any(|source| source.saved.gradient.is_some());
+        let [weight_learns, bias_learns] = [&self.weight, &self.bias].map(|param| param.trainable);
+        let learns =
+            weight_learns || bias_learns || sources.iter().any(|source| source.saved.gradient.is_some());
         let mut saved: Vec<Saved> = Vec::with_capacity(sources.len());
         let mut tape = T::default();
         for source in sources {
@@ -289,8 +285,10 @@ impl Conv {
                 if relu {
                     relu_mask(out.data.view(), gradient.view_mut());
                 }
-                if is_trained {
+                if bias_learns {
                     bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
+                }
+                if weight_learns {
                     let views: Vec<_> = saved.iter().map(|s| s.data.view()).collect();
                     arithmetic.weight_gradient(&views, gradient.view(), gradients.get_or_alloc_mut(&weight)?);
                 }

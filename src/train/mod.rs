@@ -17,4 +17,4 @@ pub use dataset::{Dataset, Sample};
 pub use log::Row;
 pub use loss::Loss;
 pub use optimizer::{Optimizer, Rule};
-pub use run::{Event, Options, run};
+pub use run::{Event, Options, run, train_only};

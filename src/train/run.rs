@@ -70,9 +70,9 @@ pub struct Options {
     pub seed: u64,
     /// A weights file to begin with, instead of weights drawn from the seed.
     pub init: Option<PathBuf>,
-    /// Whether the heads alone are trained, and all that they read stays as it began.
+    /// The names of the parameters that are trained, as [`train_only`] reads them; all are if there are none.
     #[serde(default)]
-    pub heads_only: bool,
+    pub only: Vec<String>,
     /// The weights file whose prefilter the network gets, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<PathBuf>,
@@ -125,11 +125,7 @@ pub fn run(
         set_prefilter(&mut *network, options)?;
     }
     network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
-    if options.heads_only {
-        for conv in network.convolutions().into_iter().filter(|conv| !conv.is_head()) {
-            conv.params().into_iter().for_each(|param| param.trainable = false);
-        }
-    }
+    train_only(&mut *network, &options.only)?;
     let mut average = network.duplicate();
     let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
     let mut progress = Progress::default();
@@ -206,6 +202,31 @@ pub fn run(
             return Err(Error::Interrupted);
         }
     }
+    Ok(())
+}
+
+/// Keeps all parameters as they are but those that one of `names` matches, in which `*` stands for any part of a name; with none,
+/// changes nothing.
+///
+/// # Errors
+/// One of `names` is no pattern, or matches nothing that is trained.
+pub fn train_only(network: &mut dyn Network, names: &[String]) -> Result<()> {
+    let mut matched = vec![names.is_empty(); network.params().len()];
+    for name in names {
+        let pattern = glob::Pattern::new(name).map_err(|e| Error::Usage(format!("--only '{name}': {e}")))?;
+        let params = network.params();
+        let mut found: Vec<usize> = (0..params.len()).filter(|&i| pattern.matches(&params[i].name)).collect();
+        found.retain(|&i| params[i].trainable);
+        if found.is_empty() {
+            let trained: Vec<&str> =
+                params.iter().filter(|param| param.trainable).map(|param| &param.name[..]).collect();
+            let (first, last) = (trained[0], trained[trained.len() - 1]);
+            let reason = format!("matches no parameter that is trained; they are {first} to {last}");
+            return Err(Error::Usage(format!("--only '{name}': {reason}")));
+        }
+        found.into_iter().for_each(|i| matched[i] = true);
+    }
+    network.params().into_iter().zip(matched).for_each(|(param, matched)| param.trainable &= matched);
     Ok(())
 }
 
@@ -374,7 +395,7 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         seed: options.seed,
         init: path(&options.init),
         prefilter: path(&options.prefilter),
-        heads_only: options.heads_only,
+        only: options.only.clone(),
         seconds: row.seconds,
         validation_frames: options.validation.len(),
         validation_relmse: row.val_relmse,
