@@ -10,13 +10,13 @@ use std::path::Path;
 
 use crate::{
     Error, Result,
+    augment::Augment,
     error::attempt,
     metrics::{self, error::relmse},
     passes::{Pass, PassSet},
     planes::Planes,
     report::{self, Loaded, Method, append_row, cell, geometric_mean, to_csv, write_file},
     testset::Pair,
-    train::Augment,
 };
 
 /// One way to change a frame.

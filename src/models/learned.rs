@@ -9,11 +9,11 @@ use super::{
 };
 use crate::{
     Error, Result,
+    augment::Augment,
     features::{PREFILTERED_PASSES, exposure, guide_rows},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
-    train::Augment,
 };
 
 const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");

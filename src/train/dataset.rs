@@ -5,9 +5,9 @@ use std::collections::HashMap;
 use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
-use super::Augment;
 use crate::{
     Error, Result,
+    augment::Augment,
     frame::HALF_MAX,
     metrics::pairing,
     nn::Rng,
@@ -159,8 +159,12 @@ impl Dataset {
             let other = other.passes(&other.passes, (x, y), (side, side));
             sample.passes = mixed(&sample.passes, &other, rng);
         }
-        Augment::draw(rng).apply(&mut sample);
-        sample
+        let augment = Augment::draw(rng);
+        Sample {
+            passes: augment.passes(&sample.passes),
+            reference: augment.passes(&sample.reference),
+            raw_reference: sample.raw_reference.map(|raw| augment.pass(Pass::Combined, &raw)),
+        }
     }
 
     /// A frame and its index, drawn as often as it is large.

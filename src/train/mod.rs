@@ -4,7 +4,6 @@
 //! `best.safetensors`. Every random choice follows from the seed and the step's number, so a run that
 //! was stopped at any moment and resumed ends with the same bits as one that was not.
 
-mod augment;
 mod checkpoint;
 mod dataset;
 mod log;
@@ -12,7 +11,6 @@ mod loss;
 mod optimizer;
 mod run;
 
-pub use augment::Augment;
 pub use dataset::{Dataset, Sample};
 pub use log::Row;
 pub use loss::Loss;

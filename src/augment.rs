@@ -1,11 +1,10 @@
-//! Label-preserving changes to a crop: flips, quarter turns, a permutation of RGB, exposure.
+//! Changes to a frame that leave it as good a picture: flips, quarter turns, a permutation of RGB, exposure.
 //!
 //! A vector pass must change with the picture. Camera-space normals turn as the image turns. World
 //! space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
 //! world, so the same flip and turn are applied to the horizontal axes of normals and positions,
 //! about the vertical one, which gravity makes special.
 
-use super::Sample;
 use crate::{
     nn::Rng,
     passes::{Pass, PassSet},
@@ -45,25 +44,19 @@ impl Augment {
         }
     }
 
-    /// Applies it to every pass and the reference.
+    /// Applied to every pass of a frame.
     ///
     /// # Panics
-    /// If the sample is not square and a quarter turn is asked for.
-    pub fn apply(&self, sample: &mut Sample) {
-        sample.passes = self.passes(&sample.passes);
-        sample.reference = self.passes(&sample.reference);
-        sample.raw_reference = sample.raw_reference.take().map(|raw| self.pass(Pass::Combined, &raw));
-    }
-
-    /// Applied to every pass.
-    ///
-    /// # Panics
-    /// As [`Augment::apply`].
+    /// If the frame is not square and a quarter turn is asked for.
     pub fn passes(&self, old: &PassSet) -> PassSet {
         old.map((old.width, old.height), |pass, planes| self.pass(pass, planes))
     }
 
-    fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
+    /// Applied to one pass.
+    ///
+    /// # Panics
+    /// As [`Augment::passes`].
+    pub fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
         let mut planes = self.moved(planes);
         match pass {
             Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes),
