@@ -29,6 +29,7 @@ use crate::{
         logarithm::{LogTransfer, ln},
         vectorised::{self, CHUNK, Vectorised},
     },
+    metrics::display::LUMINANCE,
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -396,7 +397,7 @@ impl<F: Fn(f32) -> f32> Vectorised for Luminance<'_, F> {
     #[inline(always)]
     fn run(self) {
         let Self { planes, rows, of, columns } = self;
-        for (c, weight) in [0.2126, 0.7152, 0.0722].into_iter().enumerate() {
+        for (c, weight) in LUMINANCE.into_iter().enumerate() {
             for y in rows.clone() {
                 let row = &planes.channel(c)[y * planes.width..][..planes.width];
                 for (sum, v) in columns.iter_mut().zip(row) {
