@@ -211,22 +211,25 @@ pub fn run(
 /// # Errors
 /// One of `names` is no pattern, or matches nothing that is trained.
 pub fn train_only(network: &mut dyn Network, names: &[String]) -> Result<()> {
-    let mut matched = vec![names.is_empty(); network.params().len()];
-    for name in names {
-        let pattern = glob::Pattern::new(name).map_err(|e| Error::Usage(format!("--only '{name}': {e}")))?;
-        let params = network.params();
-        let mut found: Vec<usize> = (0..params.len()).filter(|&i| pattern.matches(&params[i].name)).collect();
-        found.retain(|&i| params[i].trainable);
-        if found.is_empty() {
-            let trained: Vec<&str> =
-                params.iter().filter(|param| param.trainable).map(|param| &param.name[..]).collect();
-            let (first, last) = (trained[0], trained[trained.len() - 1]);
-            let reason = format!("matches no parameter that is trained; they are {first} to {last}");
-            return Err(Error::Usage(format!("--only '{name}': {reason}")));
-        }
-        found.into_iter().for_each(|i| matched[i] = true);
+    if names.is_empty() {
+        return Ok(());
     }
-    network.params().into_iter().zip(matched).for_each(|(param, matched)| param.trainable &= matched);
+    let mut trained = network.params();
+    trained.retain(|param| param.trainable);
+    let refuse = |name: &str, reason: String| Error::Usage(format!("--only '{name}': {reason}"));
+    let mut patterns = Vec::with_capacity(names.len());
+    for name in names {
+        let pattern = glob::Pattern::new(name).map_err(|e| refuse(name, e.to_string()))?;
+        if !trained.iter().any(|param| pattern.matches(&param.name)) {
+            let (first, last) = (&trained[0].name, &trained[trained.len() - 1].name);
+            let reason = format!("matches no parameter that is trained; they are {first} to {last}");
+            return Err(refuse(name, reason));
+        }
+        patterns.push(pattern);
+    }
+    for param in trained {
+        param.trainable = patterns.iter().any(|pattern| pattern.matches(&param.name));
+    }
     Ok(())
 }
 
