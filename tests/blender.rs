@@ -292,7 +292,7 @@ fn guides_alone_are_the_guides_of_whole_renders() {
 fn builds_every_kind_of_scene_without_assets() {
     let said = run(blender().arg(snippet("every_kind.py")).arg(script("")));
     let kinds: Vec<_> = said.lines().filter_map(|line| line.strip_prefix("KIND ")).collect();
-    assert_eq!(kinds.len(), 11, "{said}");
+    assert_eq!(kinds.len(), 12, "{said}");
     for kind in kinds {
         let meshes: usize = kind.rsplit(' ').next().unwrap().parse().unwrap();
         assert!(meshes >= 3, "{kind}");

@@ -1,5 +1,9 @@
 """The kinds of scenes by name: what builds each, and the cameras that suit it."""
 
+import math
+
+from mathutils import Vector
+
 from . import outside, relief, rooms, studio, views
 
 
@@ -18,6 +22,24 @@ def _relief(stage):
 
     def camera():
         return views.around_camera(stage, stage.rng.choice(stage.interest), (6, 18), (0.5, 2.5), (20, 45), 0.5)
+    return camera
+
+
+def _sunlit(stage):
+    """Sharp shadows, as dense as textures, of which guides know nothing: the sun through blinds and bars, or
+    through leaves onto a house."""
+    rng = stage.rng
+    if rng.random() < 0.85:
+        shell = rooms.room(stage, "day", rng.random() < 0.3, sunlit=True)
+        return lambda: views.room_camera(stage, shell)
+    relief.house(stage)
+    toward = outside.sun_lamp(stage, math.radians(rng.uniform(200, 340)), math.radians(rng.uniform(15, 60)))
+    outside.environment(stage, outside.DAY, rng.uniform(0.3, 1.2), ("night", "moon"))
+    for target in rng.sample(stage.interest, min(len(stage.interest), 4)):
+        outside.bush(stage, Vector(target) + toward * rng.uniform(1.5, 6), rng.uniform(0.8, 2.5))
+
+    def camera():
+        return views.around_camera(stage, rng.choice(stage.interest), (5, 14), (0.5, 2.5), (20, 50), 0.5)
     return camera
 
 
@@ -85,6 +107,7 @@ def _fog(stage):
 KINDS = {
     "room": (_room, 12),
     "relief": (_relief, 6),
+    "sunlit": (_sunlit, 4),
     "street": (_street, 2),
     "outdoor": (_outdoor, 3),
     "studio": (_table(studio.studio), 2),

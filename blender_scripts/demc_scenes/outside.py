@@ -11,14 +11,24 @@ from .stage import darkness, environment
 from .studio import grow
 
 
+DAY = ("sunny", "sky", "sun", "garden", "forest", "dawn", "city")
+
+
 def sun(stage, low=False):
     """Environment and sun of a day."""
     rng = stage.rng
-    environment(stage, ("sunny", "sky", "sun", "garden", "forest", "dawn", "city"), rng.uniform(0.5, 1.5), ("night", "moon"))
+    environment(stage, DAY, rng.uniform(0.5, 1.5), ("night", "moon"))
     if rng.random() < 0.6:
         angle, height = rng.uniform(0, 6.28), math.radians(rng.uniform(5, 20) if low else rng.uniform(15, 65))
-        toward = Vector((math.cos(angle) * math.cos(height), math.sin(angle) * math.cos(height), math.sin(height)))
-        stage.lamp("SUN", (0, 0, 30), rng.uniform(2, 8), rng.choice(((1, 0.95, 0.88), (1, 0.75, 0.5))), aim=Vector((0, 0, 30)) - toward, angle=math.radians(rng.uniform(0.3, 2)))
+        sun_lamp(stage, angle, height)
+
+
+def sun_lamp(stage, angle, height):
+    """A sun at an azimuth and a height in radians; returns the direction toward it."""
+    rng = stage.rng
+    toward = Vector((math.cos(angle) * math.cos(height), math.sin(angle) * math.cos(height), math.sin(height)))
+    stage.lamp("SUN", (0, 0, 30), rng.uniform(2, 8), rng.choice(((1, 0.95, 0.88), (1, 0.75, 0.5))), aim=Vector((0, 0, 30)) - toward, angle=math.radians(rng.uniform(0.3, 2)))
+    return toward
 
 
 def facade(stage, at, turn, night):

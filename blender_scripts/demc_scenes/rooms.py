@@ -6,10 +6,11 @@ daylight comes in through windows alone.
 
 import math
 
-from mathutils import Vector
+from mathutils import Matrix, Vector
 
 from . import materials as m
 from . import palette, props, relief, shapes
+from .outside import DAY, bush
 from .stage import darkness, environment
 
 _THICK = 0.25
@@ -18,9 +19,11 @@ _THICK = 0.25
 class Room:
     """The shell of a room and what light it has."""
 
-    def __init__(self, stage, width, depth, height, relief=False):
+    def __init__(self, stage, width, depth, height, relief=False, sunlit=False):
         self.stage, self.width, self.depth, self.height = stage, width, depth, height
         self.relief = relief  # whether walls and ceiling are dressed
+        # How far sunbeams sink for each metre into the room; None where the sun is not what the room is about.
+        self.sunbeam = stage.rng.uniform(0.2, 1.1) if sunlit else None
         self.windows = []  # (centre, inward normal, width, height)
 
     def wall_point(self, wall, along, off=0.0):
@@ -42,16 +45,19 @@ class Room:
         return (math.pi, -math.pi / 2, 0.0, math.pi / 2)[wall]
 
 
-def room(stage, mood=None, relief=False):
+def room(stage, mood=None, relief=False, sunlit=False):
     """A furnished room; `mood` is day, night or dim."""
     rng = stage.rng
     mood = mood or rng.choice(("day", "day", "day", "night", "dim"))
-    shell = Room(stage, rng.uniform(2.8, 6.5), rng.uniform(3.0, 7.5), rng.uniform(2.35, 3.4), relief)
+    shell = Room(stage, rng.uniform(2.8, 6.5), rng.uniform(3.0, 7.5), rng.uniform(2.35, 3.4), relief, sunlit)
     build_shell(shell, windows=rng.randint(1, 4))
     furnish(shell)
     decorate_walls(shell)
     clutter(shell)
-    lights(shell, mood)
+    if sunlit:
+        sunbeams(shell)
+    else:
+        lights(shell, mood)
     return shell
 
 
@@ -127,7 +133,9 @@ def window(shell, wall, opening, trim):
     if rng.random() < 0.6:
         stage.add(shapes.box((w, 0.008, h), 0, (u, y, (v0 + v1) / 2)), m.pane(rng), at, turn)
     roll = rng.random()
-    if roll < 0.45:
+    if shell.sunbeam:
+        screen(shell, opening, at, turn)
+    elif roll < 0.45:
         cloth = m.translucent(rng) if rng.random() < 0.7 else palette.choose(rng, stage.library, "fabric")
         for side in (-1, 1):
             width = w * rng.uniform(0.15, 0.55)
@@ -142,6 +150,33 @@ def window(shell, wall, opening, trim):
     outside = Vector(shell.wall_point(wall, u, -1.5)) + Vector((0, 0, (v0 + v1) / 2))
     inside = Vector(shell.wall_point(wall, u, 1.5)) + Vector((0, 0, (v0 + v1) / 2))
     shell.windows.append((outside, inside, w, h))
+
+
+def screen(shell, opening, at, turn):
+    """What breaks sunlight into stripes: blinds, bars, a lattice, or leaves outside."""
+    stage, rng = shell.stage, shell.stage.rng
+    u0, u1, v0, v1 = opening
+    w, h, u, v = u1 - u0, v1 - v0, (u0 + u1) / 2, (v0 + v1) / 2
+    pitch, thin = rng.uniform(0.03, 0.15), rng.uniform(0.004, 0.03)
+    material = m.paint(rng, (0.02, 0.95)) if rng.random() < 0.7 else palette.choose(rng, stage.library, "furniture")
+    rows = [v0 + (i + 0.5) * pitch for i in range(int(h / pitch))]
+    columns = [u0 + (i + 0.5) * pitch for i in range(int(w / pitch))]
+    way = rng.choice(("blinds", "blinds", "blinds", "vertical", "bars", "lattice", "leaves", "none"))
+    if way == "blinds":
+        depth, tilt = pitch * rng.uniform(0.5, 1.0), rng.uniform(-0.5, 0.5) - math.atan(shell.sunbeam)  # open to the sun
+        stage.add(shapes.boxes([((w, depth, 0.003), (u, 0.05, z)) for z in rows], turn=Matrix.Rotation(tilt, 4, "X")), material, at, turn)
+    elif way == "vertical":
+        slats = [((pitch * 0.9, 0.003, h), (x, 0.08, v)) for x in columns]
+        stage.add(shapes.boxes(slats, turn=Matrix.Rotation(rng.uniform(0.9, 2.2), 4, "Z")), material, at, turn)
+    elif way in ("bars", "lattice"):
+        bars = [((thin, thin, h), (x, -_THICK, v)) for x in columns]
+        if way == "lattice":
+            bars += [((w, thin, thin), (u, -_THICK, z)) for z in rows]
+        stage.add(shapes.boxes(bars), material, at, turn)
+    elif way == "leaves":
+        for _ in range(rng.randint(1, 3)):
+            out = Vector(shell.wall_point(0, u + rng.uniform(-w, w), -rng.uniform(0.6, 2.0))) + Vector((0, 0, v + rng.uniform(-0.3, 1.0)))
+            bush(stage, Matrix.Translation(at) @ Matrix.Rotation(turn, 4, "Z") @ out, rng.uniform(0.6, 1.5))
 
 
 def furnish(shell):
@@ -292,7 +327,7 @@ def lights(shell, mood):
     if mood == "night":
         darkness(stage, rng.uniform(0.0, 0.05))
     else:
-        environment(stage, ("sunny", "city", "forest", "garden", "sky", "sun", "dawn"), rng.uniform(0.6, 3.0) if mood == "day" else rng.uniform(0.2, 0.8), ("night",))
+        environment(stage, DAY, rng.uniform(0.6, 3.0) if mood == "day" else rng.uniform(0.2, 0.8), ("night",))
         daylight(shell, mood)
         if shell.windows and rng.random() < 0.55:
             outside, inside, *_ = rng.choice(shell.windows)
@@ -303,6 +338,33 @@ def lights(shell, mood):
     lamps = {"day": rng.choice((0, 0, 1)), "dim": rng.randint(0, 1), "night": rng.randint(1, 4)}[mood]
     for _ in range(lamps):
         rng.choice((pendant, panel, downlights, floor_lamp, floor_lamp))(shell)
+
+
+def sunbeams(shell):
+    """A low sun through a window, and where its light falls as what is worth looking at."""
+    stage, rng = shell.stage, shell.stage.rng
+    environment(stage, DAY, rng.uniform(0.4, 2.0), ("night",))
+    daylight(shell, "day")
+    if not shell.windows:
+        return
+    outside, inside, *_ = rng.choice(shell.windows)
+    inward = (inside - outside).normalized()
+    ray = inward + Vector((-inward.y, inward.x, 0)) * rng.uniform(-0.9, 0.9) - Vector((0, 0, shell.sunbeam))
+    stage.lamp("SUN", (0, 0, 9), rng.uniform(4, 30), rng.choice(((1, 0.95, 0.85), (1, 0.8, 0.55), (1, 1, 1))), aim=Vector((0, 0, 9)) + ray,
+               angle=math.radians(rng.uniform(0.2, 1.5)))
+    lit = []
+    for outside, inside, w, h in shell.windows:
+        center, inward = outside.lerp(inside, 0.5), (inside - outside).normalized()
+        if inward.dot(ray) < 0.2:
+            continue
+        side = Vector((-inward.y, inward.x, 0))
+        for _ in range(8):
+            start = center + side * rng.uniform(-w / 2, w / 2) + Vector((0, 0, rng.uniform(-h / 2, h / 2)))
+            # Where the beam leaves the box of the room, along each axis.
+            ends = [((far if step > 0 else 0.0) - from_) / step for from_, step, far in zip(start, ray, (shell.width, shell.depth, shell.height)) if abs(step) > 1e-3]
+            lit.append(start + ray * min(end for end in ends if end > 1e-3))
+        lit += [center] * 3
+    stage.interest = lit + rng.sample(stage.interest, min(len(stage.interest), 3))
 
 
 def daylight(shell, mood):

@@ -40,11 +40,11 @@ def box(size, bevel=0.0, center=(0, 0, 0), segments=2):
     return _finish(builder, "box", False)
 
 
-def boxes(parts, bevel=0.0):
-    """Several (size, center) boxes in one mesh."""
+def boxes(parts, bevel=0.0, turn=Matrix()):
+    """Several (size, center) boxes in one mesh, each turned about its center."""
     builder = bmesh.new()
     for size, center in parts:
-        made = bmesh.ops.create_cube(builder, size=1.0, matrix=Matrix.Translation(center) @ Matrix.Diagonal((*size, 1)))
+        made = bmesh.ops.create_cube(builder, size=1.0, matrix=Matrix.Translation(center) @ turn @ Matrix.Diagonal((*size, 1)))
         if bevel:
             edges = {e for v in made["verts"] for e in v.link_edges}
             bmesh.ops.bevel(builder, geom=list(edges), offset=min(bevel, min(size) * 0.45), segments=2, profile=0.5, affect="EDGES")
