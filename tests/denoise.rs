@@ -208,10 +208,30 @@ fn plain_rgb_images_gain_a_layer_too() {
 #[test]
 fn skips_finished_results_unless_told_otherwise() {
     let (_dir, out) = out();
-    demc(&out).arg(data("blender4.exr")).assert().success();
     let result = out.join("blender4.exr");
-    fs::copy(data("blender5.exr"), &result).unwrap();
+    demc(&out).arg(data("blender5.exr")).assert().success();
+    fs::rename(out.join("blender5.exr"), &result).unwrap();
+    let finished = fs::read(&result).unwrap();
     demc(&out).arg(data("blender4.exr")).assert().success().stdout(contains("is there already"));
+    // Another result than the one there is wanted: neither is it done without a word, nor that one lost.
+    for other in [
+        &["--replace"][..],
+        &["--layer", "Clean"],
+        &["--view-layer", "Nope"],
+        &["--layer", "Clean", "--preview"],
+    ] {
+        let run = demc(&out).arg(data("blender4.exr")).args(other).assert().code(1);
+        run.stderr(
+            contains("out/blender4.exr: exists without 'ViewLayer.").or(contains("no view layer 'Nope'")),
+        );
+    }
+    assert_eq!(fs::read(&result).unwrap(), finished);
+    fs::copy(data("blender5.exr"), &result).unwrap();
+    demc(&out)
+        .arg(data("blender4.exr"))
+        .assert()
+        .code(1)
+        .stderr(contains("--overwrite denoises the frame again"));
     assert_eq!(fs::read(&result).unwrap(), fs::read(data("blender5.exr")).unwrap());
     demc(&out).arg(data("blender4.exr")).arg("--overwrite").assert().success();
     assert_kept(&data("blender4.exr"), &result);
@@ -248,7 +268,7 @@ fn previews_are_made_up_for_and_kept() {
     let (_dir, out) = self::out();
     demc(&out).arg(data(files[0])).assert().success();
     let again = demc(&out).arg(data(files[0])).args(["--replace", "--preview"]).assert().code(1);
-    again.stderr(contains("blender4.exr: lacks the layer to preview; --overwrite"));
+    again.stderr(contains("blender4.exr: exists without 'ViewLayer.Combined' made by demc; --overwrite"));
     assert!(!out.join(pngs[0]).exists());
 }
 
@@ -258,7 +278,8 @@ fn takes_files_directories_and_globs_and_does_each_file_once() {
     for name in ["a.0001.exr", "a.0002.exr", "b.EXR", ".hidden.exr", "note.txt"] {
         fs::copy(data("blender4.exr"), dir.path().join(name)).unwrap();
     }
-    let glob = dir.path().join("a.*.exr");
+    let glob = dir.path().join("*a.*.exr");
+    fs::write(dir.path().join("._a.0001.exr"), "not an image").unwrap();
     demc(&out)
         .args([&glob, dir.path(), &dir.path().join("b.EXR")])
         .assert()
@@ -304,7 +325,7 @@ fn layer_names() {
     let image = read_exr(out.join("blender5.exr"));
     assert!(samples(&image, "ViewLayer.Clean beauty.R").is_some());
     assert!(samples(&image, "ViewLayer.Denoised.R").is_none());
-    for bad in ["", "a.b", "Normal", "DiffCol", "Combined"] {
+    for bad in ["", "a.b", "a\nb", "Normal", "DiffCol", "Combined", "Beauty", "rgb"] {
         demc(&out)
             .arg(data("blender5.exr"))
             .args(["--layer", bad])
@@ -374,11 +395,29 @@ fn a_batch_outlives_those_who_read_what_it_says() {
     assert_eq!(fs::read_dir(&out).unwrap().count(), 2);
 }
 
+/// A sequence in which a frame is held by linking to it, and one whose storage is not there.
+#[cfg(unix)]
+#[test]
+fn links_are_frames_of_their_own() {
+    let (dir, out) = out();
+    let link = |to: &str, name: &str| std::os::unix::fs::symlink(to, dir.path().join(name)).unwrap();
+    fs::copy(data("blender4.exr"), dir.path().join("f.0001.exr")).unwrap();
+    link("f.0001.exr", "f.0002.exr");
+    link("gone.exr", "f.0003.exr");
+    for input in [dir.path().to_path_buf(), dir.path().join("f.*.exr")] {
+        let run = demc(&out).arg(input).arg("--overwrite").assert().code(1);
+        run.stdout(contains("2 denoised, 1 failed")).stderr(contains("f.0003.exr: cannot read"));
+        assert_kept(&data("blender4.exr"), &out.join("f.0002.exr"));
+    }
+}
+
 #[test]
 fn an_input_that_names_nothing_does_not_stop_the_others() {
     let (dir, out) = out();
     let empty = dir.path().join("empty");
     fs::create_dir(&empty).unwrap();
+    let none = demc(&out).args([&empty, &dir.path().join("*.exr")]).assert().code(2);
+    none.stderr(contains("no EXR files").and(contains("matches no file")));
     demc(&out)
         .args([&empty, &dir.path().join("*.exr"), &data("blender4.exr")])
         .assert()
@@ -443,6 +482,85 @@ fn says_when_lossy_channels_are_stored_as_zip() {
         let now = samples(&after, &channel.name.to_string()).unwrap();
         assert_eq!(bits(&channel.sample_data), bits(now), "{}", channel.name);
     }
+}
+
+/// A single part of 3x2 pixels with these channels.
+fn write_channels(path: &Path, attributes: exr::prelude::LayerAttributes, channels: &[(&str, f32)]) {
+    use exr::prelude::*;
+    let list = channels.iter().map(|(name, value)| AnyChannel::new(*name, FlatSamples::F32(vec![*value; 6])));
+    let layer = Layer::new((3, 2), attributes, Encoding::SMALL_LOSSLESS, AnyChannels::sort(list.collect()));
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}
+
+#[test]
+fn an_aov_of_that_name_is_not_the_beauty() {
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let channels =
+        ["R", "G", "B"].map(|c| [(format!("V.Beauty.{c}"), 9.0), (format!("V.Combined.{c}"), 0.5)]).concat();
+    let channels: Vec<(&str, f32)> = channels.iter().map(|(name, value)| (name.as_str(), *value)).collect();
+    write_channels(&input, Default::default(), &channels);
+    demc(&out).arg(&input).assert().success();
+    assert_same_values(&out.join("in.exr"), "V.Combined.G", "V.Denoised.G");
+}
+
+#[test]
+fn keeps_a_key_code_whole() {
+    use exr::prelude::attribute::AttributeValue;
+    let (dir, out) = out();
+    let (input, output) = (dir.path().join("in.exr"), out.join("in.exr"));
+    let bytes: Vec<u8> = (1..8i32).flat_map(i32::to_le_bytes).collect();
+    let mut attributes = exr::prelude::LayerAttributes::default();
+    let value = AttributeValue::Custom { kind: "keycode".into(), bytes: bytes.as_slice().into() };
+    attributes.other.insert("keyC0de".into(), value); // the writer refuses the name itself
+    write_channels(&input, attributes, &[("R", 0.1), ("G", 0.2), ("B", 0.3)]);
+    let mut file = fs::read(&input).unwrap();
+    let name = file.windows(7).position(|part| part == b"keyC0de").unwrap();
+    file[name..][..7].copy_from_slice(b"keyCode");
+    fs::write(&input, file).unwrap();
+    demc(&out).arg(&input).assert().success();
+    assert_kept(&input, &output);
+    let stored = [&b"keyCode\0keycode\0\x1c\0\0\0"[..], &bytes].concat();
+    assert!(fs::read(&output).unwrap().windows(stored.len()).any(|part| part == stored));
+}
+
+#[test]
+fn alpha_in_another_part_stays_there() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let part = |name: &str, channels: &[&str]| {
+        let list = channels.iter().map(|c| AnyChannel::new(*c, FlatSamples::F32(vec![0.5; 12])));
+        let channels = AnyChannels::sort(list.collect());
+        Layer::new((4, 3), LayerAttributes::named(name), Encoding::SMALL_LOSSLESS, channels)
+    };
+    let parts = vec![part("beauty", &["R", "G", "B"]), part("rgba", &["R", "G", "B", "A"])];
+    Image::from_layers(ImageAttributes::new(IntegerBounds::from_dimensions((4, 3))), parts)
+        .write()
+        .to_file(&input)
+        .unwrap();
+    demc(&out).arg(&input).arg("--replace").assert().success();
+    let names = |path: &Path| -> Vec<Vec<String>> {
+        let parts = read_exr(path).layer_data;
+        parts.iter().map(|part| part.channel_data.list.iter().map(|c| c.name.to_string()).collect()).collect()
+    };
+    assert_eq!(names(&out.join("in.exr")), names(&input));
+}
+
+#[test]
+fn channels_of_no_view_do_not_hide_the_eyes() {
+    use exr::prelude::*;
+    let (dir, out) = out();
+    let input = dir.path().join("in.exr");
+    let mut image = read_exr(data("blender4_stereo.exr"));
+    let list = &mut image.layer_data[0].channel_data.list;
+    let mut depth = list.iter().find(|c| c.name.to_string().ends_with(".left.R")).unwrap().clone();
+    depth.name = "ViewLayer.Depth.Z".into();
+    list.push(depth);
+    image.layer_data[0].channel_data = AnyChannels::sort(list.clone());
+    image.write().to_file(&input).unwrap();
+    demc(&out).arg(&input).assert().success();
+    assert_same_values(&out.join("in.exr"), "ViewLayer.Combined.left.R", "ViewLayer.Denoised.left.R");
 }
 
 /// Ctrl-C in the middle of a batch: the shell's exit status, whole files only, nothing temporary.

@@ -39,14 +39,22 @@ pub fn expand(inputs: &[PathBuf]) -> Result<Inputs> {
             all.unusable.push((input.clone(), Error::Usage(format!("{}: {nothing}", input.display()))));
         }
     }
-    if all.files.is_empty()
-        && let Some((_, error)) = all.unusable.pop()
-    {
-        return Err(error);
+    if all.files.is_empty() {
+        let why: Vec<String> = all.unusable.iter().map(|(_, error)| error.to_string()).collect();
+        return Err(Error::Usage(why.join("\n")));
     }
+    // By name too: frames that are held are links to another.
     let mut seen = HashSet::new();
-    all.files.retain(|f| seen.insert(fs::canonicalize(f).unwrap_or_else(|_| f.clone())));
+    let identity = |f: &PathBuf| {
+        (fs::canonicalize(f).unwrap_or_else(|_| f.clone()), f.file_name().map(ToOwned::to_owned))
+    };
+    all.files.retain(|f| seen.insert(identity(f)));
     Ok(all)
+}
+
+/// Whether a path that was found is to be read: no folder or pipe, but a link whose target is missing, which reading reports.
+fn is_input(path: &Path) -> bool {
+    !is_hidden(path) && (path.is_file() || (path.is_symlink() && !path.exists()))
 }
 
 fn directory(path: &Path, all: &mut Inputs) {
@@ -59,7 +67,7 @@ fn directory(path: &Path, all: &mut Inputs) {
         match entry {
             Ok(entry) => {
                 let file = entry.path();
-                if !is_hidden(&file) && is_exr(&file) && file.is_file() {
+                if is_exr(&file) && is_input(&file) {
                     all.files.push(file);
                 }
             }
@@ -75,7 +83,7 @@ fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
         .map_err(|e| Error::Usage(format!("{text}: not a valid glob ({}); quote or escape it", e.msg)))?;
     for found in matches {
         match found {
-            Ok(file) if file.is_file() => all.files.push(file),
+            Ok(file) if is_input(&file) => all.files.push(file),
             Ok(_) => {}
             Err(error) => {
                 let path = error.path().to_path_buf();

@@ -8,10 +8,10 @@ use exr::{
         chunk::TileCoordinates,
         reader::{ChunksReader, Reader},
     },
-    meta::header::Header,
+    meta::{MetaData, attribute::AttributeValue, header::Header},
 };
 
-use super::{Frame, StoredChunk};
+use super::{Frame, StoredChunk, text};
 use crate::{Error, Result};
 
 /// Leading bytes of every EXR file.
@@ -62,10 +62,7 @@ impl Frame {
             return Err(truncated(path));
         }
 
-        let meta = chunks_reader.meta_data().clone();
-        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks };
-        frame.describe();
-        Ok(frame)
+        Ok(Self::assemble(path, byte_len, chunks_reader.meta_data().clone(), chunks))
     }
 
     /// Reads a file's headers alone: what it holds, none of its pixels.
@@ -75,10 +72,31 @@ impl Frame {
     pub fn read_headers(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let (reader, byte_len) = open(path)?;
-        let meta = reader.meta_data().clone();
-        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks: Vec::new() };
+        Ok(Self::assemble(path, byte_len, reader.meta_data().clone(), Vec::new()))
+    }
+
+    fn assemble(path: &Path, byte_len: u64, mut meta: MetaData, chunks: Vec<StoredChunk>) -> Self {
+        for header in &mut meta.headers {
+            let attributes = &mut header.own_attributes;
+            // exr 1.74 writes six of a key code's seven numbers, and a file that nothing reads: so they go as plain bytes.
+            if let Some(code) = attributes.film_key_code.take() {
+                let numbers = [
+                    code.film_manufacturer_code,
+                    code.film_type,
+                    code.film_roll_prefix,
+                    code.count,
+                    code.perforation_offset,
+                    code.perforations_per_frame,
+                    code.perforations_per_count,
+                ];
+                let bytes = numbers.iter().flat_map(|n| n.to_le_bytes()).collect();
+                let value = AttributeValue::Custom { kind: text("keycode"), bytes };
+                attributes.other.insert(text("keyCode"), value);
+            }
+        }
+        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks };
         frame.describe();
-        Ok(frame)
+        frame
     }
 }
 

@@ -16,7 +16,7 @@ use std::{
 };
 
 pub use layers::{Layer, PassChannels, choose, choose_like, layers, read, read_layer, rgb_layers};
-pub use names::{COMBINED, NOISY_IMAGE, POSITION_AOV};
+pub use names::{COMBINED, NOISY_IMAGE, POSITION_AOV, is_bare};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};
 

@@ -77,6 +77,11 @@ pub fn row(pass: Pass) -> &'static Row {
     TABLE.iter().find(|r| r.pass == pass).expect("the table has a row for every pass")
 }
 
+/// Whether a layer of that name in a file without view layers is the image itself, as some programs write it.
+pub fn is_bare(name: &str) -> bool {
+    ["rgb", "rgba", "beauty"].iter().any(|bare| bare.eq_ignore_ascii_case(name))
+}
+
 /// What the name of a channel says.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChannelName {
@@ -108,8 +113,8 @@ impl ChannelName {
             prefix = head;
         }
         let (view_layer, pass) = prefix.rsplit_once('.').unwrap_or(("", prefix));
-        // Single-layer images: `R G B A`, and `Z` for depth.
-        let bare = ["", "rgb", "rgba", "beauty"].iter().any(|b| b.eq_ignore_ascii_case(pass));
+        // Single-layer images: `R G B A`, and `Z` for depth. In a view layer such a name is an AOV's.
+        let bare = view_layer.is_empty() && (pass.is_empty() || is_bare(pass));
         let (pass, component) = match (bare, component) {
             (true, "Z") => ("Depth", component.to_owned()),
             (true, c) => ("Combined", c.to_ascii_uppercase()),
@@ -148,6 +153,8 @@ mod tests {
         check("Z", None, &[], ("", "Depth", None, "Z"));
         check("R", Some("ViewLayer.Diffuse Color"), &[], ("ViewLayer", "Diffuse Color", None, "R"));
         check("R", Some("rgba"), &[], ("", "Combined", None, "R"));
+        check("Beauty.R", None, &[], ("", "Combined", None, "R"));
+        check("ViewLayer.Beauty.R", None, &[], ("ViewLayer", "Beauty", None, "R"));
         check("X", Some("Normal"), &[], ("", "Normal", None, "X"));
         check("ViewLayer.Combined.R", Some("any part"), &[], ("ViewLayer", "Combined", None, "R"));
     }

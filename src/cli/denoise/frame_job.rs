@@ -69,10 +69,16 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
             return Err(Error::invalid(input, why));
         }
     }
-    let mut wanted = vec![Pass::Combined, Pass::Alpha, Pass::NoisyImage];
-    wanted.extend(model.passes().iter().chain(model.optional_passes()));
+    let mut needed = vec![Pass::Combined];
+    needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha, Pass::NoisyImage]].concat();
+    // Beside its stereo views a view layer may hold channels of no view.
+    let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
+    if eyes.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
+        eyes.retain(|l| l.passes.contains_key(&Pass::Combined));
+    }
     let mut views = Vec::new();
-    for layer in layers.iter().filter(|l| l.name == chosen.name) {
+    for layer in eyes {
         let mut set = passes::read_layer(&frame, layer, &wanted)?;
         if set.use_noisy_image() {
             report.notes.push(
@@ -80,7 +86,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
             );
         }
         // Before any work: a missing pass is the user's commonest mistake.
-        set.require_all([&[Pass::Combined], model.passes()].concat(), model.name())?;
+        set.require_all(needed.iter().copied(), model.name())?;
         for (pass, count) in set.sanitize() {
             *report.repaired.entry(pass.to_string()).or_default() += count;
         }
@@ -170,8 +176,10 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
             None => {
                 let mut channels: Vec<(usize, &[f32])> =
                     at.channels.iter().enumerate().map(|(c, &i)| (i, radiance.channel(c))).collect();
-                if let (Some(alpha), Some(at)) = (alpha, layer.passes.get(&Pass::Alpha)) {
-                    channels.push((at.channels[0], alpha.channel(0)));
+                if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
+                    && of_alpha.part == at.part
+                {
+                    channels.push((of_alpha.channels[0], alpha.channel(0)));
                 }
                 frame.replace(at.part, &layer_name(&layer.name, COMBINED), &channels)?
             }
@@ -197,37 +205,37 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
     Ok(report)
 }
 
-/// The headers of a result, where it is finished: a file that reads as an EXR, since results are written whole.
-pub fn finished(output: &Path) -> Option<Frame> {
+/// The headers of what is at the output's place: an EXR, whole since results are written so.
+pub fn existing(output: &Path) -> Option<Frame> {
     Frame::read_headers(output).ok()
 }
 
-/// Writes what previews of a finished result, of which these are the headers, are wanted and missing.
-pub fn add_previews(headers: &Frame, options: &Options) -> Result<()> {
-    if !options.preview {
-        return Ok(());
-    }
+/// Whether that is the frame that is wanted; writes what previews of it are wanted and missing.
+///
+/// # Errors
+/// It is another: nothing is overwritten unasked. Or a preview cannot be written.
+pub fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers(headers);
     let chosen = &passes::choose(headers, &layers, options.view_layer.as_deref())?.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
+    let full_name = layer_name(chosen, name);
     let views = passes::rgb_layers(headers, Some(chosen), name);
-    if views.iter().all(|layer| preview::path(output, layer, views.len()).exists()) && !views.is_empty() {
+    if views.is_empty() || !headers.is_own_layer(&full_name) {
+        let why = format!(
+            "exists without '{full_name}' made by demc; --overwrite denoises the frame again, or choose another --out"
+        );
+        return Err(Error::invalid(output, why));
+    }
+    let previews = views.iter().map(|layer| (layer, preview::path(output, layer, views.len())));
+    let missing: Vec<_> = previews.filter(|(_, path)| options.preview && !path.exists()).collect();
+    if missing.is_empty() {
         return Ok(());
     }
     let frame = Frame::read(output)?;
-    if views.is_empty() || !frame.is_own_layer(&layer_name(chosen, name)) {
-        return Err(Error::invalid(
-            output,
-            "lacks the layer to preview; --overwrite denoises the frame again",
-        ));
-    }
-    for layer in &views {
-        let path = preview::path(output, layer, views.len());
-        if !path.exists() {
-            let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
-            preview::write(&path, set.require(Pass::Combined, "--preview")?)?;
-        }
+    for (layer, path) in missing {
+        let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
+        preview::write(&path, set.require(Pass::Combined, "--preview")?)?;
     }
     Ok(())
 }

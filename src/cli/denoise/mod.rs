@@ -25,7 +25,7 @@ use super::{
 };
 use crate::{
     Error, Result, models,
-    passes::{NOISY_IMAGE, Pass},
+    passes::{NOISY_IMAGE, Pass, is_bare},
 };
 
 /// Arguments of `demc denoise`.
@@ -127,9 +127,9 @@ pub fn run(args: Args) -> Result<ExitCode> {
 /// A layer name must make channel names that read back as this layer and no other.
 fn check_layer_name(name: &str) -> Result<()> {
     let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
-    if name.is_empty() || name.len() > 100 || name.contains(['.', '\0']) {
-        Err(Error::Usage(format!("--layer '{name}': wants 1 to 100 characters without a dot")))
-    } else if name == NOISY_IMAGE || Pass::ALL.iter().any(reserved) {
+    if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
+        Err(Error::Usage(format!("--layer '{name}': wants 1 to 100 characters in one line, without a dot")))
+    } else if name == NOISY_IMAGE || is_bare(name) || Pass::ALL.iter().any(reserved) {
         Err(Error::Usage(format!(
             "--layer '{name}': is a pass of the renderer; choose another name, or --replace for Combined"
         )))

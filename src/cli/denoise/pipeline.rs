@@ -109,11 +109,11 @@ fn spawn(
 
 fn load_all(batch: &Batch, next: &SyncSender<(usize, Frames<PassSet>)>, events: &Sender<Event>) {
     for (index, job) in batch.jobs.iter().enumerate() {
-        let finished = if batch.options.overwrite { None } else { frame_job::finished(&job.output) };
-        if let Some(headers) = finished {
+        let existing = if batch.options.overwrite { None } else { frame_job::existing(&job.output) };
+        if let Some(headers) = existing {
             let _writing = batch.writing.lock().unwrap_or_else(PoisonError::into_inner);
-            let previewed = attempt(&job.output, || frame_job::add_previews(&headers, &batch.options));
-            let outcome = previewed.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
+            let taken_up = attempt(&job.output, || frame_job::take_up(&headers, &batch.options));
+            let outcome = taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
             let _ = events.send(Event::Finished(index, outcome));
             continue;
         }

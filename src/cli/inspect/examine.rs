@@ -198,7 +198,7 @@ fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String
     let mut warnings = Vec::new();
     if report.non_finite > 0 {
         warnings.push(format!(
-            "{pass}: {} of {} values are NaN or infinite; `demc denoise` fills them from around them",
+            "{pass}: {} of {} values are NaN or infinite; `demc denoise` works with values filled in from around them",
             report.non_finite,
             planes.data.len()
         ));
