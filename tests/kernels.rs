@@ -323,6 +323,33 @@ fn with_a_border_of_one() -> (Shape, Vec<Block>) {
 }
 
 #[test]
+#[should_panic = "sources differ"]
+fn sources_have_one_border() {
+    let (shape, x) = with_a_border_of_one();
+    let wide = Shape { pad: 2, ..shape };
+    let y = vec![Block::default(); wide.blocks()];
+    let sources = [View::new(wide, &y), View::new(shape, &x)];
+    let weights = vec![Block::default(); packed_len(&[3, 3], 3, Geometry::Same(3))];
+    let output = &mut vec![Block::default(); shape.blocks()];
+    let bias = [Block::default()];
+    convolve(
+        Tier::detect(),
+        &sources,
+        &weights,
+        &bias,
+        Geometry::Same(3),
+        Epilogue::default(),
+        ViewMut::new(shape, output),
+    );
+}
+
+#[test]
+#[should_panic = "fits into memory"]
+fn no_view_is_of_more_than_memory_holds() {
+    View::new(Shape { n: 1, c: 16, h: usize::MAX - 1, w: 16, pad: 1 }, &[]);
+}
+
+#[test]
 #[should_panic = "border too small"]
 fn weight_gradients_need_a_border() {
     let (shape, x) = with_a_border_of_one();

@@ -223,8 +223,9 @@ pub fn convolve(
     let input = sources[0].shape;
     let channels: Vec<usize> = sources.iter().map(|s| s.shape.c).collect();
     for source in sources {
-        assert_eq!((source.shape.n, source.shape.h, source.shape.w), (input.n, input.h, input.w));
-        assert!(source.shape.pad >= geometry.reach(), "border too small for {geometry:?}");
+        let Shape { n, h, w, pad, .. } = source.shape;
+        assert_eq!((n, h, w, pad), (input.n, input.h, input.w, input.pad), "sources differ");
+        assert!(pad >= geometry.reach(), "border too small for {geometry:?}");
     }
     let out = output.shape;
     assert_eq!((out.n, (out.h, out.w)), (input.n, geometry.output(input.h, input.w)));

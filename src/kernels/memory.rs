@@ -20,13 +20,14 @@ impl<T: Clone> Pool<T> {
     }
 
     /// The smallest free memory for `len` values, unless more than half of it would lie idle; else new
-    /// memory, filled with `value`.
+    /// memory, filled with `value`. What is too small goes back to the system then: frames that grow leave nothing behind.
     pub fn take(&'static self, len: usize, value: T) -> Pooled<T> {
         let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |(_, data): &(usize, &Vec<T>)| (len..=2 * len).contains(&data.len());
         let data = match free.iter().enumerate().filter(fits).min_by_key(|(_, d)| d.len()).map(|(i, _)| i) {
             Some(i) => free.swap_remove(i),
             None => {
+                free.retain(|data| data.len() >= len);
                 drop(free);
                 vec![value; len]
             }
@@ -150,4 +151,22 @@ pub fn plane_buffer(len: usize) -> PlaneBuffer {
 /// Gives all free memory of planar images back to the system.
 pub fn clear() {
     PLANES.clear();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_that_grow_leave_nothing_behind() {
+        static POOL: Pool<u8> = Pool::new();
+        let lens = || POOL.0.lock().unwrap().iter().map(Vec::len).collect::<Vec<_>>();
+        drop([POOL.take(100, 0), POOL.take(10, 0)]);
+        drop([POOL.take(90, 0), POOL.take(8, 0)]);
+        assert_eq!(lens(), [100, 10], "what fits is used again");
+        drop([POOL.take(120, 0), POOL.take(12, 0)]);
+        assert_eq!(lens(), [120, 12]);
+        drop([POOL.take(30, 0), POOL.take(120, 0)]);
+        assert_eq!(lens(), [30, 120], "what is larger is kept for frames to come");
+    }
 }

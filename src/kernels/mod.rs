@@ -102,8 +102,12 @@ impl Shape {
     }
 
     /// Blocks of the whole activation, borders included.
+    ///
+    /// # Panics
+    /// If there are more than memory could hold.
     pub fn blocks(self) -> usize {
-        self.n * self.planes() * self.plane_stride()
+        let planes = self.n.checked_mul(self.planes());
+        planes.and_then(|n| n.checked_mul(self.plane_stride())).expect("an activation fits into memory")
     }
 
     /// Channels in use in plane `plane`: 16, or fewer in the last.

@@ -21,8 +21,13 @@ impl Plane {
     }
 
     /// Positions, borders included.
+    ///
+    /// # Panics
+    /// If there are more than memory could hold: buffers are checked against this number.
     pub fn positions(self) -> usize {
-        (self.h + 2 * self.pad) * self.stride()
+        let side = |n: usize| n.checked_add(self.pad.checked_mul(2)?);
+        let positions = side(self.h).zip(side(self.w)).and_then(|(h, w)| h.checked_mul(w));
+        positions.expect("a plane fits into memory")
     }
 
     /// The position of row `y`, column 0.

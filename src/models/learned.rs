@@ -93,7 +93,8 @@ impl Learned {
         Ok(self)
     }
 
-    /// The network.
+    /// The network. What changes its layers or their parameters, or may, thaws them, and those of 8 bits compute only
+    /// while they are frozen: [`Network::freeze`] follows.
     pub fn network(&mut self) -> &mut dyn Network {
         &mut *self.network
     }

@@ -61,6 +61,8 @@ pub struct Weights {
     pub(super) groups: Vec<u8>,
     /// The parts of the sources where squares of outputs are computed together; none where it is tap by tap.
     parts: Vec<Part>,
+    /// Whether sums of four products in 8 bits fit into 16.
+    fit_16_bits: bool,
     geometry: Geometry,
     /// Channels and format of every source read.
     inputs: Vec<(usize, Format)>,
@@ -171,10 +173,20 @@ impl Weights {
                 std::array::from_fn(|t| of_channel[t] as i16)
             };
             let (rows, groups) = (winograd::pack(&parts, outputs, kernel), winograd::groups(&parts));
-            return Self { rows, groups, parts, geometry, inputs, outputs, scale, shift };
+            return Self {
+                rows,
+                groups,
+                parts,
+                fit_16_bits: in_16_bits,
+                geometry,
+                inputs,
+                outputs,
+                scale,
+                shift,
+            };
         }
         let packed = Self::build(geometry, inputs, outputs, |o, i, t| rounded[(o * total + i) * taps + t]);
-        Self { scale, shift, ..packed }
+        Self { fit_16_bits: in_16_bits, scale, shift, ..packed }
     }
 
     /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has them.
@@ -222,7 +234,7 @@ impl Weights {
             of_phase.iter().map(|&(input, _)| planes[input].count.div_ceil(side * GROUP) as u8).collect();
         let scale = vec![Block([1.0; LANES]); outputs.div_ceil(LANES)];
         let shift = vec![Block::default(); scale.len()];
-        Self { rows, groups, parts: Vec::new(), geometry, inputs, outputs, scale, shift }
+        Self { rows, groups, parts: Vec::new(), fit_16_bits: false, geometry, inputs, outputs, scale, shift }
     }
 
     /// What each source is to be rounded to.
@@ -322,6 +334,13 @@ pub fn convolve(
     assert_eq!((out.h, out.w, out.c), (spread * grid.h, spread * grid.w, weights.outputs));
     assert!(epilogue.accumulate || bias.len() == out.planes());
     assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
+    for (_, format) in &weights.inputs {
+        if let Format::Int8(steps) = format {
+            let fit = weights.fit_16_bits || !engine.adds_in_16_bits(geometry);
+            assert!(fit, "weights are rounded for an engine with longer sums");
+            assert!(steps.zero == 0 || !epilogue.accumulate, "no bias makes up for what is zero");
+        }
+    }
 
     // Every plane of every source: its position 0 in image 0, and planes from one image to the next.
     let planes: Vec<(*const Wide, usize)> = sources

@@ -108,7 +108,7 @@ impl Engine {
     /// Whether its products of 8 bits are faster than all others.
     pub fn prefers_int8(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return !matches!(self.0, Unit::Portable | Unit::Amx);
+        return matches!(self.0, Unit::Avx2 | Unit::AvxVnni | Unit::Vnni | Unit::Avx512);
         #[cfg(not(target_arch = "x86_64"))]
         false
     }
@@ -168,7 +168,11 @@ impl Engine {
                     avx2::multiply_vnni((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]
-                (Unit::Vnni | Unit::Avx512 | Unit::Amx, Format::Int8(_)) => {
+                (Unit::Vnni | Unit::Avx512, Format::Int8(_)) => {
+                    avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
+                }
+                #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+                (Unit::Amx, Format::Int8(_)) => {
                     avx512::multiply_int8((terms, groups), position, weights, (outputs, plane), sums);
                 }
                 #[cfg(target_arch = "x86_64")]

@@ -267,6 +267,7 @@ impl Operand {
     /// If rows or columns are odd, or there are not as many values as `planes` demands.
     pub fn halved(engine: Engine, format: Format, planes: Shape, values: &[f32]) -> Self {
         let shape = planes.squares();
+        assert_eq!(values.len(), shape.n * shape.c * shape.h * shape.w, "values of all planes");
         let mut operand = Self::new(shape, format);
         let (planes, blocks) = (operand.planes(), format.channels() / LANES);
         operand.each_row(|plane, y, row| {
