@@ -257,9 +257,19 @@ fn rows_of_other_methods_and_renders_stay_as_long_as_they_hold() {
     // What the rows are known by stays too.
     run(meadow, "demc-s", "2").stderr(predicate::str::contains("2 of 2 rows are there already"));
     run(room, "noisy", "2").stderr(predicate::str::contains("1 of 1 rows are there already"));
+    // Weights that changed have changed in any arithmetic.
+    let weights = out.path().join("mine.safetensors");
+    for built_in in ["demc-s", "demc-m"] {
+        let from = format!("{}/src/models/weights/{built_in}.safetensors", env!("CARGO_MANIFEST_DIR"));
+        fs::copy(from, &weights).unwrap();
+        for kept in [1, 2] {
+            let kept = format!("{kept} of 2 rows are there already");
+            run(meadow, &format!("{}:f32", weights.display()), "2").stderr(predicate::str::contains(kept));
+        }
+    }
     // Rows made with other settings do not belong into one table.
     run(room, "noisy", "1")
-        .stderr(predicate::str::contains("2 rows of other methods or renders are dropped"));
+        .stderr(predicate::str::contains("3 rows of other methods or renders are dropped"));
     assert_eq!(table(&out.path().join("scores.csv")).len(), 1);
 }
 

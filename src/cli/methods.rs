@@ -2,6 +2,7 @@
 
 use std::{
     collections::HashSet,
+    iter,
     path::{Path, PathBuf},
     process::ExitCode,
 };
@@ -57,11 +58,15 @@ impl Args {
         let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
         let mut methods = Vec::new();
         for name in &asked {
-            let denoiser: Box<dyn Denoiser> = match Oidn::new(name, self.oidn.clone()) {
-                Some(oidn) => Box::new(oidn),
-                None => models::open(name)?,
+            let (denoiser, file): (Box<dyn Denoiser>, _) = match Oidn::new(name, self.oidn.clone()) {
+                Some(oidn) => {
+                    let file = oidn.program();
+                    (Box::new(oidn), Some(file))
+                }
+                None => (models::open(name)?, weights_file(name).map(Into::into)),
             };
-            let stamp = if is_file(name) { report::file_stamp(Path::new(name)) } else { program.clone() };
+            let of_file = file.map(|file: PathBuf| report::file_stamp(&file));
+            let stamp = iter::once(program.clone()).chain(of_file).collect::<Vec<_>>().join(" ");
             let (spec, view_layer) = (name.to_string(), self.view_layer.clone());
             let peak_mib =
                 move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
@@ -76,25 +81,28 @@ impl Args {
     }
 }
 
-/// A weights file goes by its stem, and by its folder too where the stem alone is another's.
+/// A weights file goes by its stem and the arithmetic asked for, and by its folder too where those alone are another's.
 pub fn short_name(name: &str, all: &[&str]) -> String {
-    if !is_file(name) {
-        return name.into();
-    }
-    let stem = |name: &str| Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
+    let Some(file) = weights_file(name) else { return name.into() };
+    let stem = |name: &str| {
+        let plain = models::split_precision(name).0;
+        let stem = Path::new(plain).file_stem()?.to_string_lossy().into_owned();
+        Some(stem + &name[plain.len()..])
+    };
     let own = stem(name).unwrap_or_else(|| name.into());
     let is_unique = all.iter().filter(|other| stem(other).as_ref() == Some(&own)).count() == 1;
-    if is_unique && own != "best" {
+    if is_unique && file.file_stem() != Some("best".as_ref()) {
         return own;
     }
-    match Path::new(name).parent().and_then(Path::file_name) {
+    match file.parent().and_then(Path::file_name) {
         Some(folder) => format!("{}/{own}", folder.to_string_lossy()),
         None => own,
     }
 }
 
-fn is_file(name: &str) -> bool {
-    Path::new(name).is_file()
+/// The weights file that a method's name names.
+fn weights_file(name: &str) -> Option<&Path> {
+    Some(Path::new(models::split_precision(name).0)).filter(|path| path.is_file())
 }
 
 /// The noisy renders of a test set. References that go with none are named on stderr; renders without their reference have

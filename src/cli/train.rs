@@ -155,14 +155,20 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a pair is held out: decided by its reference's file name without the frame number, so that every
-/// sample count, seed and frame of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+/// Whether a pair is held out: decided by its reference's file name without the numbers of frame and crop, so that every
+/// sample count, seed, frame and crop of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
 fn held_out(pair: &Pair) -> bool {
     let mut name = pair.reference.file_name().unwrap_or_default().to_string_lossy().into_owned();
     if let Some(frame) = &pair.frame
         && let Some(at) = name.rfind(&format!(".{frame}."))
     {
         name.replace_range(at..=at + frame.len(), "");
+    }
+    if let Some((view, crop)) = name.strip_suffix("_ref.exr").and_then(|stem| stem.rsplit_once("_c"))
+        && !crop.is_empty()
+        && crop.bytes().all(|c| c.is_ascii_digit())
+    {
+        name = format!("{view}_ref.exr");
     }
     let hash = name
         .bytes()
@@ -385,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_a_sequence_are_held_out_with_its_still_or_trained_on_together() {
+    fn frames_and_crops_are_held_out_with_their_still_or_trained_on_together() {
         let name = |scene: usize, frame: &str| format!("train/s{scene:04}_room_ref{frame}.exr");
         let still = |scene| held_out(&pair(name(scene, ""), None));
         for scene in 0..40 {
@@ -393,6 +399,11 @@ mod tests {
                 let of_sequence = pair(name(scene, &format!(".{frame}")), Some(frame.into()));
                 assert_eq!(held_out(&of_sequence), still(scene), "{scene}, frame {frame}");
             }
+        }
+        // Crops of a view may overlap.
+        for (crop, scene) in [("c0", 0), ("c1", 0), ("c12", 0), ("c0", 1), ("c1", 1)] {
+            let of_crop = pair(format!("train/s{scene:04}_room_{crop}_ref.exr"), None);
+            assert_eq!(held_out(&of_crop), still(scene), "{scene}, crop {crop}");
         }
         // Which stills they are is not to change.
         let held: Vec<usize> = (0..40).filter(|scene| still(*scene)).collect();

@@ -145,7 +145,8 @@ fn mean(image: &Planes, reference: &Planes, value: impl Fn(f64, f64) -> f64 + Sy
 /// Why a score is none against this reference, for a message.
 pub fn why_undefined(reference: &Planes) -> String {
     match display::exposure(reference) {
-        None => "the reference is black".into(),
+        None if reference.data.iter().all(|&value| value <= 0.0) => "the reference is black".into(),
+        None => "98% of the reference is black, by which its exposure is told".into(),
         Some(_) => format!("the images are smaller than its window of {0}x{0}", ssim::WINDOW),
     }
 }

@@ -108,12 +108,7 @@ impl Denoiser for Noisy {
 /// # Errors
 /// No built-in method or readable weights file goes by that name, or it has no such arithmetic.
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
-    let (plain, precision) = match name_or_file.rsplit_once(':') {
-        Some((plain, "f32")) => (plain, Some(Precision::F32)),
-        Some((plain, "bf16")) => (plain, Some(Precision::Bf16)),
-        Some((plain, "int8")) => (plain, Some(Precision::Int8)),
-        _ => (name_or_file, None),
-    };
+    let (plain, precision) = split_precision(name_or_file);
     let learned = |model: learned::Learned| -> Result<Box<dyn Denoiser>> {
         Ok(Box::new(model.with_precision(name_or_file, precision)?))
     };
@@ -136,6 +131,16 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
                 "no model '{other}': `demc models` lists the built-in ones; weights files end in .safetensors"
             ))),
         },
+    }
+}
+
+/// A method's name or weights file, and the arithmetic asked for: `demc-m:f32`.
+pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
+    match name_or_file.rsplit_once(':') {
+        Some((plain, "f32")) => (plain, Some(Precision::F32)),
+        Some((plain, "bf16")) => (plain, Some(Precision::Bf16)),
+        Some((plain, "int8")) => (plain, Some(Precision::Int8)),
+        _ => (name_or_file, None),
     }
 }
 

@@ -120,7 +120,7 @@ impl Buffer {
 
 /// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to
 /// `shot_0004spp.0017.exr`, where both exist.
-fn half_paths(noisy: &Path) -> Option<[PathBuf; 2]> {
+pub fn half_paths(noisy: &Path) -> Option<[PathBuf; 2]> {
     let name = noisy.file_name()?.to_str()?;
     let (head, tail) = name.rsplit_once("spp.")?;
     let paths = ["a", "b"].map(|half| noisy.with_file_name(format!("{head}spp_{half}.{tail}")));

@@ -45,6 +45,13 @@ impl Oidn {
         Some(Self { name, program: absolute.unwrap_or(program) })
     }
 
+    /// Where the program lies: for a bare name, the first on the search path.
+    pub fn program(&self) -> PathBuf {
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        let mut found = std::env::split_paths(&path).map(|folder| folder.join(&self.program));
+        found.find(|program| program.is_file()).unwrap_or_else(|| self.program.clone())
+    }
+
     /// `oidn-high-prefilter` is high quality on guides that were denoised first.
     fn prefilters(&self) -> bool {
         self.name.ends_with("-prefilter")

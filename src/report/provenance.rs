@@ -8,7 +8,10 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use crate::{kernels::simd::Tier, nn::Precision};
+use crate::{
+    kernels::{narrow::Engine, simd::Tier},
+    nn::Precision,
+};
 
 /// The program, the machine, and the command.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -51,12 +54,12 @@ impl Provenance {
 
 /// See [`Provenance::instructions`].
 fn instructions() -> String {
-    let tier = Tier::detect();
+    let (tier, engine) = (Tier::detect(), Engine::detect());
     match [Precision::fastest(true), Precision::fastest(false)] {
         [built_in, others] if built_in != others => {
-            format!("{tier:?}, {built_in:?} (built-in), {others:?} (others)")
+            format!("{tier:?}, {engine:?}, {built_in:?} (built-in), {others:?} (others)")
         }
-        [all, _] => format!("{tier:?}, {all:?}"),
+        [all, _] => format!("{tier:?}, {engine:?}, {all:?}"),
     }
     .to_lowercase()
 }

@@ -281,7 +281,11 @@ fn run_pair(
             };
             match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.passes)) {
                 Ok(run) => times[i].push(run.seconds),
-                Err(error) => row.reason = error.to_string(),
+                Err(error) => {
+                    let (width, height) = (row.width, row.height);
+                    *row = Row { reason: error.to_string(), width, height, ..new_row(method) };
+                    times[i].clear();
+                }
             }
         }
     }
@@ -343,6 +347,8 @@ fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Op
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
     use super::*;
     use crate::{models::Noisy, report::Method};
 
@@ -363,8 +369,28 @@ mod tests {
         }
     }
 
+    /// Its first run goes well, and it cannot be timed.
+    struct FailsLater(AtomicUsize);
+
+    impl Denoiser for FailsLater {
+        fn name(&self) -> &str {
+            "fails later"
+        }
+
+        fn passes(&self) -> &[Pass] {
+            &[Pass::Combined]
+        }
+
+        fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+            match self.0.fetch_add(1, Ordering::Relaxed) {
+                0 => Noisy.denoise(passes),
+                _ => Err(Error::Usage("out of memory".into())),
+            }
+        }
+    }
+
     #[test]
-    fn a_method_that_panics_fails_alone() {
+    fn a_method_that_fails_fails_alone_and_whole() {
         let out = tempfile::tempdir().unwrap();
         let data = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/*_0004spp.exr");
         let pairs = crate::testset::read(data).unwrap().pairs;
@@ -383,12 +409,18 @@ mod tests {
             overwrite: false,
             sheets: false,
         };
-        let methods = [method(Box::new(Noisy)), method(Box::new(Panics))];
+        let methods = [
+            method(Box::new(Noisy)),
+            method(Box::new(Panics)),
+            method(Box::new(FailsLater(AtomicUsize::new(0)))),
+        ];
         let rows = evaluate(&pairs, &methods, &options, &mut |_| {}).unwrap();
-        assert_eq!(rows.len(), 2 * pairs.len());
+        assert_eq!(rows.len(), 3 * pairs.len());
         for row in rows {
             assert_eq!(row.is_valid(), row.model == NOISY, "{row:?}");
             assert_eq!(row.reason.contains("internal error"), row.model == "panics", "{row:?}");
+            assert_eq!(row.reason.contains("out of memory"), row.model == "fails later", "{row:?}");
+            assert!(row.is_valid() || row.seconds.is_none() && row.ssim.is_none(), "{row:?}");
         }
     }
 }

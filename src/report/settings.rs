@@ -1,6 +1,10 @@
 //! `run.json`: what the rows in a folder were made with, so that a later run keeps those that hold.
 
-use std::{collections::BTreeMap, fs, path::Path};
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +13,7 @@ use super::{
     provenance::Provenance,
     rows::{Row, write_file},
 };
-use crate::{Result, testset::Pair};
+use crate::{Result, models::nfor, testset::Pair};
 
 /// The settings of a run, and stamps of what it read. Fields of other versions are passed over.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -93,8 +97,11 @@ pub fn name(noisy: &Path, reference: &Path) -> String {
     format!("{} {}", noisy.display(), reference.display())
 }
 
+/// Of all files that a method may read for a pair.
 fn pair_stamp(noisy: &Path, reference: &Path) -> String {
-    [file_stamp(noisy), file_stamp(reference)].join(" ")
+    let halves = nfor::half_paths(noisy).into_iter().flatten();
+    let files = [noisy.into(), reference.into()].into_iter().chain(halves);
+    files.map(|file: PathBuf| file_stamp(&file)).collect::<Vec<_>>().join(" ")
 }
 
 /// Size and time of change of a file: differs when the file was written again.
@@ -140,6 +147,11 @@ mod tests {
             [false; 4],
             "another number of threads"
         );
+        let halves = ["a_0004spp_a.exr", "a_0004spp_b.exr"].map(|name| dir.path().join(name));
+        halves.iter().for_each(|half| fs::write(half, "x").unwrap());
+        assert_eq!(holds(&settings(&asked)), [false; 4], "half buffers");
+        halves.iter().for_each(|half| fs::remove_file(half).unwrap());
+        assert_eq!(holds(&settings(&asked)), [true, true, true, false]);
         fs::write(&reference, "longer").unwrap();
         assert_eq!(holds(&settings(&asked)), [false; 4], "another reference");
     }

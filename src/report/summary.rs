@@ -10,7 +10,7 @@ use std::{
 };
 
 use super::{
-    cell,
+    NOISY, cell,
     rows::{Row, to_csv},
 };
 
@@ -97,10 +97,14 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
     for &row in &rows {
         by_model.entry(&row.model).or_default().insert((&row.noisy, &row.reference), row);
     }
-    let scoring: Vec<&RowsOfMethod> =
-        by_model.values().filter(|of| of.values().any(|r| r.is_valid())).collect();
-    let mut common: Vec<Files> = scoring.first().map(|of| of.keys().copied().collect()).unwrap_or_default();
-    common.retain(|&pair| scoring.iter().all(|of| valid(of, pair)));
+    let mut scoring = by_model.clone();
+    scoring.retain(|_, of| of.values().any(|r| r.is_valid()));
+    // What spoils the input, a NaN say, takes no scene from the methods that repair it.
+    if scoring.len() > 1 {
+        scoring.remove(NOISY);
+    }
+    let mut common: Vec<Files> = scoring.values().next().map(|of| of.keys().copied().collect()).unwrap_or_default();
+    common.retain(|&pair| scoring.values().all(|of| valid(of, pair)));
     common.sort_unstable();
     let nothing = RowsOfMethod::new();
     let base = by_model.get(baseline).unwrap_or(&nothing);
@@ -232,6 +236,9 @@ mod tests {
             row("b", "y", 4, None),
             row("a", "absent", 4, None),
             row("b", "absent", 4, None),
+            // The input, which a NaN may spoil, is none of them.
+            row("a", NOISY, 4, None),
+            row("b", NOISY, 4, Some(9.0)),
         ];
         let found = summarise(&rows, &models(&["x", "y", "absent"]), "x");
         close(found[0].of("relmse").mean, 1.0);
