@@ -81,7 +81,8 @@ impl Args {
     }
 }
 
-/// A weights file goes by its stem and the arithmetic asked for, and by its folder too where those alone are another's.
+/// A weights file goes by its stem and the arithmetic asked for, by its folder too where those alone are another's, and by all
+/// that was asked for where that is another's as well.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
     let stem = |name: &str| {
@@ -89,15 +90,20 @@ pub fn short_name(name: &str, all: &[&str]) -> String {
         let stem = Path::new(plain).file_stem()?.to_string_lossy().into_owned();
         Some(stem + &name[plain.len()..])
     };
-    let own = stem(name).unwrap_or_else(|| name.into());
-    let is_unique = all.iter().filter(|other| stem(other).as_ref() == Some(&own)).count() == 1;
-    if is_unique && file.file_stem() != Some("best".as_ref()) {
-        return own;
-    }
-    match file.parent().and_then(Path::file_name) {
-        Some(folder) => format!("{}/{own}", folder.to_string_lossy()),
-        None => own,
-    }
+    let with_folder = |name: &str| {
+        let folder =
+            Path::new(models::split_precision(name).0).parent()?.file_name()?.to_string_lossy().into_owned();
+        Some(format!("{folder}/{}", stem(name)?))
+    };
+    let is_best = file.file_stem() == Some("best".as_ref());
+    let short = (!is_best).then(|| stem(name)).flatten().filter(|own| is_unique(own, name, all, stem));
+    let long = || with_folder(name).filter(|own| is_unique(own, name, all, with_folder));
+    short.or_else(long).unwrap_or_else(|| name.into())
+}
+
+/// Whether no other method goes by that name.
+fn is_unique(own: &str, name: &str, all: &[&str], named: impl Fn(&str) -> Option<String>) -> bool {
+    !all.iter().any(|other| *other != name && named(other).as_deref() == Some(own))
 }
 
 /// The weights file that a method's name names.
@@ -136,4 +142,28 @@ pub fn finish(failed: usize, table: &Path) -> ExitCode {
     }
     warn_line(&format!("demc: {failed} failed; {} says why", table.display()));
     ExitCode::from(SOME_FAILED)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_weights_file_goes_by_a_name_of_its_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = |name: &str| {
+            let path = dir.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, "").unwrap();
+            path.display().to_string()
+        };
+        let names =
+            ["a/run/best.safetensors", "b/run/best.safetensors", "run3/best.safetensors", "a/m.safetensors"];
+        let [one, two, third, m] = names.map(file);
+        let rounded = format!("{m}:f32");
+        let all = ["demc-m", &one, &two, &third, &m, &rounded];
+        let short = all.map(|name| short_name(name, &all));
+        assert_eq!(short, ["demc-m", &one, &two, "run3/best", "m", "m:f32"]);
+        assert_eq!(short_name(&one, &["demc-m", &one]), "run/best");
+    }
 }

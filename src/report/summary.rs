@@ -103,7 +103,8 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
     if scoring.len() > 1 {
         scoring.remove(NOISY);
     }
-    let mut common: Vec<Files> = scoring.values().next().map(|of| of.keys().copied().collect()).unwrap_or_default();
+    let mut common: Vec<Files> =
+        scoring.values().next().map(|of| of.keys().copied().collect()).unwrap_or_default();
     common.retain(|&pair| scoring.values().all(|of| valid(of, pair)));
     common.sort_unstable();
     let nothing = RowsOfMethod::new();

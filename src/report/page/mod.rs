@@ -52,9 +52,9 @@ impl Page<'_> {
     /// A sheet cannot be read or the file not be written.
     pub fn write(&self) -> Result<()> {
         let count = self.scenes.iter().filter(|(_, sheet)| sheet.is_some()).count();
-        let scenes = self.scenes.par_iter().map(|(pair, sheet)| {
+        let scenes = self.scenes.par_iter().enumerate().map(|(index, (pair, sheet))| {
             let picture = sheet.as_ref().map(|path| picture::embed(path, count)).transpose()?;
-            Ok(self.scene(pair, sheet.as_deref(), picture))
+            Ok(self.scene(index, pair, sheet.as_deref(), picture))
         });
         let scenes: Vec<Markup> = scenes.collect::<Result<_>>()?;
         let path = self.options.out.join("report.html");
@@ -66,6 +66,7 @@ impl Page<'_> {
         let p = self.provenance;
         let notes: BTreeSet<&str> =
             self.rows.iter().map(|row| row.note.as_str()).filter(|note| !note.is_empty()).collect();
+        let spp: BTreeSet<u32> = self.scenes.iter().map(|(pair, _)| pair.spp).collect();
         html! {
             (DOCTYPE)
             html lang="en" {
@@ -86,7 +87,7 @@ impl Page<'_> {
                     (self.failures())
                     h2 #summary { "Summary" }
                     p.faint {
-                        "Over the renders that every method scored. A ratio is the geometric mean, scene by \
+                        "Over the renders that every method scored, the input itself aside. A ratio is the geometric mean, scene by \
                          scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
                     }
                     (self.summary())
@@ -98,7 +99,14 @@ impl Page<'_> {
                         figure { (PreEscaped(svg)) }
                     }
                     h2 #scenes { "Scenes" }
-                    nav { @for (pair, _) in self.scenes { a href=(format!("#{}", anchor(pair))) { (pair.label()) } } }
+                    nav {
+                        @for (index, (pair, _)) in self.scenes.iter().enumerate() {
+                            a href=(format!("#{}", anchor(index))) {
+                                (pair.label())
+                                @if spp.len() > 1 { " " (pair.spp) " spp" }
+                            }
+                        }
+                    }
                     @for scene in scenes { (scene) }
                     (self.how())
                     script { (PreEscaped(include_str!("page.js"))) }
@@ -186,7 +194,7 @@ impl Page<'_> {
         }
     }
 
-    fn scene(&self, pair: &Pair, sheet: Option<&Path>, picture: Option<Picture>) -> Markup {
+    fn scene(&self, index: usize, pair: &Pair, sheet: Option<&Path>, picture: Option<Picture>) -> Markup {
         let of_pair = |r: &&Row| r.noisy == pair.noisy && r.reference == pair.reference;
         let rows: Vec<&Row> = self.rows.iter().filter(of_pair).collect();
         let names: Vec<&str> = rows.iter().map(|r| r.model.as_str()).collect();
@@ -198,7 +206,7 @@ impl Page<'_> {
         let size = rows.iter().find_map(|r| Some(format!("{}×{}", r.width?, r.height?)));
         let file = sheet.and_then(Path::file_name).map(|name| format!("sheets/{}", name.to_string_lossy()));
         html! {
-            section id=(anchor(pair)) {
+            section id=(anchor(index)) {
                 h3 {
                     (pair.label()) ", " (pair.spp) " samples per pixel"
                     @if let Some(size) = size { ", " (size) }
@@ -255,14 +263,9 @@ impl Page<'_> {
     }
 }
 
-/// Where the page holds a pair: letters, digits, `-`, `_` and `.` of its name, the rest as hex.
-fn anchor(pair: &Pair) -> String {
-    let id = pair.id();
-    let letter = |c: char| match c {
-        c if c.is_alphanumeric() || "-_.".contains(c) => c.to_string(),
-        c => format!("~{:x}", u32::from(c)),
-    };
-    format!("scene-{}", id.chars().map(letter).collect::<String>())
+/// Where the page holds a pair; pairs may share a name.
+fn anchor(index: usize) -> String {
+    format!("scene-{}", index + 1)
 }
 
 /// A statistic of a metric of the summary.
@@ -307,7 +310,7 @@ const SUMMARY: [Column<Method>; 12] = [
     },
     Column {
         heading: "renders",
-        hint: "scored by every method",
+        hint: "scored, of those that every method but the input scored",
         better: Better::Neither,
         show: whole,
         value: |m| Some(m.scenes as f64),
