@@ -50,7 +50,7 @@ def parse(arguments):
     parser.add_argument("--resolution", type=cl.size, metavar="WxH",
                         help="frame size in pixels (default: the scene's)")
     parser.add_argument("--frames", type=cl.frame_range, metavar="A-B",
-                        help="frames to render (default: the current one, named without a number)")
+                        help="frames to render, --frames=-5--1 where they are negative (default: the current one, named without a number)")
     parser.add_argument("--view-layer", metavar="NAME",
                         help="render this view layer alone (default: all that are on)")
     parser.add_argument("--region", type=cl.region, metavar="X,Y,W,H",
@@ -164,9 +164,9 @@ def export(options):
     if scene.camera is None:
         raise RuntimeError(f"{name} has no camera")
     first, last = options.frames or (scene.frame_current, scene.frame_current)
-    start_frame = scene.frame_current
+    start, part = scene.frame_current, scene.frame_subframe
     with Edits() as edits:
-        edits.on_undo(lambda: scene.frame_set(start_frame))
+        edits.on_undo(lambda: scene.frame_set(start, subframe=part))
         rendering.prepare_scene(edits, scene)
         rendering.set_output(edits, scene, options.full_float)
         if options.resolution:
@@ -193,6 +193,7 @@ def main():
     """Entry point of the script."""
     options = parse(cl.script_arguments())
     cl.quiet_stdout()
+    cl.end_at_once(lambda: None)  # a render goes to a temporary name first
     try:
         failed = export(options)
     except (RuntimeError, ValueError, OSError) as error:

@@ -293,7 +293,7 @@ def main():
     options = parse(cl.script_arguments())
     cl.quiet_stdout()
     logging.disable(logging.INFO)  # the glTF importer tells every step
-    os.makedirs(options.out, exist_ok=True)
+    cl.make_folder(options.out)
     options.out = os.path.abspath(options.out)
     library, records, failed = Library(options.assets), Records(options.out), 0
     cl.end_at_once(records.end)

@@ -116,7 +116,7 @@ def main():
     cl.quiet_stdout()
     logging.disable(logging.INFO)  # the glTF exporter tells every step
     models = os.path.join(options.out, "models")
-    os.makedirs(models, exist_ok=True)
+    cl.make_folder(models)
     rows, failed = [], 0
     for path in options.libraries:
         with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:

@@ -379,7 +379,7 @@ def main():
     options = parse(cl.script_arguments())
     cl.quiet_stdout()
     library = Library([options.hdri] if options.hdri else [])
-    os.makedirs(options.out, exist_ok=True)
+    cl.make_folder(options.out)
     failed = made = 0
     for name in sorted(os.listdir(os.path.join(options.data, "tracks"))):
         target = os.path.join(os.path.abspath(options.out), f"{name}.blend")

@@ -59,6 +59,15 @@ def end_at_once(tidy):
     threading.Thread(target=wait, daemon=True).start()
 
 
+def make_folder(path):
+    """Makes the folder of --out, or ends the script with a line that says why not."""
+    try:
+        os.makedirs(path, exist_ok=True)
+    except OSError as error:
+        print(f"error: {path}: {error.strerror} (--out)", file=sys.stderr)
+        sys.exit(1)
+
+
 def reason(error):
     """An exception's message on one line."""
     return " ".join(str(error).split())
@@ -99,7 +108,7 @@ def side_or_size(text):
 
 
 def frame_range(text):
-    """Parses `A-B` or a single `A` into (first, last); negative frames are written `-5--1`."""
+    """Parses `A-B` or a single `A` into (first, last); negative frames are written `--frames=-5--1`."""
     cut = text.find("-", 1)
     first = _integer(text if cut < 0 else text[:cut])
     last = first if cut < 0 else _integer(text[cut + 1:])

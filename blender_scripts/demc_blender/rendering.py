@@ -75,9 +75,10 @@ def denoise(edits, scene, layers):
 def set_output(edits, scene, full_float=False):
     """Multilayer EXR, ZIP. Half keeps files small: Cycles' data passes stay 32-bit float in it."""
     settings = scene.render.image_settings
-    # Registered first and so undone last: a depth is valid only for its own file format.
-    depth = settings.color_depth
+    # Registered first and so undone last: the media type resets the file format, and a depth is valid only for its own.
+    file_format, depth = settings.file_format, settings.color_depth
     edits.on_undo(lambda: setattr(settings, "color_depth", depth))
+    edits.on_undo(lambda: setattr(settings, "file_format", file_format))
     if hasattr(settings, "media_type"):  # Blender 5 wants it before the file format
         edits.set(settings, "media_type", "MULTI_LAYER_IMAGE")
     edits.set(settings, "file_format", "OPEN_EXR_MULTILAYER")

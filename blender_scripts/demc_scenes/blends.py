@@ -34,12 +34,17 @@ def open_blend(stage, path):
     """Opens a scene and returns a function that places its camera, one of several where there are, at random near where it was."""
     bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
     stage.scene = scene = bpy.context.scene
-    if scene.camera is None:
-        raise ValueError(f"{path} has no camera")
+    scene.timeline_markers.clear()  # a camera bound to one would take the place of that chosen here
     rng = stage.rng
     cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
     if len(cameras) > 1:
         scene.camera = rng.choice(cameras)
+    elif cameras and scene.camera is None:
+        scene.camera = cameras[0]
+    if scene.camera is None:
+        raise ValueError(f"{path} has no camera")
+    if not any(layer.use for layer in scene.view_layers):
+        raise ValueError(f"{path}: all its view layers are off")
     relight(rng, scene)
     camera = scene.camera
     home = camera.matrix_world.copy()

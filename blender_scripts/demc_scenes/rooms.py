@@ -234,8 +234,6 @@ def along_wall(shell):
     models = lib.with_role("wall", "sofa", "bed", "table", "lamp", smallest=0.5, largest=min(length, 3.3))
     if models and rng.random() < 0.6:
         group = stage.model(rng.choice(models))
-        if group is None:
-            return
         # The long side goes along the wall; models look to -Y or, where they are deep, to +X.
         w, d = group.size.x, group.size.y
         extra = math.pi / 2 if d > w * 1.15 else 0.0

@@ -19,7 +19,6 @@ class Stage:
         self.tops = []  # objects with a surface to put things on
         self.interest = []  # points worth looking at
         self._imported = {}
-        self.moving = []  # objects that motion blur may move
 
     def add(self, obj, material=None, at=(0, 0, 0), turn=0.0):
         """Links an object, gives it a material, a place and a turn about Z."""
@@ -35,7 +34,10 @@ class Stage:
         """Imports a model once and returns a new copy standing at the origin."""
         if model.path not in self._imported:
             before = set(bpy.data.objects)
-            bpy.ops.import_scene.gltf(filepath=model.path)
+            try:
+                bpy.ops.import_scene.gltf(filepath=model.path)
+            except RuntimeError as error:
+                raise ValueError(f"{model.path}: {error}; take it out of --assets") from error
             new = [o for o in bpy.data.objects if o not in before]
             for obj in new:
                 if obj.type != "MESH":
@@ -52,7 +54,7 @@ class Stage:
             self._imported[model.path] = meshes
         parts = self._imported[model.path]
         if not parts:
-            return None
+            raise ValueError(f"{model.path} holds no mesh; take it out of --assets")
         copies = [part.copy() for part in parts]
         for copy in copies:
             self.scene.collection.objects.link(copy)

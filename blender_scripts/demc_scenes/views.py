@@ -107,7 +107,7 @@ def probe(scene, spp=4):
     os.close(handle)
     try:
         with Edits() as edits:
-            layer = scene.view_layers[0]
+            layer = next(layer for layer in scene.view_layers if layer.use)
             rendering.set_resolution(edits, scene, (max(int(width * scale), 8), max(int(height * scale), 8)))
             edits.set(scene.render, "use_border", False)
             edits.set(layer.cycles, "denoising_store_passes", True)

@@ -13,6 +13,11 @@ import export_passes
 
 bpy.ops.wm.open_mainfile(filepath=blend)
 scene = bpy.context.scene
+settings = scene.render.image_settings
+if hasattr(settings, "media_type"):
+    settings.media_type = "IMAGE"
+settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+scene.frame_set(2, subframe=0.5)
 
 
 def snapshot():
