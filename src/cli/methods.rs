@@ -2,7 +2,6 @@
 
 use std::{
     collections::HashSet,
-    iter,
     path::{Path, PathBuf},
     process::ExitCode,
 };
@@ -58,15 +57,18 @@ impl Args {
         let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
         let mut methods = Vec::new();
         for name in &asked {
-            let (denoiser, file): (Box<dyn Denoiser>, _) = match Oidn::new(name, self.oidn.clone()) {
-                Some(oidn) => {
-                    let file = oidn.program();
-                    (Box::new(oidn), Some(file))
-                }
-                None => (models::open(name)?, weights_file(name).map(Into::into)),
+            let (denoiser, file): (Box<dyn Denoiser>, Option<PathBuf>) =
+                match Oidn::new(name, self.oidn.clone()) {
+                    Some(oidn) => {
+                        let file = oidn.program();
+                        (Box::new(oidn), Some(file))
+                    }
+                    None => (models::open(name)?, weights_file(name).map(Into::into)),
+                };
+            let stamp = match file {
+                Some(file) => format!("{program} {}", report::file_stamp(&file)),
+                None => program.clone(),
             };
-            let of_file = file.map(|file: PathBuf| report::file_stamp(&file));
-            let stamp = iter::once(program.clone()).chain(of_file).collect::<Vec<_>>().join(" ");
             let (spec, view_layer) = (name.to_string(), self.view_layer.clone());
             let peak_mib =
                 move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);

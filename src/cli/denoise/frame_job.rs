@@ -74,8 +74,9 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
     let wanted = [&needed, model.optional_passes(), &[Pass::Alpha, Pass::NoisyImage]].concat();
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
-    if eyes.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
-        eyes.retain(|l| l.passes.contains_key(&Pass::Combined));
+    let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
+    if eyes.iter().any(has_beauty) {
+        eyes.retain(has_beauty);
     }
     let mut views = Vec::new();
     for layer in eyes {
