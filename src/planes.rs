@@ -89,6 +89,22 @@ impl Planes {
         })
     }
 
+    /// Planes of (width, height) that are zero but for these, which begin at column `x` and row `y`.
+    ///
+    /// # Panics
+    /// If they reach beyond.
+    pub fn placed_in(&self, (width, height): (usize, usize), (x, y): (usize, usize)) -> Self {
+        assert!(x + self.width <= width && y + self.height <= height, "the planes lie inside");
+        let mut whole = Self::new(self.channels, width, height);
+        for c in 0..self.channels {
+            for row in 0..self.height {
+                let from = &self.channel(c)[row * self.width..][..self.width];
+                whole.channel_mut(c)[(y + row) * width + x..][..self.width].copy_from_slice(from);
+            }
+        }
+        whole
+    }
+
     /// The planes after half a turn: the last pixel becomes the first.
     pub fn turned(&self) -> Self {
         let (w, h) = (self.width, self.height);
@@ -166,6 +182,11 @@ mod tests {
             ([6.0, 7.0, 8.0, 7.0, 6.0, 7.0, 8.0, 7.0], [9.0, 10.0, 11.0, 10.0, 9.0, 10.0, 11.0, 10.0]);
         assert_eq!(padded.channel(1), [above, below, above, below].concat());
         assert_eq!(padded.window((0, 0), (3, 2)), planes);
+        assert_eq!(planes.placed_in((7, 5), (3, 2)).window((3, 2), (3, 2)), planes);
+        assert_eq!(
+            planes.placed_in((7, 5), (3, 2)).data.iter().sum::<f32>(),
+            planes.data.iter().sum::<f32>()
+        );
         assert_eq!(Planes::from_vec(1, 1, 1, vec![5.0]).padded_to((3, 2)).data, [5.0; 6]);
     }
 

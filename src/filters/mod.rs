@@ -1,8 +1,8 @@
 //! Classical building blocks of image denoising: pure functions on [`Planes`](crate::planes::Planes).
 //!
 //! [`nl_means`] holds the patch weights and the filter that averages by them, [`regression`] the
-//! weighted first-order fits over whole windows, [`refit`] those to what is denoised already, gathered in [`squares`], [`solve`] their small symmetric systems and
-//! [`variance`] what is known about the noise. Work is cut into tiles of the frame, one a thread; inner
+//! weighted first-order fits over whole windows, [`refit`] those to what is denoised already, gathered in [`squares`], [`solve`] their small symmetric systems,
+//! [`variance`] what is known about the noise, and [`shrinkage`] takes back what was changed beyond that. Work is cut into tiles of the frame, one a thread; inner
 //! loops run over consecutive pixels so that the compiler can vectorise them. Results do not depend on
 //! the number of threads.
 
@@ -11,6 +11,7 @@ pub mod nl_means;
 mod padded;
 pub mod refit;
 pub mod regression;
+pub mod shrinkage;
 pub mod solve;
 pub mod squares;
 pub mod variance;

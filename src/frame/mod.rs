@@ -19,7 +19,7 @@ use exr::{
     block::chunk::Chunk,
     meta::{
         BlockDescription, MetaData,
-        attribute::{SampleType, Text},
+        attribute::{AttributeValue, SampleType, Text},
         header::Header,
     },
 };
@@ -119,6 +119,18 @@ impl Frame {
     /// Whether the file has the multi-part layout (Blender 5: one part per pass).
     pub fn is_multi_part(&self) -> bool {
         self.parts.len() > 1 || self.meta.requirements.is_multilayer()
+    }
+
+    /// The text of an attribute that OpenEXR does not define, of the first part that has it.
+    pub fn text_attribute(&self, name: &str) -> Option<String> {
+        let name = text(name);
+        self.meta.headers.iter().find_map(|header| {
+            let own = header.own_attributes.other.get(&name);
+            match own.or_else(|| header.shared_attributes.other.get(&name))? {
+                AttributeValue::Text(value) => Some(string(value)),
+                _ => None,
+            }
+        })
     }
 
     /// What viewers show, in the coordinates of the data windows.

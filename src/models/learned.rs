@@ -10,7 +10,8 @@ use super::{
 use crate::{
     Error, Result,
     augment::Augment,
-    features::{PREFILTERED_PASSES, exposure, guide_rows},
+    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows},
+    filters::shrinkage::{Render, shrink},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -140,6 +141,31 @@ impl Denoiser for Learned {
     }
 
     fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        if self.metadata.network.architecture != Architecture::Pyramid {
+            return self.network.infer(passes, tile);
+        }
+        let (place, size) = rendered(passes);
+        if size == (passes.width, passes.height) {
+            return self.restrained(passes, tile);
+        }
+        let part = self.restrained(&passes.window(place, size), tile)?;
+        Ok(part.placed_in((passes.width, passes.height), place))
+    }
+}
+
+impl Learned {
+    /// What the network makes of a frame, and no more of it than there was noise.
+    fn restrained(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+        let mut image = self.looks(passes, tile)?;
+        let radiance = passes.require(Pass::Combined, &self.name)?;
+        let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
+        let (exposure, samples) = (exposure(radiance), passes.samples);
+        shrink(&mut image, &Render { radiance, albedo, exposure, samples, firefly: FIREFLY });
+        Ok(image)
+    }
+
+    /// What the network makes of a frame.
+    fn looks(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         if !self.turned {
             return self.network.infer(passes, tile);
         }
@@ -149,5 +175,37 @@ impl Denoiser for Learned {
         let values = image.data.iter_mut().zip(&second.data);
         values.for_each(|(first, second)| *first = 0.5 * (*first + second));
         Ok(image)
+    }
+}
+
+/// Of the pixels around a region that was rendered of a frame, the share that holds something.
+const FILLED: f64 = 0.9;
+
+/// Column and row, width and height of the part of a frame that was rendered. Where that was a region, all else is zero in
+/// every pass, which is no black wall: what lies beyond a region is unknown. Things before a transparent background fill a
+/// part of the frame as well, but not to its edges; such a frame is taken whole.
+fn rendered(passes: &PassSet) -> ((usize, usize), (usize, usize)) {
+    let (width, height) = (passes.width, passes.height);
+    let whole = ((0, 0), (width, height));
+    let is_filled = |x: usize, y: usize| {
+        passes.iter().any(|(_, planes)| (0..planes.channels).any(|c| planes.channel(c)[y * width + x] != 0.0))
+    };
+    let row_is_filled = |y: &usize| (0..width).any(|x| is_filled(x, *y));
+    let Some(top) = (0..height).find(row_is_filled) else { return whole };
+    let bottom = (top..height).rfind(row_is_filled).expect("the first such row is one");
+    let column_is_filled = |x: &usize| (top..=bottom).any(|y| is_filled(*x, y));
+    let left = (0..width).find(column_is_filled).expect("some row holds something");
+    let right = (left..width).rfind(column_is_filled).expect("the first such column is one");
+    let (columns, rows) = (right + 1 - left, bottom + 1 - top);
+    if (columns, rows) == (width, height) {
+        return whole;
+    }
+    let level = (left..=right).flat_map(|x| [(x, top), (x, bottom)]);
+    let upright = (top..=bottom).flat_map(|y| [(left, y), (right, y)]);
+    let filled = level.chain(upright).filter(|&(x, y)| is_filled(x, y)).count();
+    if filled as f64 >= FILLED * (2 * (columns + rows)) as f64 {
+        ((left, top), (columns, rows))
+    } else {
+        whole
     }
 }

@@ -231,6 +231,9 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let window = frame.parts()[anchor.part].data_window;
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
+    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had.
+    let samples = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
+    set.samples = samples.and_then(|count| count.trim().parse().ok());
 
     // One decoding run for each part: in single-part files all passes share their blocks.
     let mut by_part: BTreeMap<usize, Vec<(Pass, &[usize])>> = BTreeMap::new();

@@ -162,6 +162,8 @@ pub struct PassSet {
     pub height: usize,
     /// Where the first pixel lies in the coordinates of the display window: other than 0, 0 in cropped renders.
     pub origin: (i32, i32),
+    /// Samples of a pixel, or the most that it may have had, where the file tells.
+    pub samples: Option<u32>,
     planes: BTreeMap<Pass, Planes>,
 }
 
@@ -169,7 +171,20 @@ impl PassSet {
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
         let (path, view_layer) = (path.into(), view_layer.into());
-        Self { path, view_layer, width, height, origin: (0, 0), planes: BTreeMap::new() }
+        Self { path, view_layer, width, height, origin: (0, 0), samples: None, planes: BTreeMap::new() }
+    }
+
+    /// A set of another size that is said to be of the same render.
+    fn empty(&self, width: usize, height: usize) -> Self {
+        Self { samples: self.samples, ..Self::new(&self.path, &self.view_layer, width, height) }
+    }
+
+    /// A rectangle of pixels of every pass, from column `x` and row `y`.
+    ///
+    /// # Panics
+    /// If it leaves the frame.
+    pub fn window(&self, (x, y): (usize, usize), size: (usize, usize)) -> Self {
+        self.map(size, |_, planes| planes.window((x, y), size))
     }
 
     /// Some rows of those of `passes` that it holds.
@@ -186,7 +201,7 @@ impl PassSet {
     /// # Panics
     /// As [`Planes::padded_rows`].
     pub fn padded_rows(&self, passes: &[Pass], rows: Range<usize>, (width, height): (usize, usize)) -> Self {
-        let mut part = Self::new(&self.path, &self.view_layer, width, height);
+        let mut part = self.empty(width, height);
         for (&pass, planes) in self.planes.iter().filter(|(pass, _)| passes.contains(pass)) {
             part.insert(pass, planes.padded_rows(rows.clone(), (width, height)));
         }
@@ -198,7 +213,7 @@ impl PassSet {
     /// # Panics
     /// If a result has another size or channel count.
     pub fn map(&self, (width, height): (usize, usize), change: impl Fn(Pass, &Planes) -> Planes) -> Self {
-        let mut changed = Self::new(&self.path, &self.view_layer, width, height);
+        let mut changed = self.empty(width, height);
         self.iter().for_each(|(pass, planes)| changed.insert(pass, change(pass, planes)));
         changed
     }

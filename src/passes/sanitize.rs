@@ -5,12 +5,15 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 
 use super::{Pass, PassSet};
+use crate::frame::HALF_MAX;
 
 impl PassSet {
     /// Makes every value finite, so that one bad sample cannot spread: a NaN or infinite value takes
-    /// the mean of the finite values among its 8 neighbours (0 without one). Returns how many values
-    /// each pass had replaced; passes that were clean are not listed. Negative radiance is left as it
-    /// is: filters with negative lobes make it, and models clamp their own inputs.
+    /// the mean of the finite values among its 8 neighbours (0 without one). Only where infinite values
+    /// lie together are they light that a half float is too small for, and become the largest half
+    /// float. Returns how many values each pass had replaced; passes that were clean are not listed.
+    /// Negative radiance is left as it is: filters with negative lobes make it, and models clamp their
+    /// own inputs.
     pub fn sanitize(&mut self) -> BTreeMap<Pass, usize> {
         let (width, height) = (self.width, self.height);
         let mut replaced = BTreeMap::new();
@@ -39,24 +42,34 @@ fn sanitize_plane(plane: &mut [f32], width: usize, height: usize) -> usize {
     }
     let bad: Vec<usize> = (0..plane.len()).filter(|&i| !plane[i].is_finite()).collect();
     // All repairs read the original plane: a repaired value must not feed the next one.
-    let repaired: Vec<f32> = bad.iter().map(|&i| finite_mean(plane, width, height, i)).collect();
+    let repaired: Vec<f32> = bad.iter().map(|&i| repair(plane, width, height, i)).collect();
     for (&i, value) in bad.iter().zip(repaired) {
         plane[i] = value;
     }
     bad.len()
 }
 
-fn finite_mean(plane: &[f32], width: usize, height: usize, i: usize) -> f32 {
+/// Of the 8 neighbours of a value that is infinite, so many must be too for all of them to be bright: all that lie inside a
+/// spot of light or at its edge have as many, chance does not bring as many together.
+const BRIGHT_TOGETHER: usize = 3;
+
+/// What a value that is not finite becomes.
+fn repair(plane: &[f32], width: usize, height: usize, i: usize) -> f32 {
     let (x, y) = (i % width, i / width);
-    let (mut sum, mut n) = (0.0f64, 0u32);
+    let (mut sum, mut n, mut infinite) = (0.0f64, 0u32, 0);
     for ny in y.saturating_sub(1)..=(y + 1).min(height - 1) {
         for nx in x.saturating_sub(1)..=(x + 1).min(width - 1) {
             let v = plane[ny * width + nx];
             if v.is_finite() {
                 sum += f64::from(v);
                 n += 1;
+            } else if v == f32::INFINITY && (nx, ny) != (x, y) {
+                infinite += 1;
             }
         }
+    }
+    if plane[i] == f32::INFINITY && infinite >= BRIGHT_TOGETHER {
+        return HALF_MAX;
     }
     if n == 0 { 0.0 } else { (sum / f64::from(n)) as f32 }
 }
@@ -80,6 +93,25 @@ mod tests {
         assert_eq!(set.get(Pass::Depth).unwrap().data, [1.0, 3.25, 3.0, 4.0, 5.0, 4.0]);
         assert_eq!(set.get(Pass::Alpha).unwrap().data, [0.0; 6]);
         assert_eq!(set.get(Pass::Combined).unwrap().data, [-1.0; 18]);
+    }
+
+    #[test]
+    fn infinite_values_that_lie_together_are_bright_and_others_are_not() {
+        let (w, h) = (16, 12);
+        let mut plane = Planes::from_vec(1, w, h, vec![2.0; w * h]);
+        let inf = f32::INFINITY;
+        // A spot of 4x3, two side by side, and one alone.
+        (3..6).for_each(|y| plane.data[y * w + 2..][..4].fill(inf));
+        plane.data[9 * w + 9..][..2].fill(inf);
+        plane.data[13] = inf;
+        let mut set = PassSet::new("x.exr", "V", w, h);
+        set.insert(Pass::Depth, plane);
+        assert_eq!(set.sanitize(), BTreeMap::from([(Pass::Depth, 12 + 2 + 1)]));
+        let found = &set.get(Pass::Depth).unwrap().data;
+        let bright: Vec<usize> = (0..w * h).filter(|&i| found[i] != 2.0).collect();
+        let spot: Vec<usize> = (3..6).flat_map(|y| (2..6).map(move |x| y * w + x)).collect();
+        assert_eq!(bright, spot);
+        assert!(spot.iter().all(|&i| found[i] == 65504.0));
     }
 
     #[test]
