@@ -81,15 +81,20 @@ const MOST_NOISY: f32 = 0.1;
 /// A place with this share of that variance is clean: the mixture is trusted entirely.
 const CLEAN: f32 = 0.1;
 
-/// From this many samples on, what looks like noise is less and less likely to be noise: by the square root of the
-/// number of samples.
+/// From this many samples on, what looks like noise is less and less likely to be noise: by this power of the number of
+/// samples. Adaptive sampling ends before the most that a file tells of.
 const FINAL_SAMPLES: f32 = 64.0;
+const FINAL_POWER: f32 = 0.75;
 
 /// What a frame is taken for that does not tell its number of samples.
 const UNKNOWN_SAMPLES: u32 = 16;
 
-/// From fewer to more samples, light that the albedo shows beyond white is kept.
-const KEPT_SAMPLES: (f32, f32) = (8.0, 64.0);
+/// Of no more than the first number of samples, no light is kept that the albedo shows beyond white without being equal to it:
+/// through glass it is noise. From the second on, all is.
+const KEPT_SAMPLES: (f32, f32) = (16.0, 64.0);
+
+/// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter counts less.
+const ALONE: f32 = 4.0;
 
 /// By how much radiance may differ from the albedo and still be light that is seen directly: a few steps of a half
 /// float, and next to nothing besides.
@@ -284,7 +289,7 @@ fn add_differences([above, row, below]: [&[f32]; 3], scale: &[f32], sums: &mut [
 fn judge(sums: &[f32], (width, height): (usize, usize), samples: f32) -> Vec<f32> {
     let (squares, rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
     let noisy = (NOISY * samples.powf(NOISY_POWER)).min(MOST_NOISY);
-    let belief = (FINAL_SAMPLES / samples).min(1.0).sqrt();
+    let belief = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
     let sums: Vec<&[f32]> = sums.chunks(SUMS * squares).collect();
     let mut kept = vec![0.0; rows * KEPT * squares];
     let memory = || [(); 4].map(|()| vec![0.0; SUMS * squares]);
@@ -313,7 +318,7 @@ fn judge(sums: &[f32], (width, height): (usize, usize), samples: f32) -> Vec<f32
                 let is_noise = 1.0 - ((correlation - CORRELATED) / DETAIL).clamp(0.0, 1.0);
                 noise[s] = least_noise(near) * is_noise * belief;
                 residual[s] = mean(near, RESIDUAL);
-                let level = least_noise(around) * is_noise + CUT_SHARE * mean(around, CUT);
+                let level = (least_noise(around) * is_noise + CUT_SHARE * mean(around, CUT)) * belief;
                 let decades = ln(noisy / level.max(f32::MIN_POSITIVE)) / -ln(CLEAN);
                 trust[s] = decades.clamp(0.0, 1.0);
             }
@@ -340,8 +345,7 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
             for (line, (a, b)) in line.iter_mut().zip(of(above).iter().zip(of(above + 1))) {
                 *line = a + (b - a) * share;
             }
-            let [radiance, albedo] = [render.radiance, render.albedo]
-                .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+            let radiance = [0, 1, 2].map(|c| &render.radiance.channel(c)[y * width..][..width]);
             for x in 0..width {
                 let (left, share) = between(x, squares);
                 let right = (left + 1).min(squares - 1);
@@ -360,9 +364,7 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
                 let own = difference.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
                 let weight = noise / residual.max(own * own / OUTLIER).max(f32::MIN_POSITIVE);
                 let shrunk = trust * (1.0 - weight.min(1.0));
-                let albedo = albedo.map(|row| row[x]);
-                let beyond_white = (0..3).map(|c| (albedo[c].min(noisy[c]) - 1.0) / noisy[c].max(1.0));
-                let seen = keeps * beyond_white.fold(0.0, f32::max);
+                let seen = if keeps > 0.0 { keeps * beyond_white(render, x, y) } else { 0.0 };
                 let back = shrunk + seen - shrunk * seen;
                 if back > 0.0 && !(own == LARGEST_RESIDUAL && is_firefly(render, x, y)) {
                     colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v += (noisy - *v) * back);
@@ -397,6 +399,25 @@ fn is_seen(render: &Render, x: usize, y: usize) -> bool {
         let seen = near(radiance, x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
         seen + beyond >= SEEN_TOGETHER
     }
+}
+
+/// The share of a pixel's light that comes straight to the camera, or by way of mirrors, as far as the albedo shows it beyond
+/// white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
+fn beyond_white(render: &Render, x: usize, y: usize) -> f32 {
+    let Render { radiance, albedo, .. } = render;
+    let beyond = |x: usize, y: usize| {
+        let at = y * radiance.width + x;
+        let colours = (0..3).map(|c| (albedo.channel(c)[at].min(radiance.channel(c)[at]) - 1.0, c));
+        colours.fold((0.0, 0), |most, colour| if colour.0 > most.0 { colour } else { most })
+    };
+    let (light, c) = beyond(x, y);
+    if light <= 0.0 {
+        return 0.0;
+    }
+    let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
+    let company = others.map(|(x, y)| beyond(x, y).0).fold(0.0, f32::max);
+    let share = light / radiance.channel(c)[y * radiance.width + x];
+    share * (ALONE * company / light).min(1.0)
 }
 
 /// Whether a pixel is far brighter than all around it.
