@@ -1,4 +1,4 @@
-"""Copies a folder of training pairs with its references cleaned: B of README.md from A.
+"""Copies a folder of training pairs with its references cleaned by Open Image Denoise.
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 

@@ -6,7 +6,7 @@
 import sys
 
 import weights
-from narrow import PREFILTER
+from weights import PREFILTER
 
 
 def main():
