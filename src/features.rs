@@ -1,8 +1,9 @@
 //! From passes to network inputs: the sole authority on channel order, on transfer functions (each
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 //!
-//! Whoever changes what a network reads changes [`Architecture::inputs`](crate::models::network::Architecture::inputs) with it, by
-//! which weights trained on something else are refused.
+//! Whoever changes what a network reads changes
+//! [`Architecture::inputs`](crate::models::network::Architecture::inputs) with it, by which weights trained
+//! on something else are refused.
 
 mod black;
 mod fireflies;
@@ -117,19 +118,20 @@ pub const PREFILTERED_PASSES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::Denoisin
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
 const ALBEDO_FLOOR: f32 = 0.05;
 
-/// Of the built-in models' [`LogTransfer`]: exposed radiance below the inverse is nearly linear, white is 1. Nothing is ever
-/// transferred back, because kernels act on radiance itself.
+/// Steepness of the built-in models' [`LogTransfer`]: exposed radiance below 1/16 is encoded nearly linearly,
+/// white as 1. No inverse is needed, because the predicted kernels act on radiance itself.
 const STEEPNESS: f32 = 16.0;
 
-/// The log-average luminance that exposure-normalised radiance has: photography's middle grey.
+/// Log-average luminance of radiance after exposure: photography's middle grey.
 const MIDDLE_GREY: f64 = 0.18;
 
-/// Rows and columns of the squares over which luminance is averaged before its logarithm, so that
-/// the noise of single pixels does not bias the exposure.
+/// Luminance is averaged over squares of this many rows and columns before the logarithm is taken: the
+/// logarithm of single noisy pixels would bias the exposure.
 const EXPOSURE_SQUARE: usize = 16;
 
-/// Rows of a frame, grown to (width, height) as [`Planes::padded_to`] does, its fireflies [tamed](tame_fireflies) at the
-/// `exposure` of the whole: nothing darker than middle grey is one.
+/// The passes of a built-in model for some rows of a frame, padded to `size` (width, height) as
+/// [`Planes::padded_to`] does, without [fireflies](tame_fireflies). `exposure` is that of the whole frame; a
+/// pixel darker than middle grey after exposure is never a firefly.
 ///
 /// # Errors
 /// The Combined pass is missing.
@@ -147,19 +149,19 @@ pub fn guide_rows(
     Ok(part)
 }
 
-/// What is made of a frame before a network with a prefilter reads it.
+/// What is computed from a frame's passes before a network with a prefilter reads it.
 #[derive(Clone, Debug)]
 pub struct Refined {
     /// The denoised albedo, (3, H, W).
     pub albedo: Planes,
-    /// The denoised normal, (3, H, W), which the network itself does not read.
+    /// The denoised normal, (3, H, W): the refit reads it, the network does not.
     pub normal: Planes,
-    /// What normals tell of the light, (1, H, W). See [`Shading`].
+    /// How the normal changes the light, a logarithm, (1, H, W). See [`Shading`].
     pub shading: Planes,
 }
 
 impl Refined {
-    /// Grown to (width, height), as [`Planes::padded_to`] does.
+    /// Padded to `size` (width, height), as [`Planes::padded_to`] does.
     pub fn padded_to(self, size: (usize, usize)) -> Self {
         let Self { albedo, normal, shading } = self;
         let [albedo, normal, shading] = [albedo, normal, shading].map(|planes| planes.padded_to(size));
@@ -168,11 +170,18 @@ impl Refined {
 }
 
 /// The built-in models' inputs, in this order:
-/// irradiance-like radiance, exposed and divided by the refined albedo (3, H, W); that albedo (3, H, W); the radiance
-/// encoder's input, the logarithm of the first (3, H, W); the guide encoder's, that albedo, the camera-space normal as rendered,
-/// whose noise tells of the radiance's, and the mean over the colours of what comes next (7, H, W): the logarithm of what radiance
-/// is divided by over what the noisy albedo would make of that (3, H, W); the shading (1, H, W); the refined normal, for the refit
-/// (3, H, W). The scale is the inverse of the exposure, that of the whole frame, of which `passes` may be some rows.
+///
+/// 0. light: exposed radiance divided by plane 1, (3, H, W);
+/// 1. divisor: the denoised albedo, clamped to 0..1, plus a floor of 0.05, (3, H, W);
+/// 2. input of the radiance encoder: the log-encoded light, (3, H, W);
+/// 3. input of the guide encoder, (7, H, W): the denoised albedo (3), the camera-space normal as rendered
+///    (3), whose noise is correlated with that of the radiance, and the mean of plane 4 over the colours (1);
+/// 4. logarithm of the divisor over the divisor that the noisy albedo would give, (3, H, W);
+/// 5. shading, see [`Shading`], (1, H, W);
+/// 6. the denoised normal, for the refit, (3, H, W).
+///
+/// `exposure` is that of the whole frame; `passes` may be some rows of it. The scale of the inputs is the
+/// inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
@@ -204,15 +213,15 @@ pub fn guides(passes: &PassSet, refined: Refined, exposure: f32, needed_by: &str
     Ok(Inputs { planes, scale: exposure.recip() })
 }
 
-/// Divides radiance by albedo.
+/// Divides radiance by albedo, for a run of values.
 struct Divide<'a> {
     clean: &'a [f32],
     radiance: &'a [f32],
     exposure: f32,
-    /// Written: the albedo as a guide, and as what radiance is divided by.
+    /// Written: the albedo as a guide (clamped to 0..1), and the divisor (with the floor added).
     colours: &'a mut [f32],
     albedo: &'a mut [f32],
-    /// Written: the exposed quotient, and its logarithm.
+    /// Written: exposed radiance over the divisor, and its log encoding.
     irradiance: &'a mut [f32],
     encoded: &'a mut [f32],
 }
@@ -234,7 +243,7 @@ impl Vectorised for Divide<'_> {
     }
 }
 
-/// The logarithm of what radiance is divided by over what the noisy albedo would make of that.
+/// The logarithm of the divisor over the divisor that the noisy albedo would give, for a run of values.
 struct Compare<'a> {
     clean: &'a [f32],
     noisy: &'a [f32],
@@ -251,12 +260,13 @@ impl Vectorised for Compare<'_> {
     }
 }
 
-/// Writes `of` each value.
+/// Writes `of(value)` for each value.
 fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
     output.par_iter_mut().zip(values).for_each(|(output, value)| *output = of(*value));
 }
 
-/// Pixels (x, y) of the 5x5 around one, as far as they lie in a frame of `w` columns and `h` rows.
+/// The pixels (x, y) of the 5x5 around one, itself included, that lie within a frame of `w` columns and `h`
+/// rows.
 #[inline]
 fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
     const REACH: usize = 2;
@@ -265,32 +275,37 @@ fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item 
     around(y, h).flat_map(move |y| columns.clone().map(move |x| (x, y)))
 }
 
-/// An axis of a normal, which is no longer than 1.
+/// A component of a normal, clamped to -1..1.
 #[inline(always)]
 fn unit(axis: f32) -> f32 {
     axis.clamp(-1.0, 1.0)
 }
 
-/// An albedo as far as it tells of texture: emitters write their radiance there, and brighter than white says
-/// nothing.
+/// An albedo clamped to 0..1: Cycles writes the radiance of emitters into this pass, and values above white
+/// hold no texture.
 #[inline(always)]
 fn texture(albedo: f32) -> f32 {
     albedo.clamp(0.0, 1.0)
 }
 
-/// What radiance is divided by.
+/// What radiance is divided by: the clamped albedo plus the floor.
 #[inline(always)]
 fn divisor(albedo: f32) -> f32 {
     texture(albedo) + ALBEDO_FLOOR
 }
 
-/// What a normal is multiplied by among a prefilter's targets: an error of it then counts as much as one of an albedo of
-/// a few tenths, and the less the longer an axis is.
+/// Normals are scaled by this among a prefilter's targets. With a relative loss, an error of a normal then
+/// counts about as much as the same error of an albedo of a few tenths, and less where the component is long.
 const NORMAL_SCALE: f32 = 0.1;
 
-/// A prefilter's inputs, each (3, H, W): what radiance would be divided by, exposed; the normal, as much smaller as
-/// [`guide_targets`] has it, exposed alike; the radiance encoder's input, the logarithm of the first; and the guide encoder's, the
-/// normal. The scale is the inverse of the exposure.
+/// A prefilter's inputs, each (3, H, W), in this order:
+///
+/// 0. the exposed divisor that the noisy albedo gives;
+/// 1. the normal, scaled as in [`guide_targets`], and exposed;
+/// 2. input of the radiance encoder: the log encoding of plane 0;
+/// 3. input of the guide encoder: the normal.
+///
+/// The scale of the inputs is `1 / exposure`.
 ///
 /// # Errors
 /// A pass is missing.
@@ -307,7 +322,7 @@ pub fn noisy_guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<
     Ok(Inputs { planes: vec![light, small, encoded, direction], scale: exposure.recip() })
 }
 
-/// Transfers light.
+/// Log-encodes light, for a run of values.
 struct Encode<'a> {
     light: &'a [f32],
     encoded: &'a mut [f32],
@@ -321,8 +336,8 @@ impl Vectorised for Encode<'_> {
     }
 }
 
-/// What a prefilter is to make of a frame whose guides have little noise: what radiance is divided by, and a tenth of the normal,
-/// (6, H, W).
+/// A prefilter's training target, from a reference whose guides have little noise, (6, H, W): the divisor
+/// that its albedo gives (3), and its normal times 0.1 (3).
 ///
 /// # Errors
 /// A pass is missing.
@@ -336,33 +351,33 @@ pub fn guide_targets(passes: &PassSet, needed_by: &str) -> Result<Planes> {
     Ok(targets)
 }
 
-/// The normal again from what a prefilter made of it.
+/// The normal of a prefilter's output: undoes the scaling of [`guide_targets`].
 pub fn normal_of_target(mut normal: Planes) -> Planes {
     normal.data.par_iter_mut().for_each(|v| *v = unit(*v / NORMAL_SCALE));
     normal
 }
 
-/// The albedo again from what a prefilter made of it.
+/// The albedo of a prefilter's output: undoes [`guide_targets`].
 pub fn albedo_of_target(mut albedo: Planes) -> Planes {
     albedo.data.par_iter_mut().for_each(|v| *v = texture(*v - ALBEDO_FLOOR));
     albedo
 }
 
-/// The factor that brings the log-average luminance (Rec. 709, of 16x16 squares) to middle grey; 1 for
-/// a black frame. Scaling radiance scales it inversely.
+/// The exposure of a frame: the factor that brings its log-average luminance (Rec. 709, averaged over 16x16
+/// squares first) to middle grey; 1 for a black frame. Radiance twice as bright gives half the factor.
 pub fn exposure(radiance: &Planes) -> f32 {
     log_average_exposure(radiance, |v| v.max(0.0))
 }
 
-/// [`exposure`] of what [`guide_targets`] makes of an albedo.
+/// The [`exposure`] of an albedo as the divisor that [`guide_targets`] makes of it.
 pub fn albedo_exposure(albedo: &Planes) -> f32 {
     log_average_exposure(albedo, divisor)
 }
 
-/// [`exposure`] of the radiance that `of` makes of each value.
+/// The [`exposure`] of `of(value)` taken as radiance.
 fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 {
     let (w, h) = (planes.width, planes.height);
-    // Of every row of squares the sum of logarithms, and their number.
+    // For each row of squares: the sum of the logarithms, and how many there are.
     let row = |y0: usize| {
         let rows = y0..(y0 + EXPOSURE_SQUARE).min(h);
         let mut columns = vec![0.0; w];
@@ -370,7 +385,7 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
         let (mut sum, mut count) = (0.0, 0usize);
         for square in columns.chunks(EXPOSURE_SQUARE) {
             let luminance: f64 = square.iter().sum();
-            // A black square has no logarithm and says nothing about exposure.
+            // The logarithm of a black square is infinite; such squares are left out.
             if luminance > 0.0 {
                 sum += (luminance / (rows.len() * square.len()) as f64).ln();
                 count += 1;
@@ -378,14 +393,14 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
         }
         (sum, count)
     };
-    // Added up in order, whatever the threads do.
+    // Added in a fixed order, so that the number of threads does not change the result.
     let rows: Vec<(f64, usize)> =
         (0..h.div_ceil(EXPOSURE_SQUARE)).into_par_iter().map(|y| row(y * EXPOSURE_SQUARE)).collect();
     let (sum, count) = rows.into_iter().fold((0.0, 0), |(s, n), (sum, count)| (s + sum, n + count));
     if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
 }
 
-/// Adds up the luminance that `of` makes of some rows, column by column.
+/// Sums the luminance of `of(value)` over some rows, for each column.
 struct Luminance<'a, F> {
     planes: &'a Planes,
     rows: Range<usize>,
@@ -408,7 +423,8 @@ impl<F: Fn(f32) -> f32> Vectorised for Luminance<'_, F> {
     }
 }
 
-/// Distance as a feature between 0 (near, and where nothing is hit) and 1, one half at the median.
+/// Distance as a feature `d / (d + median)` in 0..1: one half at the median distance, 0 where the ray hits
+/// nothing.
 pub fn relative_depth(distance: &Planes) -> Planes {
     /// Cycles writes 1e10 where a ray hits nothing.
     const FAR: f32 = 1e9;
@@ -421,18 +437,18 @@ pub fn relative_depth(distance: &Planes) -> Planes {
     out
 }
 
-/// A frame as a network wants it.
+/// A frame's inputs for a network.
 #[derive(Clone, Debug)]
 pub struct Inputs {
     /// The network's inputs, all of the frame's size.
     pub planes: Vec<Planes>,
-    /// Scene radiance divided by the network's: what its output is multiplied by.
+    /// Factor that the network's output is multiplied by to get scene radiance.
     pub scale: f32,
 }
 
 impl Inputs {
-    /// Grows every input to a multiple of `multiple` in both directions, as [`Planes::padded_to`] does: what a network
-    /// that halves its input `log2(multiple)` times needs.
+    /// Grows every input to a multiple of `multiple` in both directions, as [`Planes::padded_to`] does: what
+    /// a network that halves its input `log2(multiple)` times needs.
     pub fn padded(mut self, multiple: usize) -> Self {
         let grow = |planes: Planes| {
             let size = [planes.width, planes.height].map(|size| size.next_multiple_of(multiple));

@@ -127,9 +127,10 @@ def readme(rows, workers, args):
         "# Speed beside the rivals",
         "",
         f"`python {' '.join(['eval/rivals_bench/run.py', *sys.argv[1:]])}` at commit {commit.stdout.strip()};",
-        f"{args.threads} threads of {cpu()}; {programs}. Medians of {args.rounds} rounds in which all programs",
-        "took turns. `ratio` is the time over that of the run marked 1.00: torch's f32 step, ONNX Runtime's f32",
-        "inference, Open Image Denoise's quality high. Every run is in `every_run.csv`.",
+        f"{args.threads} threads of {cpu()}; {programs}.",
+        f"Medians of {args.rounds} rounds in which all programs took turns.",
+        "`ratio` is the time over that of the run marked 1.00: torch's f32 step, ONNX Runtime's f32 inference,",
+        "Open Image Denoise's quality high. Every run is in `every_run.csv`.",
     ]
     for task in TASKS:
         of_task = [row for row in rows if row["task"] == task]

@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
-"""Averages the weights of runs that share a beginning: average.py A.safetensors B.safetensors ... --out FILE
+"""Averages the weights of runs that share a beginning.
 
-All files hold the same tensors in half precision (what `demc train` writes); the metadata is that of the last, with
-the largest range that any of them knows for a layer. Needs numpy.
+    average.py A.safetensors B.safetensors ... --out FILE
+
+All files hold the same tensors in half precision (what `demc train` writes); the metadata is that of the
+last, with the largest range that any of them knows for a layer. Needs numpy.
 """
 
 import argparse

@@ -2,10 +2,11 @@
 
     python clean_guides.py '../shared/data/val/*_0004spp.exr' OUT --oidn PATH/oidnDenoise --guides albedo
 
-The noisy frames keep their Combined pass; the passes named by --guides are replaced by what Open Image Denoise,
-quality high, makes of them; with --spp N by those of a render with as many samples, where <scene>_<N>spp.exr lies beside the
-frame, and other frames are left out. References are copied. With --keep-quotient, Combined is scaled by clean over noisy
-albedo, so that a model that divides by the albedo it is given divides by the noisy one in effect.
+The noisy frames keep their Combined pass; the passes named by --guides are replaced by what Open Image
+Denoise, quality high, makes of them; with --spp N by those of a render with as many samples, where
+<scene>_<N>spp.exr lies beside the frame, and other frames are left out. References are copied. With
+--keep-quotient, Combined is scaled by clean over noisy albedo, so that a model that divides by the albedo
+it is given divides by the noisy one in effect.
 """
 
 import argparse

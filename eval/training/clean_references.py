@@ -1,10 +1,10 @@
-"""Copies a folder of training pairs with its references cleaned: B of README.md from A.
+"""Copies a folder of training pairs with its references cleaned by Open Image Denoise.
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
-Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the scene's
-noisy frame as guides, denoised first, and keeps what it was as Noisy Image. Noisy frames are copied as they are. What
-is there already is kept.
+Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the
+scene's noisy frame as guides, denoised first, and keeps what it was as Noisy Image. Noisy frames are
+copied as they are. What is there already is kept.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from demc_blender import exr
 
 
 def pairs(folder):
-    """(scene, reference, its noisy frames) of a folder of <scene>_<spp>spp.exr and <scene>_ref.exr, sorted."""
+    """(scene, reference, its noisy frames) of a folder of pairs, sorted by scene."""
     folder = glob.escape(folder)
     for reference in sorted(glob.glob(os.path.join(folder, "*_ref.exr"))):
         scene = os.path.basename(reference).removesuffix("_ref.exr")

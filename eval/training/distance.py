@@ -1,11 +1,13 @@
-"""Tells how far a model is from Open Image Denoise, quality high with guides denoised first, on the pairs of a manifest.
+"""Tells how far a model is from Open Image Denoise, quality high with guides denoised first, on the pairs
+of a manifest.
 
     python distance.py MANIFEST --model WEIGHTS --oidn PATH/oidnDenoise [--demc PATH/demc] [--most 110]
 
-Pairs of 4 samples whose references were denoised and keep what they were as Noisy Image. Printed for all of them and for
-each third, ordered by the RelMSE of Open Image Denoise: the geometric mean of the ratio of RelMSE, both against the
-denoised reference, and the median of (ours - its) / ours with both taken against the noisy one. The former favours whoever
-errs as the denoiser of the references does; the noise of the latter is the same for both and cancels.
+Pairs of 4 samples whose references were denoised and keep what they were as Noisy Image. Printed for all
+of them and for each third, ordered by the RelMSE of Open Image Denoise: the geometric mean of the ratio of
+RelMSE, both against the denoised reference, and the median of (ours - its) / ours with both taken against
+the noisy one. The former favours whoever errs as the denoiser of the references does; the noise of the
+latter is the same for both and cancels.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""Reads and writes manifests of pairs as demc does: CSV with the header scene,noisy,reference,spp, its paths relative to it."""
+"""Reads and writes manifests of pairs as demc does: CSV with the header scene,noisy,reference,spp, its
+paths relative to it."""
 
 import csv
 import os
@@ -7,7 +8,10 @@ HEADER = ("scene", "noisy", "reference", "spp")
 
 
 def read(path):
-    """The rows of a manifest, a dictionary each, with paths that hold in the working directory. Lines that begin with # are comments."""
+    """The rows of a manifest, a dictionary each, with paths that hold in the working directory.
+
+    Lines that begin with # are comments.
+    """
     folder = os.path.dirname(path)
     with open(path, encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader((line for line in file if not line.startswith("#")), skipinitialspace=True))
@@ -26,6 +30,9 @@ def write(path, rows):
 
 
 def relative(path, folder):
-    """A file's path from a folder on. Links to folders are followed first, for which `..` is another place; the file keeps its name."""
+    """A file's path from a folder on.
+
+    Links to folders are followed first, for which `..` is another place; the file keeps its name.
+    """
     place, name = os.path.split(path)
     return os.path.normpath(os.path.join(os.path.relpath(os.path.realpath(place), os.path.realpath(folder)), name))

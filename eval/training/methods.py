@@ -21,7 +21,7 @@ def demc(program, model, path, folder):
 
 
 def both(options, path, folder):
-    """What the model makes of a frame, and what Open Image Denoise does, quality high with guides denoised first."""
+    """What the model makes of a frame, and Open Image Denoise, quality high with guides denoised first."""
     frame = exr.read(path)
     theirs = clean(options.oidn, folder, planes(frame, "Combined", "RGB")[0], frame)
     return demc(options.demc, options.model, path, folder), theirs

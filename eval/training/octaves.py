@@ -1,9 +1,11 @@
-"""Tells at which sizes of features a model errs more than Open Image Denoise, quality high with guides denoised first.
+"""Tells at which sizes of features a model errs more than Open Image Denoise, quality high with guides
+denoised first.
 
-    python octaves.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise [--demc PATH/demc]
+    python octaves.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise
 
-The error over the reference is parted into what squares of 2, 4, ... 64 pixels differ by from those twice as large, and the rest.
-Printed is, for each, its share of Open Image Denoise's squared error (the mean over frames), and the geometric mean of the ratio.
+The error over the reference is parted into what squares of 2, 4, ... 64 pixels differ by from those twice
+as large, and the rest. Printed is, for each, its share of Open Image Denoise's squared error (the mean
+over frames), and the geometric mean of the ratio.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""Takes the prefilter out of a network's weights file, as a network of its own that `demc train --init` can begin with.
+"""Takes the prefilter out of a network's weights file, as a network of its own that `demc train --init`
+can begin with.
 
     prefilter.py IN.safetensors OUT.safetensors
 """
@@ -6,7 +7,7 @@
 import sys
 
 import weights
-from narrow import PREFILTER
+from weights import PREFILTER
 
 
 def main():

@@ -1,12 +1,17 @@
-"""Tells how much of a model's RelMSE is noise of the references, and how much Open Image Denoise has in common with it.
+"""Tells how much of a model's RelMSE is noise of the references, and how much Open Image Denoise has in
+common with it.
 
-    python shared_error.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise [--demc PATH/demc]
+    python shared_error.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise
 
-With x and y what the two make of a frame (Open Image Denoise: quality high, guides denoised first), r its reference and t that reference
-denoised in the same way, and <a, b> the mean of (a - r) (b - r) / (r^2 + 0.001), printed is for each frame, over RelMSE <y, y>:
+With x and y what the two make of a frame (Open Image Denoise: quality high, guides denoised first), r its
+reference and t that reference denoised in the same way, and <a, b> the mean of (a - r) (b - r) / (r^2 +
+0.001), printed is for each frame, over RelMSE <y, y>:
 - <x, x>, the ratio of the two;
-- <x, t>, noise of the reference: what a frame without any noise would still be charged with, plus the detail that x and t both lack;
-- <x, y>, what is wrong with both alike: noise of the reference, what the samples do not tell, and what both blur.
+- <x, t>, noise of the reference: what a frame without any noise would still be charged with, plus the
+  detail that x and t both lack;
+- <x, y>, what is wrong with both alike: noise of the reference, what the samples do not tell, and what
+  both blur.
+
 The last line holds geometric means.
 """
 

@@ -1,10 +1,11 @@
-"""Writes the manifests that demc-m's later steps train and validate on, from the folders that generate_scenes.py filled.
+"""Writes two manifests, to train and to validate on, from folders that generate_scenes.py filled.
 
 python split.py TRAIN.csv HELD_OUT.csv FOLDER... [--pairs FOLDER]
 
-A FOLDER holds manifest.csv (scene, noisy, reference, spp). A scene is held out, with all its views, if the CRC-32 of its name
-up to the seed ("s28136" of "s28136_skin") is a multiple of 12; of its pairs only the first noise at 4 spp is scored.
-A folder after --pairs holds NAME_0004spp.exr and NAME_ref.exr, views of the scenes of B, which are all trained on.
+A FOLDER holds manifest.csv (scene, noisy, reference, spp). A scene is held out, with all its views, if the
+CRC-32 of its name up to the seed ("s28136" of "s28136_skin") is a multiple of 12; of its pairs only the
+first noise at 4 spp is scored. A folder after --pairs holds NAME_0004spp.exr and NAME_ref.exr, views
+that are all trained on.
 """
 import argparse, re, zlib
 from pathlib import Path

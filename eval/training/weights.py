@@ -1,12 +1,14 @@
-"""Weights files as `demc train` writes them: safetensors in half precision."""
+"""Reads and writes weights files as `demc train` does: safetensors in half precision."""
 
 import json
 import struct
-import sys
 
 import numpy as np
 
 _KEY = "demc"  # src/nn/weights.rs
+
+# What the names of a prefilter's layers begin with in the network that holds it: src/models/pyramid.rs.
+PREFILTER = "prefilter."
 
 
 def read(path):
@@ -32,10 +34,3 @@ def write(path, facts, tensors):
     text += b" " * (-len(text) % 8)
     with open(path, "wb") as file:
         file.write(struct.pack("<Q", len(text)) + text + values)
-
-
-def edit(change):
-    """Copies the file that the command line names first to the second, each tensor as `change(layer, tensor)` makes it."""
-    source, target = sys.argv[1:]
-    facts, tensors = read(source)
-    write(target, facts, {name: change(name.rsplit(".", 1)[0], tensor) for name, tensor in tensors.items()})

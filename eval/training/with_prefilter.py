@@ -8,7 +8,7 @@ PREFILTER is a file of `demc train --model prefilter`.
 import sys
 
 import weights
-from narrow import PREFILTER
+from weights import PREFILTER
 
 
 def main():

@@ -48,7 +48,7 @@ fn row(model: &str, network: &mut dyn Network, macs: f64, trained: Option<String
 fn built_in(name: &str) -> Option<Row> {
     let mut model = Learned::built_in(name)?;
     let t = &model.metadata.training;
-    let last = if t.init.is_some() { ", the last of several runs (eval/training/README.md)" } else { "" };
+    let last = if t.init.is_some() { ", the last of several runs (docs/training.md)" } else { "" };
     let hours = t.seconds / 3600.0;
     let trained =
         format!("{} steps of {} crops from {} frames in {hours:.1} h{last}", t.steps, t.batch, t.frames);

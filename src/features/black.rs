@@ -5,11 +5,12 @@ use rayon::prelude::*;
 use super::square;
 use crate::planes::Planes;
 
-/// Sets to zero each channel of a pixel where neither `radiance` nor `albedo` has anything of that channel in the 5x5
-/// around it; all are (3, H, W).
+/// Sets a colour channel of a pixel of `image` to zero where both `radiance` and `albedo` are zero in that
+/// channel over the 5x5 pixels around it. All three are (3, H, W).
 ///
-/// Softmax kernels trust no pixel by nothing at all, and those of coarse levels carry a hundred-thousandth of the light
-/// far into such a place, which a display's gamma shows. Black radiance alone may be a dim wall that no path lit.
+/// Softmax weights are never exactly zero, so kernels of coarse levels carry about 1e-5 of the light far into
+/// black places, which a display's gamma makes visible. Radiance alone does not tell: a dim wall may be black
+/// in all samples.
 pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
     let (w, h, n) = (image.width, image.height, image.pixels());
     image.data.par_chunks_mut(n).enumerate().for_each(|(c, plane)| {
@@ -17,7 +18,7 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
         let nothing = |radiance: f32, albedo: f32| (radiance <= 0.0) & (albedo <= 0.0);
         let is_black = |x: usize, y: usize| nothing(radiance_of[y * w + x], albedo_of[y * w + x]);
         plane.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
-            // Most rows have no black at all, which is seen without a branch for each pixel.
+            // Most rows hold no black pixel; this loop finds that out without a branch per pixel.
             let pixels = radiance_of[y * w..][..w].iter().zip(&albedo_of[y * w..][..w]);
             if !pixels.fold(false, |any, (v, a)| any | nothing(*v, *a)) {
                 return;
@@ -35,7 +36,7 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
 mod tests {
     use super::*;
 
-    /// Everywhere `value`, but for a hole of 7x7 in the middle of its green.
+    /// `value` everywhere, except 7x7 zeros in the middle of the green channel.
     fn holed(value: f32) -> Planes {
         let (w, h) = (15, 13);
         let mut planes = Planes::from_vec(3, w, h, vec![value; 3 * w * h]);

@@ -1,4 +1,5 @@
-//! Single pixels far brighter than all around them, as unlikely paths to a lamp leave them.
+//! Fireflies: single pixels far brighter than all their neighbours, left by improbable light paths. Here they
+//! are dimmed.
 
 use std::ops::Range;
 
@@ -7,17 +8,20 @@ use rayon::prelude::*;
 use super::square;
 use crate::planes::{Planes, mirror_beyond, mirrored};
 
-/// Pixels of a row that are looked at together.
+/// Pixels of a row that are tested together.
 const RUN: usize = 32;
 
-/// A pixel may be this many times as bright as the brightest other one of the 5x5 around it.
+/// A pixel may be at most this many times as bright as the brightest other pixel in the 5x5 around it.
 pub const FIREFLY: f32 = 32.0;
 
-/// Rows `rows` of radiance, grown to (width, height) as [`Planes::padded_to`] does, in which a pixel's brightest channel is
-/// at most [`FIREFLY`] times that of the brightest other one of the 5x5 around it in the whole frame, or `floor` if that is
-/// more; what is brighter is scaled down to that and keeps its hue.
+/// Rows `rows` of `radiance` (3, H, W) without fireflies, padded to `size` (width, height) as
+/// [`Planes::padded_to`] does.
 ///
-/// Of 1000 times the mean, what a network lets through of a pixel that it hardly trusts still shows.
+/// The brightness of a pixel is its largest channel. Its limit is [`FIREFLY`] times the brightest other pixel
+/// in the 5x5 around it (of the whole frame, not only of `rows`), or `floor` if that is more. A brighter
+/// pixel is scaled down to the limit; its hue stays.
+///
+/// A network trusts such a pixel little, but a small share of 1000 times the mean is still visible.
 pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize), floor: f32) -> Planes {
     let w = radiance.width;
     if radiance.pixels() == 1 {
@@ -39,7 +43,8 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
         row.extend((0..w).map(|x| brightest(x, y)));
         for first in (0..w).step_by(RUN) {
             let run = first..(first + RUN).min(w);
-            // Nearly every pixel has company beside it, which is seen without a branch for each.
+            // Nearly every pixel has a neighbour in its row that is bright enough; no branch per pixel is
+            // needed to see that.
             let near = &row[first.saturating_sub(1)..(run.end + 1).min(w)];
             let alone = |near: &[f32]| (near[1] > floor) & (near[1] > FIREFLY * near[0].max(near[2]));
             let at_border = first == 0 || run.end == w;

@@ -28,7 +28,8 @@ pub const KPCN_PASSES: [Pass; 7] = [
     GUIDES[2],
 ];
 
-/// Light that no surface reflects: noise-free but for the pixel filter, and added back as it is.
+/// Light that no surface reflects. It has no Monte Carlo noise but for the pixel filter's, so it is added
+/// back unfiltered.
 pub const KPCN_UNFILTERED: [Pass; 2] = [Pass::Emission, Pass::Environment];
 
 /// Channels that a stream's network reads: colour, normal and albedo with one variance and six
@@ -108,7 +109,7 @@ fn logarithm(planes: &Planes) -> Planes {
     out
 }
 
-/// What both streams read beside their colour.
+/// The inputs that both streams share, besides their colour.
 struct Guides {
     albedo: Planes,
     /// Normal, albedo and depth with variances and differences, (24, H, W).

@@ -27,19 +27,25 @@ const SECONDARY: usize = 7;
 /// Channels that the network reads.
 pub const LBF_CHANNELS: usize = SECONDARY * (1 + LBF_GROUPS.len());
 
-/// Least variance of a feature, of range 1, that its distance is divided by.
+/// Smallest variance of a feature (whose range is about 1) that a squared distance is divided by.
 const FEATURE_NOISE: f32 = 1e-3;
 
-/// Radii of the blocks of the statistics: 3x3 and 7x7.
+/// Radii of the blocks over which statistics are taken: 3x3 and 7x7 pixels.
 const NEAR: usize = 1;
 const FAR: usize = 3;
 
-/// Distances of world positions from their mean, in deviations, end here: skies must not flatten rooms.
+/// World positions are clipped at this many standard deviations from their mean: a sky far away would
+/// otherwise leave a room with next to no range.
 const MAX_DEVIATIONS: f32 = 3.0;
 
-/// What the method sees, in this order: exposed radiance (3, H, W); its variance, summed over channels
-/// (1, H, W); the features (12, H, W); what each precision is multiplied by (6, H, W), 1 for position
-/// and colour and the inverse of its noise for a feature; the secondary features (35, H, W).
+/// The method's inputs, in this order:
+///
+/// 0. exposed radiance, (3, H, W);
+/// 1. its variance, summed over channels, (1, H, W);
+/// 2. the features that the filter compares, (12, H, W);
+/// 3. factors of the filter's six precisions, (6, H, W): 1 for pixel position and for colour, the inverse noise
+///    variance for each of the four feature groups;
+/// 4. the secondary features, (35, H, W).
 ///
 /// # Errors
 /// A pass is missing.
@@ -86,7 +92,8 @@ pub fn lbf(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     Ok(Inputs { planes: [vec![colour], planes].concat(), scale: exposure.recip() })
 }
 
-/// World position as a feature: from its mean over the frame, in deviations, one factor for all axes.
+/// World position as a feature: its distance from the frame's mean in standard deviations, one factor for all
+/// axes.
 fn relative_position(position: &Planes) -> Planes {
     let n = position.pixels().max(1) as f64;
     let mut out = position.clone();

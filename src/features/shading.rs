@@ -1,9 +1,10 @@
-//! How light changes as a surface turns: what normals alone show of it, such as a moulding on a wall of one colour.
+//! How light changes with the direction of a surface. This shows detail that only the normal holds, such as a
+//! moulding on a wall of one colour.
 //!
-//! Around every pixel the logarithm of radiance over albedo is fitted by a plane over the three axes of the normal, as a
-//! guided filter does (He et al. 2013), its moments gathered in squares of pixels (He and Sun 2015). The hundreds of noisy
-//! pixels that decide on a slope so tell of detail that is one pixel wide, where kernels find but a handful of the
-//! same normal to average.
+//! Around every pixel the logarithm of radiance over albedo is fitted as a linear function of the three
+//! components of the normal, as in a guided filter (He et al. 2013), on squares of pixels (He and Sun 2015).
+//! A slope is estimated from hundreds of noisy pixels, so it is reliable enough to draw detail one pixel
+//! wide. A kernel would find only a few pixels of the same normal to average there.
 
 use std::ops::Range;
 
@@ -24,45 +25,50 @@ use crate::{
     planes::Planes,
 };
 
-/// Weights of the squares on either side of one, binomial: a deviation of 1.4 squares.
+/// Window of the fit: binomial weights of the squares on either side of one, a standard deviation of 1.4
+/// squares.
 const WINDOW: [f32; 9] = [1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0];
 
-/// Added to the variance of each axis of the normal, in variances of the light: 8 times the variance with which
-/// the 400 pixels of a window decide on a slope, by which slopes that noise alone may explain shrink.
+/// Ridge of the regression: this times the variance of the light is added to the variance of each component
+/// of the normal, so that slopes that noise alone could explain shrink. It is 8 times 1/400, the variance of
+/// a slope that the 400 pixels of a window estimate.
 const RIDGE: f32 = 0.02;
 
-/// Light counts as no brighter than this, 2.5 times middle grey: lamps and fireflies would decide on slopes all around them.
+/// Encoded light is clipped here, at 2.5 times middle grey: lamps and fireflies would dominate every fit
+/// around them.
 const BRIGHTEST: f32 = 0.75;
 
-/// A variance of the light below which there is no noise to speak of.
+/// Smallest variance of the light that the ridge is computed from, so that the fit stays solvable in flat
+/// areas.
 const LEAST_VARIANCE: f32 = 1e-4;
 
-/// The shading that [`Shading::rows`] gives is at most this, either way.
+/// Bound on the magnitude of what [`Shading::rows`] returns, a natural logarithm.
 const LARGEST: f32 = 1.0;
 
-/// What is fitted: a constant and the three axes of the normal.
+/// Unknowns of the fit: a constant and a slope for each component of the normal.
 const UNKNOWNS: usize = 4;
 
-/// Lines of a row of pixels: one, the three axes of the normal, and the light.
+/// Values of a pixel, each stored as a line over the row: 1, the three components of the normal, and the
+/// light.
 const LINES: usize = UNKNOWNS + 1;
 
-/// Sums over pixels of the products of every two of those, a lower triangle row by row: the matrix of the fit, its right-hand
-/// side, and the square of the light.
+/// Sums over pixels of all products of two of these values, as a lower triangle row by row: the matrix of the
+/// fit, its right-hand side, and the sum of the squared light.
 const MOMENTS: usize = LINES * (LINES + 1) / 2;
 
-/// What is kept of each square: the slope of light over the normal, and what it makes of the mean normal around.
+/// Values kept for each square: the three slopes, and what they give for the mean normal of the window.
 const KEPT: usize = UNKNOWNS;
 
-/// The slopes of light over normals, all over a frame.
+/// The slopes of light over the normal, for every square of a frame.
 pub struct Shading {
     /// Squares in a row.
     squares: usize,
-    /// Of each row of squares, [`KEPT`] lines of `squares` values.
+    /// For each row of squares, [`KEPT`] lines of `squares` values.
     lines: Vec<f32>,
 }
 
 impl Shading {
-    /// Fits the light of a whole frame at its `exposure`.
+    /// Fits the light of a whole frame, whose radiance is multiplied by `exposure`.
     ///
     /// # Errors
     /// A pass is missing.
@@ -111,8 +117,8 @@ impl Shading {
         Ok(Self { squares, lines })
     }
 
-    /// By how much, as a logarithm, the light of each pixel of some rows of the frame should differ from that around by its
-    /// normal, (1, R, W).
+    /// How much brighter than the mean of its window each pixel should be according to its normal, as a
+    /// natural logarithm, for R rows of the frame: (1, R, W).
     ///
     /// # Errors
     /// A pass is missing.
@@ -136,14 +142,15 @@ impl Shading {
 
 /// The shading of a row of pixels.
 struct Shade<'a> {
-    /// What is kept of the squares, a line each, as it is at that row.
+    /// The values kept for each square, interpolated vertically to this row; one line each.
     slopes: [&'a [f32]; KEPT],
     normal: [&'a [f32]; 3],
     output: &'a mut [f32],
 }
 
 impl Shade<'_> {
-    /// That of pixel `x`, which is `share` of the way from one square on to the next.
+    /// The shading of pixel `x`, which lies `share` of the way from the centre of square `left` to that of
+    /// the next.
     #[inline(always)]
     fn of(slopes: &[&[f32]; KEPT], left: usize, share: f32, normal: &[&[f32]; 3], x: usize) -> f32 {
         let right = (left + 1).min(slopes[0].len() - 1);
@@ -163,7 +170,8 @@ impl Vectorised for Shade<'_> {
         const HALF: usize = SQUARE / 2;
         let Self { slopes, normal, output } = self;
         let (width, squares) = (output.len(), slopes[0].len());
-        // From the middle of one square to that of the next, all pixels lie between the same two.
+        // All pixels from the centre of one square to the centre of the next are interpolated between these
+        // two.
         let runs = output.get_mut(HALF..).unwrap_or_default().as_chunks_mut::<SQUARE>().0;
         let inside = HALF..HALF + SQUARE * runs.len().min(squares - 1);
         for (left, run) in runs.iter_mut().enumerate().take(squares - 1) {
@@ -224,7 +232,8 @@ impl Vectorised for Gather<'_> {
     }
 }
 
-/// The slopes of light, as a natural logarithm, over the normal, and what they make of the mean normal, from moments.
+/// Solves the fit from its moments: the three slopes of the natural logarithm of light, and their value at
+/// the mean normal.
 fn fit(moments: [Lanes; MOMENTS]) -> [Lanes; KEPT] {
     let (matrix, rest) = moments.split_at(MOMENTS - LINES);
     let [mut solution @ .., square] = <[Lanes; LINES]>::try_from(rest).expect("the last row of a triangle");
@@ -249,8 +258,8 @@ mod tests {
 
     const SIZE: (usize, usize) = (70, 53);
 
-    /// A frame of albedo 1 with random normals near +Z, whose light is e to the power of `slope` times the normal's X, times
-    /// `brightness` and noise.
+    /// A frame of albedo 1 with random normals near +Z, whose light is e to the power of `slope` times the
+    /// normal's X, times `brightness` and noise.
     fn frame(slope: f32, brightness: f32, noise: f32) -> PassSet {
         let (w, h) = SIZE;
         let rng = &mut Rng::new(3, 0);

@@ -1,10 +1,19 @@
-//! What guides and samples still tell of a frame that a network has denoised.
+//! The refit: local regression that corrects a denoised frame by its guides and its noisy samples.
 //!
-//! A network blurs some of the texture that the albedo did not account for, and leaves blotches on even walls. Both show
-//! against the guides: around every pixel, two planes a colour are fitted over the axes of the normal and the logarithms of the
-//! albedo, both clean. One is fitted to the noisy radiance over the denoised, whose hundreds of samples tell what slopes were missed, as
-//! regression over features does (Bitterli et al. 2016). The other is fitted to the logarithm of what was denoised, which gives way
-//! to it where it varies little besides: a guided filter (He et al. 2013) that has its own image for a guide as well.
+//! A network blurs some of the texture that the albedo does not explain, and leaves blotches on even walls.
+//! Around every pixel and for each colour, two linear functions of the clean guides (the three components of
+//! the normal and the logarithms of the three albedo channels) are fitted, in windows of some two hundred
+//! pixels:
+//!
+//! - The *missed slopes*, fitted to noisy radiance over denoised radiance: if that ratio follows a guide, the
+//!   network blurred something, and its slope is added. This is regression over features (Bitterli et al.
+//!   2016).
+//! - The *smooth part*, fitted to the logarithm of the denoised radiance over albedo. Where the result varies
+//!   little beside that fit, the rest is taken for blotches and the result moves to the fit: a guided filter
+//!   (He et al. 2013).
+//!
+//! Moments are gathered over squares of 4x4 pixels, and fits interpolated between their centres. In: exposed
+//! denoised radiance, (3, H, W), guides and samples. Out: a factor for each value of it.
 
 use std::{collections::VecDeque, ops::Range};
 
@@ -20,96 +29,104 @@ use crate::kernels::{
     vectorised::{self, Vectorised},
 };
 
-/// Weights of the squares on either side of one, binomial: a deviation of one square.
+/// Window of a fit: binomial weights of the squares on either side of one, a standard deviation of one
+/// square.
 const WINDOW: [f32; 5] = [1.0, 4.0, 6.0, 4.0, 1.0];
 
-/// How many pixels a window counts for, over the sum of their weights: the square of that over the sum of squares.
+/// Effective number of pixels of a window per unit of summed weight: `(sum w)^2 / sum w^2` over `sum w`.
 const PIXELS: f32 = 256.0 / (70.0 * 70.0);
 
-/// Three axes of the normal and three logarithms of the albedo.
+/// Guides: the three components of the normal, and the logarithms of the three albedo channels.
 const GUIDES: usize = 6;
 
-/// What is fitted: a constant and the slopes.
+/// Regressors of a fit: a constant 1 and the guides.
 const KNOWN: usize = GUIDES + 1;
 
 const COLOURS: usize = 3;
 
-/// What is fitted to: each colour's logarithm of what is denoised, then each colour's samples over that.
+/// Targets of the fits: for each colour the logarithm of denoised light, then for each colour samples over
+/// denoised light.
 const TARGETS: usize = 2 * COLOURS;
 
-/// Sums over pixels of the products of every two of the first, a lower triangle row by row; then for each target its products with
-/// those, and its square.
+/// Moments of a window, as weighted sums over its pixels: all products of two regressors, as a lower triangle
+/// row by row; then for each target its products with the regressors, and its square.
 const MOMENTS: usize = KNOWN * (KNOWN + 1) / 2 + TARGETS * (KNOWN + 1);
 
-/// What is kept of each square for each colour: a constant and the slopes of its change over the guides, and over its own logarithm,
-/// of which a share is taken away.
+/// Values kept for each square, [`KNOWN`] + 1 for each colour: constant and slopes of the logarithm of its
+/// factor over the guides, and the (negative) slope over the logarithm of the denoised light itself, which
+/// removes blotches.
 const KEPT: usize = COLOURS * (KNOWN + 1);
 
-/// Added to the variances of an axis and of a logarithm: how much of a guide is noise, or too little to tell of anything.
+/// Added to the variance of each guide: its remaining noise, and variation too small to explain anything.
 const GUIDE_NOISE: [f32; GUIDES] = [1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4];
 
-/// Deviation of the slopes that are there to be found in the samples: those that noise alone may explain shrink below it.
+/// Expected standard deviation of missed slopes, a prior: slopes that noise alone could explain are shrunk
+/// towards zero.
 const SLOPE: f32 = 0.5;
 
-/// Deviation of the blotches that a network leaves: what varies less beside the guides gives way to them.
+/// Standard deviation of a network's blotches, as a logarithm: variation beside the fit that is smaller is
+/// smoothed away.
 const BLOTCHES: f32 = 0.09;
 
-/// Variance of the samples over what was denoised from which on blotches are that large: with less noise there is less of them.
+/// Variance of samples over denoised light at which blotches are that large; with less noise they are taken
+/// to be smaller.
 const NOISY: f32 = 0.1;
 
-/// Exposed radiance over albedo that is added to samples and to what is denoised before one is
-/// divided by the other, and before the latter's logarithm: relative errors of what is darker count less and less.
+/// Added to samples and to denoised light (exposed radiance over albedo) before one is divided by the other,
+/// and to denoised light before its logarithm: below these, relative errors count less and less.
 const SAMPLE_FLOOR: f32 = 0.3;
 const FLOOR: f32 = 0.007;
 
-/// A sample is at most this many times what was denoised, as fireflies would decide on slopes all around them.
+/// A sample counts as at most this many times the denoised light: fireflies would dominate every fit around
+/// them.
 const MOST: f32 = 2.0;
 
-/// Exposed radiance over albedo, the mean of the colours, 8 times middle grey, from which on a pixel counts less and less: lamps say
-/// nothing of the walls around.
+/// Light (exposed radiance over albedo, mean of the colours; this is 8 times middle grey) above which a
+/// pixel's weight falls: lamps tell nothing about the walls around them.
 const BRIGHT: f32 = 1.5;
 
-/// The logarithm of the largest change.
+/// Bound on the logarithm of a factor, either way.
 const LARGEST: f32 = 0.7;
 
-/// A window that counts for no more than this has none of the frame's pixels, or lamps alone.
+/// A window whose summed weight is no more than this lies beyond the frame or holds only lamps: nothing is
+/// fitted.
 const LEAST_COUNT: f32 = 1e-2;
 
-/// What samples vary by, and their level over what is denoised, are taken to be at least this.
+/// Lower bounds of the variance of samples over denoised light, and of their mean.
 const LEAST_NOISE: f32 = 1e-3;
 const LEAST_LEVEL: f32 = 0.3;
 
-/// What is known of a frame besides its radiance.
+/// The clean guides of a frame.
 #[derive(Clone, Copy)]
 pub struct Guides<'a> {
     /// Columns and rows.
     pub size: (usize, usize),
-    /// Axes of the normal without its noise, and as many rows of it as of the albedo, (3, R, W).
+    /// The denoised normal, for the same R rows as the albedo, (3, R, W).
     pub normal: &'a [f32],
-    /// What radiance is divided by, the albedo without its noise: rows from `first` on, as many as there are, (3, R, W).
+    /// The divisor of radiance that the denoised albedo gives, for R rows from `first` on, (3, R, W).
     pub albedo: &'a [f32],
-    /// The first of those rows.
+    /// The frame's row that is the first of them.
     pub first: usize,
 }
 
 /// Noisy radiance, (3, H, W).
 #[derive(Clone, Copy)]
 pub enum Samples<'a> {
-    /// Exposed and divided by albedo.
+    /// Exposed and divided by the albedo.
     Divided(&'a [f32]),
-    /// As rendered, and the exposure.
+    /// As rendered, with the exposure to apply.
     Rendered(&'a [f32], f32),
 }
 
 impl Guides<'_> {
-    /// Row `y` of three planes of all rows.
+    /// Row `y` of three planes that hold the whole frame, (3, H, W).
     #[inline(always)]
     fn row<'p>(&self, planes: &'p [f32], y: usize) -> [&'p [f32]; 3] {
         let (width, height) = self.size;
         [0, 1, 2].map(|c| &planes[(c * height + y) * width..][..width])
     }
 
-    /// Row `y` of a guide.
+    /// Row `y` of the frame in a guide, which holds rows from `first` on.
     #[inline(always)]
     fn guide_row<'p>(&self, guide: &'p [f32], y: usize) -> [&'p [f32]; 3] {
         let (width, plane) = (self.size.0, guide.len() / 3);
@@ -117,32 +134,35 @@ impl Guides<'_> {
     }
 }
 
-/// A refit that goes down a frame as the frame is denoised, and keeps of it no more than the windows take.
+/// A refit that follows the denoising down a frame, and keeps only the moments and fits that windows still
+/// need.
 pub struct Refit {
     squares: usize,
     square_rows: usize,
-    /// Moments of rows of squares: the number of the first, and [`MOMENTS`] lines each.
+    /// Number of the first row of squares whose moments are kept, and [`MOMENTS`] lines of `squares` values
+    /// for each row.
     moments: (usize, VecDeque<Vec<f32>>),
-    /// Fits of rows of squares: the number of the first, and [`KEPT`] lines each.
+    /// The same for fits, [`KEPT`] lines for each row of squares.
     fits: (usize, VecDeque<Vec<f32>>),
-    /// Rows of pixels that are done.
+    /// Rows of pixels whose factors have been applied.
     done: usize,
 }
 
 impl Refit {
-    /// A refit of a frame of so many columns and rows.
+    /// A refit of a frame of `width` columns and `height` rows.
     pub fn new((width, height): (usize, usize)) -> Self {
         let [squares, square_rows] = [width, height].map(|n| n.div_ceil(SQUARE));
         Self { squares, square_rows, moments: Default::default(), fits: Default::default(), done: 0 }
     }
 
-    /// Rows of pixels that are done: their albedo is not asked for again.
+    /// Rows of pixels that are finished: their guides are not needed again.
     pub fn done(&self) -> usize {
         self.done
     }
 
-    /// Does `change` with every value of an exposed `image`, (3, H, W), and what it should be multiplied by, as far as that can be
-    /// known when its first `rows` rows are there. It was made of `samples`.
+    /// Calls `change` with each value of the exposed denoised `image` (3, H, W) and the factor to multiply it
+    /// by. The first `rows` rows of `image` have been denoised so far; rows whose windows they complete are
+    /// changed, and each row once. `samples` is the noisy frame.
     pub fn advance(
         &mut self,
         guides: Guides,
@@ -187,7 +207,7 @@ impl Refit {
         );
         fits.extend(new.collect::<Vec<_>>());
 
-        // A pixel lies between the middles of two squares.
+        // Fits are interpolated between the centres of two squares, so the last half square has to wait.
         let end = match *first_fit + fits.len() {
             end if end == self.square_rows => guides.size.1,
             end if end > 1 => SQUARE * end - SQUARE / 2,
@@ -206,7 +226,7 @@ impl Refit {
         *first_fit += unused;
     }
 
-    /// Does `change` with every value of some rows and its factor.
+    /// Calls `change` with each value of some rows and its factor.
     fn each_row(
         &self,
         guides: Guides,
@@ -233,7 +253,7 @@ impl Refit {
         });
     }
 
-    /// Finds the factors of row `y`, which holds `image`.
+    /// Computes the factors of row `y`, whose three colours are `image`, into `memory`.
     fn find(&self, guides: Guides, image: [&[f32]; 3], y: usize, memory: &mut Memory) {
         let (above, share) = between(y, self.square_rows);
         let (first, fits) = &self.fits;
@@ -242,27 +262,27 @@ impl Refit {
     }
 }
 
-/// What a thread needs for the factors of a row.
+/// Scratch memory of a thread for the factors of a row.
 struct Memory {
     pixels: Pixels,
-    /// The fits as they are at that row, a square more on either side.
+    /// The fits interpolated vertically to that row, with one square more on either side.
     fit: Vec<f32>,
-    /// Of each colour.
+    /// The factors, for each colour.
     factors: [Vec<f32>; COLOURS],
 }
 
-/// What is known of the pixels of a row, and what they are fitted to. Lines hold first the first pixels of all squares, then the
-/// second, and so on: what is done to squares is so done to neighbouring values.
+/// Regressors, targets and weights of a row of pixels. A line holds the first pixel of every square, then the
+/// second of every square, and so on, so that loops over squares read neighbouring values.
 struct Pixels {
     squares: usize,
-    /// One, and the guides.
+    /// The regressors: [`KNOWN`] lines.
     known: Vec<f32>,
     targets: Vec<f32>,
-    /// How much each counts.
+    /// The weight of each pixel in the fits.
     weight: Vec<f32>,
-    /// Radiance over albedo, of each colour.
+    /// Denoised light (exposed radiance over albedo) of each colour.
     light: Vec<f32>,
-    /// Memory for a row.
+    /// The divisor of each colour, and a spare line.
     albedo: Vec<f32>,
     spare: Vec<f32>,
 }
@@ -282,8 +302,8 @@ impl Pixels {
         }
     }
 
-    /// Reads what is known of row `y`: how much its pixels count, their guides, and the logarithms of what is denoised, the first
-    /// targets.
+    /// Reads row `y`: weights, guides, and the logarithms of the denoised light, which are the first
+    /// [`COLOURS`] targets.
     #[inline(always)]
     fn read(&mut self, guides: Guides, image: [&[f32]; 3], y: usize) {
         let len = SQUARE * self.squares;
@@ -314,13 +334,13 @@ impl Pixels {
         for (target, light) in self.targets.iter_mut().zip(&self.light) {
             *target = ln(light + FLOOR);
         }
-        // Pixels of the last squares beyond the frame.
+        // Pixels of the last square that lie beyond the frame have no weight.
         for beyond in width..len {
             self.weight[beyond % SQUARE * self.squares + beyond / SQUARE] = 0.0;
         }
     }
 
-    /// Reads the samples over what is denoised, the other targets.
+    /// Reads samples over denoised light, the other targets. `read` comes first.
     #[inline(always)]
     fn read_samples(&mut self, guides: Guides, samples: Samples, y: usize) {
         let len = SQUARE * self.squares;
@@ -340,7 +360,7 @@ impl Pixels {
     }
 }
 
-/// Parts a row of pixels as [`Pixels`] has them. What lies beyond the row keeps its value.
+/// Writes a row of pixels in the order of a line of [`Pixels`]. Places beyond the row keep their value.
 #[inline(always)]
 fn part(row: &[f32], squares: usize, line: &mut [f32]) {
     let (whole, rest) = row.as_chunks::<SQUARE>();
@@ -356,7 +376,8 @@ fn part(row: &[f32], squares: usize, line: &mut [f32]) {
     }
 }
 
-/// Does `work` with each pixel of a row and its value in a line.
+/// Calls `work` with each pixel of a row and its value in a line of [`Pixels`]: the inverse order of
+/// [`part`].
 #[inline(always)]
 fn interleave(line: &[f32], squares: usize, row: &mut [f32], work: impl Fn(&mut f32, f32)) {
     for (s, square) in row.chunks_mut(SQUARE).enumerate() {
@@ -364,7 +385,7 @@ fn interleave(line: &[f32], squares: usize, row: &mut [f32], work: impl Fn(&mut 
     }
 }
 
-/// What a row of pixels adds to the moments of its squares.
+/// Adds a row of pixels to the moments of its squares.
 struct Gather<'a> {
     guides: Guides<'a>,
     image: &'a [f32],
@@ -407,7 +428,7 @@ fn scale(weight: &[f32], values: &[f32], output: &mut [f32]) {
     output.iter_mut().zip(weight.iter().zip(values)).for_each(|(output, (w, v))| *output = w * v);
 }
 
-/// Adds to each square the products of its pixels.
+/// Adds to each square's sum the products `a * b` of its four pixels in this row.
 #[inline(always)]
 fn add_products(a: &[f32], b: &[f32], sums: &mut [f32]) {
     let n = sums.len();
@@ -418,7 +439,7 @@ fn add_products(a: &[f32], b: &[f32], sums: &mut [f32]) {
     }
 }
 
-/// Fits planes around every square of a row.
+/// Solves the fits of every square of a row.
 struct FitRow<'a> {
     /// [`MOMENTS`] lines of `squares` values.
     moments: &'a [f32],
@@ -444,7 +465,7 @@ impl Vectorised for FitRow<'_> {
     }
 }
 
-/// `f` of each lane.
+/// `f(lane)` for each lane.
 #[inline(always)]
 fn each(f: impl Fn(usize) -> f32) -> Lanes {
     let mut lanes = [0.0; LANES];
@@ -454,7 +475,8 @@ fn each(f: impl Fn(usize) -> f32) -> Lanes {
     lanes
 }
 
-/// The fits of one square a lane, from its moments, as [`KEPT`] tells.
+/// Solves the fits of [`LANES`] squares, one in each lane, from their windows' moments; the result is what
+/// [`KEPT`] says.
 #[inline(always)]
 fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
     let (of_guides, of_targets) = moments.split_at(KNOWN * (KNOWN + 1) / 2);
@@ -484,7 +506,8 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
     }
     let (denoised, samples) = targets.split_at(COLOURS);
 
-    // Slopes of the samples: a ridge that is the variance with which as many of them decide on one.
+    // Missed slopes are found by ridge regression: the ridge is the variance of a slope that this many noisy
+    // samples estimate, relative to the prior variance of slopes.
     let noise = each(|l| samples.iter().map(|(_, _, noise)| noise[l]).sum::<f32>() * (1.0 / COLOURS as f32));
     let doubt = each(|l| noise[l].max(LEAST_NOISE) / ((PIXELS * SLOPE * SLOPE) * count[l].max(LEAST_COUNT)));
     let mut doubted = covariances.clone();
@@ -515,7 +538,7 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
         });
         let mut constant = each(|l| given[l] * mean[l]);
         for i in 0..GUIDES {
-            // What was missed lies on a plane itself, so of it nothing is taken away.
+            // The missed slopes are a fit themselves, so smoothing takes nothing of them away.
             kept[1 + i] = each(|l| given[l] * smooth[i][l] + missed[i][l] / level[l].max(LEAST_LEVEL));
             constant = each(|l| constant[l] - kept[1 + i][l] * means[i][l]);
         }
@@ -525,12 +548,13 @@ fn fit(moments: &[Lanes; MOMENTS]) -> [Lanes; KEPT] {
     kept
 }
 
-/// The factors of a row of pixels.
+/// Computes the factors of a row of pixels.
 struct Factors<'a> {
     guides: Guides<'a>,
     image: [&'a [f32]; 3],
     y: usize,
-    /// The fits of the squares above and below, and how far the row is on the way to the latter.
+    /// The fits of the rows of squares above and below, and how far (0..1) the row lies from the former to
+    /// the latter.
     near: [&'a [f32]; 2],
     share: f32,
     memory: &'a mut Memory,
@@ -566,12 +590,13 @@ impl Vectorised for Factors<'_> {
     }
 }
 
-/// Adds values of squares, interpolated between their middles, times those of pixels.
+/// Adds the values of squares, interpolated to each pixel between their centres, times the values of the
+/// pixels.
 #[inline(always)]
 fn add_interpolated(squares: &[f32], pixels: &[f32], sums: &mut [f32]) {
     let n = squares.len() - 2;
     for (phase, (sums, pixels)) in sums.chunks_exact_mut(n).zip(pixels.chunks_exact(n)).enumerate() {
-        // The first half of a square's pixels lies between its middle and that of the square before.
+        // The first half of a square's pixels lies between its centre and the centre of the square before.
         let (first, share) = between_of(phase);
         let (left, right) = (&squares[first..][..n], &squares[first + 1..][..n]);
         for ((sum, pixel), (left, right)) in sums.iter_mut().zip(pixels).zip(left.iter().zip(right)) {
@@ -580,7 +605,8 @@ fn add_interpolated(squares: &[f32], pixels: &[f32], sums: &mut [f32]) {
     }
 }
 
-/// For the pixels `phase` of squares, how many squares on from the one before they lie, and how far on towards the next.
+/// For pixel number `phase` of a square: the square on its left, counted from the one before its own, and how
+/// far (0..1) it lies from that square's centre to the next.
 #[inline(always)]
 fn between_of(phase: usize) -> (usize, f32) {
     let place = (phase as f32 + 0.5) / SQUARE as f32 + 0.5;
@@ -595,7 +621,8 @@ mod tests {
     const SIZE: (usize, usize) = (71, 54);
     const PIXELS: usize = SIZE.0 * SIZE.1;
 
-    /// A frame whose radiance over albedo is `light` of a pixel in what was denoised, `samples` in what was rendered.
+    /// A frame whose denoised radiance over albedo is `light(pixel)`, and whose noisy one is
+    /// `samples(pixel)`.
     struct Frame {
         normal: Vec<f32>,
         albedo: Vec<f32>,

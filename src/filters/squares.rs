@@ -1,5 +1,5 @@
-//! Sums over 4x4 squares of pixels and over windows of squares, in which the fits to a frame are gathered (He and Sun 2015:
-//! what a guided filter does changes slowly, so it need not be found anew for every pixel).
+//! Sums over 4x4 squares of pixels and over windows of squares, in which the fits to a frame are gathered (He
+//! and Sun 2015: what a guided filter does changes slowly, so it need not be found anew for every pixel).
 
 use crate::kernels::vectorised::{self, Vectorised};
 
@@ -12,8 +12,9 @@ pub fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
-/// Writes to `output` every value of lines of `squares` values, weighted with those around it: `rows` are those above, at and below it, each
-/// with its weight, and `window` holds an odd number of weights for what is to the left and right. Beyond the frame there is nothing.
+/// Writes to `output` every value of lines of `squares` values, weighted with those around it: `rows` are
+/// those above, at and below it, each with its weight, and `window` holds an odd number of weights for what
+/// is to the left and right. Beyond the frame there is nothing.
 pub fn around<'a>(
     rows: impl Iterator<Item = (f32, &'a [f32])>,
     squares: usize,
