@@ -1,0 +1,248 @@
+"""Renders the development set: whole ladders of sample counts of views that nothing is trained on.
+
+    python development_set.py --out DIR --assets ASSETS             with bpy from PyPI
+    python development_set.py --out DIR --check                     compares the files with their hashes
+
+Choices between methods are made on this set; what is trained must never see its scenes, whose seeds
+generate_scenes.py refuses. Every view is a scene of its own seed, or a second look at one, 240 by 135 pixels:
+the whole frame, or a crop of a frame of 480 by 270.
+
+Writes <view>_<spp>spp.exr with all passes (half float) for every count of the ladder, where 4096 stands for
+Blender's defaults: adaptive, 4096 samples at most, noise threshold 0.01. Counts with further seeds add ..._n1.exr
+and ..._n2.exr. No two files share a sample. <view>_ref.exr (32-bit float, with clean guides and alpha) is the mean
+of independent adaptive renders, which stay in parts/: their differences tell how much noise is left. It is the mean of
+two first, of four with the rest of the ladder, and of eight at last.
+
+manifest.csv (scene,noisy,reference,spp) lists what is there with its reference; views.csv lists every file with
+its seeds, processor seconds, the reference's own noise as RelMSE, and SHA-256. What is listed and there is not
+rendered again. All views get 4, 64 and 4096 samples and a reference before any gets the rest.
+"""
+
+import argparse
+import csv
+import logging
+import os
+import sys
+import time
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
+
+from demc_blender import command_line as cl
+from demc_blender import exr, names, rendering
+from demc_blender.edits import Edits
+from demc_blender.ledger import Ledger
+from demc_blender.position import store_position, write_position
+from demc_scenes import making
+from demc_scenes.assets import Library
+
+_SIZE = (240, 135)
+_PANORAMA = (240, 120)
+_LARGE = (480, 270)
+_FIRST = ((4, 0), (64, 0), (rendering.DEFAULT_SAMPLES, 0))  # (samples, noise seed)
+_THEN = ((1, 0), (2, 0), (8, 0), (16, 0), (256, 0), (4, 1), (4, 2), (64, 1), (64, 2))
+# A part of a reference: adaptive, with enough samples first that stopping early has no say in the mean.
+_PART_NOISE, _PART_LEAST, _PART_MOST = 0.007, 64, 1024
+# What comes in which order: noisy frames, and the parts whose mean is the reference by then.
+_STEPS = ((_FIRST, "ab"), (_THEN, "abcd"), ((), "abcdefgh"))
+
+
+class View:
+    """A look at a scene: kind, seed, which camera, whole frame or crop, pixel filter."""
+
+    def __init__(self, kind, seed, camera=0, crop=False, box=False):
+        self.kind, self.seed, self.camera, self.crop, self.box = kind, making.DEVELOPMENT_SEEDS[seed], camera, crop, box
+        self.name = f"dev{seed:02d}_{kind}" + (f"_{camera}" if camera else "")
+        self.reference = names.reference_name(self.name)
+
+    def noisy(self, spp, seed):
+        plain = names.noisy_name(self.name, spp)
+        return plain if seed == 0 else plain.replace(".exr", f"_n{seed}.exr")
+
+    def part(self, which):
+        return f"parts/{self.name}_ref_{which}.exr"
+
+
+# Many kinds first, so that a set that is under way serves already.
+VIEWS = (
+    View("print", 41), View("screens", 44, crop=True), View("embossed", 8, crop=True), View("glass", 6),
+    View("cutout", 12), View("glints", 41), View("foliage", 41), View("backdrop", 52),
+    View("sunlit", 2, crop=True), View("hair", 51), View("beams", 62), View("pool", 40),
+    View("room", 1), View("stars", 61), View("bokeh", 43), View("manylights", 14, crop=True),
+    View("street", 17), View("skin", 20, crop=True), View("materials", 21), View("panorama", 43),
+    View("outdoor", 23), View("fog", 19), View("print", 43, crop=True, box=True), View("screens", 27),
+    View("cutout", 42), View("relief", 50, crop=True), View("foliage", 43, box=True), View("backdrop", 54, crop=True),
+    View("glints", 11, crop=True), View("room", 26, crop=True), View("pool", 43, crop=True), View("beams", 56),
+    View("hair", 53, crop=True), View("glass", 6, 1, box=True), View("street", 17, 1, crop=True), View("stars", 58, crop=True),
+)
+
+
+def parse(arguments):
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="development_set.py", description="Render the development set.",
+                                     epilog=f"Views: {', '.join(view.name for view in VIEWS)}.")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the set")
+    parser.add_argument("--assets", action="append", default=[], metavar="DIR",
+                        help="models, textures, HDRIs and pictures to furnish with; may be repeated. The set is what it "
+                             "is with the assets it was made with")
+    parser.add_argument("--views", metavar="a,b", help="these views only (default: all)")
+    parser.add_argument("--spp", type=cl.counts, metavar="N[,N]", help="these sample counts only and no references, for a first look")
+    parser.add_argument("--check", action="store_true", help="render nothing, compare files with their hashes")
+    parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
+    options = parser.parse_args(arguments)
+    known = {view.name: view for view in VIEWS}
+    chosen = options.views.split(",") if options.views else list(known)
+    unknown = set(chosen) - set(known)
+    if unknown:
+        parser.error(f"unknown view {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    options.views = [known[name] for name in chosen]
+    for folder in options.assets:
+        if not os.path.isdir(folder):
+            parser.error(f"{folder}: no such folder (--assets)")
+    return options
+
+
+class Table(Ledger):
+    """The set's views.csv, and the manifest.csv that follows from it."""
+
+    def joined(self, view):
+        """Which parts a view's reference is the mean of."""
+        return "" if self.missing(view.reference) else self.rows()[view.reference]["noise_seed"]
+
+    def record(self, view, file, spp, noise_seed, seconds, noise=""):
+        frame = "x".join(map(str, _LARGE if view.crop else _PANORAMA if view.kind == "panorama" else _SIZE))
+        self.add(view=view.name, kind=view.kind, seed=view.seed, camera=view.camera, frame=frame,
+                 filter="box" if view.box else "blackman-harris", file=file, spp=spp, noise_seed=noise_seed,
+                 seconds=f"{seconds:.1f}", noise=noise)
+        self._write_manifest()
+
+    def _write_manifest(self):
+        listed = set(self.rows())
+        rows = [["scene", "noisy", "reference", "spp"]]
+        for view in VIEWS:
+            for spp, seed in sorted(_FIRST + _THEN, key=lambda entry: entry[::-1]):
+                if {view.noisy(spp, seed), view.reference} <= listed:
+                    rows.append([view.name if seed == 0 else f"{view.name}_n{seed}", view.noisy(spp, seed), view.reference, spp])
+        partial = os.path.join(self.folder, "manifest.tmp")
+        with open(partial, "w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+        os.replace(partial, os.path.join(self.folder, "manifest.csv"))
+
+
+class Studio:
+    """One view's scene, ready to render any of its files."""
+
+    def __init__(self, options, library, view, edits):
+        self.view, self.folder = view, options.out
+        stage, place = making.build(library, view.seed, view.kind, {})
+        stage.rng.seed(f"camera {view.seed} {view.kind} {view.camera}")  # a second look takes nothing from the first
+        making.set_up(edits, stage, options.threads, size=_LARGE if view.crop else _SIZE)
+        self.scene = stage.scene
+        (region,) = making.look(edits, stage, place, 1, _SIZE if view.crop else None)
+        rendering.set_region(edits, self.scene, region)
+        edits.set(self.scene.cycles, "pixel_filter_type", "BOX" if view.box else "BLACKMAN_HARRIS")
+        edits.set(self.scene.cycles, "filter_width", 1.5)
+        self.layers = list(self.scene.view_layers)
+        write_position(edits, self.layers)
+
+    def noisy(self, spp, noise_seed):
+        """Renders a noisy file with all passes; returns its processor seconds."""
+        with Edits() as edits:
+            rendering.enable_passes(edits, self.layers)
+            store_position(edits, self.layers)
+            seed = rendering.mixed_seed(self.view.seed, self.view.name, spp, noise_seed)
+            rendering.set_sampling(edits, self.scene, spp, seed, rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0)
+            channels, seconds = self._render()
+        exr.write_half(os.path.join(self.folder, self.view.noisy(spp, noise_seed)), channels)
+        return seconds
+
+    def part(self, which):
+        """Renders a part of the reference; returns its processor seconds."""
+        with Edits() as edits:
+            edits.set(self.scene.render.image_settings, "color_depth", "32")
+            rendering.combined_only(edits, self.layers)
+            for layer in self.layers:
+                edits.set(layer.cycles, "denoising_store_passes", True)
+            seed = rendering.mixed_seed(self.view.seed, self.view.name, "reference", which)
+            rendering.set_sampling(edits, self.scene, _PART_MOST, seed, _PART_NOISE, _PART_LEAST)
+            channels, seconds = self._render()
+        exr.write_float(os.path.join(self.folder, self.view.part(which)), channels)
+        return seconds
+
+    def _render(self):
+        partial = os.path.join(self.folder, f"{self.view.name}.tmp")
+        start = time.process_time()
+        rendering.render_to(self.scene, partial)
+        seconds = time.process_time() - start
+        channels = exr.read(partial)
+        os.remove(partial)
+        return channels, seconds
+
+
+def join_parts(folder, view, parts):
+    """Writes the reference, the mean of its parts; returns the RelMSE that its own noise adds to any score, which is
+    the variance of that mean, from how the parts differ."""
+    read = [exr.read(os.path.join(folder, view.part(which))) for which in parts]
+    mean = {name: np.mean([part[name] for part in read], 0) for name in read[0]}
+    exr.write_float(os.path.join(folder, view.reference), mean)
+    color = [name for name in mean if name.endswith(("Combined.R", "Combined.G", "Combined.B"))]
+    variance = {name: np.var([part[name] for part in read], 0, ddof=1) / len(read) for name in color}
+    return float(np.mean([variance[name] / (mean[name] ** 2 + 0.001) for name in color]))
+
+
+def render_view(options, library, table, view, ladder, parts):
+    """Renders what a view lacks of a ladder and of its reference's parts; returns the words of its line, None where
+    nothing is missing."""
+    if options.spp:
+        ladder, parts = [entry for entry in ladder if entry[0] in options.spp], ""
+    noisy = [entry for entry in ladder if table.missing(view.noisy(*entry))]
+    lacking = [which for which in parts if table.missing(view.part(which))]
+    unjoined = len(table.joined(view)) < len(parts)
+    if not (noisy or lacking or unjoined):
+        return None
+    start = time.process_time()
+    if noisy or lacking:
+        with Edits() as edits:
+            studio = Studio(options, library, view, edits)
+            for entry in noisy:
+                table.record(view, view.noisy(*entry), *entry, studio.noisy(*entry))
+            for which in lacking:
+                table.record(view, view.part(which), _PART_MOST, which, studio.part(which))
+    said = f"{len(noisy)} frames, {len(lacking)} parts of the reference in {time.process_time() - start:.0f} processor seconds"
+    if not unjoined:
+        return said
+    noise = join_parts(options.out, view, parts)
+    rows = table.rows()
+    seconds = sum(float(rows[view.part(which)]["seconds"]) for which in parts)
+    table.record(view, view.reference, len(parts) * _PART_MOST, parts, seconds, f"{noise:.3g}")
+    return f"{said}, noise left {noise:.3g}"
+
+
+def main():
+    """Entry point of the script."""
+    options = parse(cl.script_arguments())
+    options.out = os.path.abspath(options.out)
+    if options.check:
+        cl.finish(Table(options.out).check())
+        return
+    cl.quiet_stdout()
+    logging.disable(logging.INFO)  # the glTF importer tells every step
+    cl.make_folder(os.path.join(options.out, "parts"))
+    cl.end_at_once(lambda: None)
+    library, table, failed = Library(options.assets), Table(options.out), 0
+    for ladder, parts in _STEPS:
+        for view in options.views:
+            try:
+                said = render_view(options, library, table, view, ladder, parts)
+            except Exception as error:  # one bad view must not stop a night of rendering
+                failed += 1
+                said = f"failed, {cl.reason(error)}"
+            if said:
+                print(f"{view.name}: {said}")
+    cl.finish(failed)
+
+
+if __name__ == "__main__":
+    main()
