@@ -7,15 +7,16 @@ Choices between methods are made on this set; what is trained must never see its
 generate_scenes.py refuses. Every view is a scene of its own seed, or a second look at one, 240 by 135 pixels:
 the whole frame, or a crop of a frame of 480 by 270.
 
-Writes <view>_<spp>spp.exr with all passes (half float) for every count of the ladder, where 4096 stands for
-Blender's defaults: adaptive, 4096 samples at most, noise threshold 0.01. Counts with further seeds add ..._n1.exr
-and ..._n2.exr. No two files share a sample. <view>_ref.exr (32-bit float, with clean guides and alpha) is the mean
-of independent adaptive renders, which stay in parts/: their differences tell how much noise is left. It is the mean of
-two first, of four with the rest of the ladder, and of eight at last.
+Writes <view>_<spp>spp.exr with all passes (half float) for every count of the ladder; counts with further seeds
+add ..._n1.exr and ..._n2.exr. <view>_ref.exr (32-bit float, with alpha and clean guides) is the mean of independent
+renders. Blender's defaults, adaptive with 4096 samples at most and a noise threshold of 0.01, are a pair of
+their own, <view>_adaptive_4096spp.exr and <view>_adaptive_ref.exr, as that frame is clean enough to serve the other
+reference: no frame shares a sample with its own. What references are made of stays in parts/.
 
-manifest.csv (scene,noisy,reference,spp) lists what is there with its reference; views.csv lists every file with
-its seeds, processor seconds, the reference's own noise as RelMSE, and SHA-256. What is listed and there is not
-rendered again. All views get 4, 64 and 4096 samples and a reference before any gets the rest.
+manifest.csv (scene,noisy,reference,spp) lists every frame that has its reference; views.csv lists every file with
+its seeds, processor seconds, the noise that is left in a reference as RelMSE, and SHA-256. What is listed and
+there is not rendered again. The first dozen views, each of another kind, come first with 4 and 64 samples, a
+reference of up to 1024, and the defaults; then the other views and all of the ladder; then more parts for all.
 """
 
 import argparse
@@ -41,12 +42,15 @@ from demc_scenes.assets import Library
 _SIZE = (240, 135)
 _PANORAMA = (240, 120)
 _LARGE = (480, 270)
-_FIRST = ((4, 0), (64, 0), (rendering.DEFAULT_SAMPLES, 0))  # (samples, noise seed)
+_DOZEN = 12
+# (samples, noise seed), in the order in which they come.
+_FIRST = ((4, 0), (64, 0))
+_DEFAULTS = (rendering.DEFAULT_SAMPLES, 0)
 _THEN = ((1, 0), (2, 0), (8, 0), (16, 0), (256, 0), (4, 1), (4, 2), (64, 1), (64, 2))
+_LADDER = _FIRST + _THEN
 # A part of a reference: adaptive, with enough samples first that stopping early has no say in the mean.
-_PART_NOISE, _PART_LEAST, _PART_MOST = 0.007, 64, 1024
-# What comes in which order: noisy frames, and the parts whose mean is the reference by then.
-_STEPS = ((_FIRST, "ab"), (_THEN, "abcd"), ((), "abcdefgh"))
+_PART_NOISE, _PART_LEAST, _PART_MOST = 0.007, 64, 512
+_DEFAULTS_WEIGHT = 4  # of the render at Blender's defaults beside a part: it has up to eight times the samples
 
 
 class View:
@@ -56,9 +60,13 @@ class View:
         self.kind, self.seed, self.camera, self.crop, self.box = kind, making.DEVELOPMENT_SEEDS[seed], camera, crop, box
         self.name = f"dev{seed:02d}_{kind}" + (f"_{camera}" if camera else "")
         self.reference = names.reference_name(self.name)
+        self.adaptive = f"{self.name}_adaptive"
+        self.adaptive_reference = names.reference_name(self.adaptive)
+        self.frame = _LARGE if crop else _PANORAMA if kind == "panorama" else _SIZE
+        self.filter = "box" if box else "blackman-harris"
 
     def noisy(self, spp, seed):
-        plain = names.noisy_name(self.name, spp)
+        plain = names.noisy_name(self.adaptive if (spp, seed) == _DEFAULTS else self.name, spp)
         return plain if seed == 0 else plain.replace(".exr", f"_n{seed}.exr")
 
     def part(self, which):
@@ -107,24 +115,23 @@ def parse(arguments):
 class Table(Ledger):
     """The set's views.csv, and the manifest.csv that follows from it."""
 
-    def joined(self, view):
-        """Which parts a view's reference is the mean of."""
-        return "" if self.missing(view.reference) else self.rows()[view.reference]["noise_seed"]
-
     def record(self, view, file, spp, noise_seed, seconds, noise=""):
-        frame = "x".join(map(str, _LARGE if view.crop else _PANORAMA if view.kind == "panorama" else _SIZE))
-        self.add(view=view.name, kind=view.kind, seed=view.seed, camera=view.camera, frame=frame,
-                 filter="box" if view.box else "blackman-harris", file=file, spp=spp, noise_seed=noise_seed,
-                 seconds=f"{seconds:.1f}", noise=noise)
+        self.add(view=view.name, kind=view.kind, seed=view.seed, camera=view.camera, frame="{}x{}".format(*view.frame),
+                 filter=view.filter, file=file, spp=spp, noise_seed=noise_seed, seconds=f"{seconds:.1f}", noise=noise)
         self._write_manifest()
+
+    def sources(self, file):
+        """What a reference is the mean of, empty where there is none."""
+        return "" if self.missing(file) else self.rows()[file]["noise_seed"]
 
     def _write_manifest(self):
         listed = set(self.rows())
         rows = [["scene", "noisy", "reference", "spp"]]
         for view in VIEWS:
-            for spp, seed in sorted(_FIRST + _THEN, key=lambda entry: entry[::-1]):
-                if {view.noisy(spp, seed), view.reference} <= listed:
-                    rows.append([view.name if seed == 0 else f"{view.name}_n{seed}", view.noisy(spp, seed), view.reference, spp])
+            pairs = [(view.name if seed == 0 else f"{view.name}_n{seed}", view.noisy(spp, seed), view.reference, spp)
+                     for spp, seed in sorted(_LADDER, key=lambda entry: entry[::-1])]
+            pairs.append((view.adaptive, view.noisy(*_DEFAULTS), view.adaptive_reference, _DEFAULTS[0]))
+            rows += [pair for pair in pairs if {pair[1], pair[2]} <= listed]
         partial = os.path.join(self.folder, "manifest.tmp")
         with open(partial, "w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
@@ -181,43 +188,59 @@ class Studio:
         return channels, seconds
 
 
-def join_parts(folder, view, parts):
-    """Writes the reference, the mean of its parts; returns the RelMSE that its own noise adds to any score, which is
-    the variance of that mean, from how the parts differ."""
-    read = [exr.read(os.path.join(folder, view.part(which))) for which in parts]
-    mean = {name: np.mean([part[name] for part in read], 0) for name in read[0]}
-    exr.write_float(os.path.join(folder, view.reference), mean)
+def join(table, view, parts):
+    """Writes a view's references from the parts that are there, and from the render at Blender's defaults where it
+    is: that one goes into the reference of the others alone."""
+    read = lambda file: exr.read(os.path.join(table.folder, file))
+    images, rows = [read(view.part(which)) for which in parts], table.rows()
+    seconds = sum(float(rows[view.part(which)]["seconds"]) for which in parts)
+    mean = {name: np.mean([image[name] for image in images], 0) for name in images[0]}
     color = [name for name in mean if name.endswith(("Combined.R", "Combined.G", "Combined.B"))]
-    variance = {name: np.var([part[name] for part in read], 0, ddof=1) / len(read) for name in color}
-    return float(np.mean([variance[name] / (mean[name] ** 2 + 0.001) for name in color]))
+    # The variance of the mean, from how its parts differ.
+    variance = {name: np.var([image[name] for image in images], 0, ddof=1) / len(images) for name in color}
+    defaults = view.noisy(*_DEFAULTS)
+    store(table, view, view.adaptive_reference, parts, mean, variance, seconds)
+    if table.missing(defaults):
+        store(table, view, view.reference, parts, mean, variance, seconds)
+        return
+    defaults_image, share = read(defaults), len(parts) / (len(parts) + _DEFAULTS_WEIGHT)
+    both = {name: share * plane + (1 - share) * defaults_image[name].astype("f4") for name, plane in mean.items()}
+    # The defaults' own variance is what they differ by from the mean of the parts, beyond what that varies by.
+    beyond = {name: (mean[name] - defaults_image[name].astype("f4")) ** 2 - variance[name] for name in color}
+    variance = {name: share ** 2 * variance[name] + (1 - share) ** 2 * beyond[name] for name in color}
+    store(table, view, view.reference, parts + "+", both, variance, seconds + float(rows[defaults]["seconds"]))
 
 
-def render_view(options, library, table, view, ladder, parts):
-    """Renders what a view lacks of a ladder and of its reference's parts; returns the words of its line, None where
+def store(table, view, file, sources, image, variance, seconds):
+    """Writes a reference; its noise is the RelMSE that its variance adds to any score."""
+    exr.write_float(os.path.join(table.folder, file), image)
+    noise = np.mean([variance[name] / (image[name] ** 2 + 0.001) for name in variance])
+    table.record(view, file, len(sources) * _PART_MOST, sources, seconds, f"{noise:.3g}")
+
+
+def render_view(options, library, table, view, frames, parts):
+    """Renders what a view lacks of frames and of its reference's parts; returns the words of its line, None where
     nothing is missing."""
     if options.spp:
-        ladder, parts = [entry for entry in ladder if entry[0] in options.spp], ""
-    noisy = [entry for entry in ladder if table.missing(view.noisy(*entry))]
+        frames, parts = [entry for entry in frames if entry[0] in options.spp], ""
+    frames = [entry for entry in frames if table.missing(view.noisy(*entry))]
     lacking = [which for which in parts if table.missing(view.part(which))]
-    unjoined = len(table.joined(view)) < len(parts)
-    if not (noisy or lacking or unjoined):
-        return None
     start = time.process_time()
-    if noisy or lacking:
+    if frames or lacking:
         with Edits() as edits:
             studio = Studio(options, library, view, edits)
-            for entry in noisy:
+            for entry in frames:
                 table.record(view, view.noisy(*entry), *entry, studio.noisy(*entry))
             for which in lacking:
                 table.record(view, view.part(which), _PART_MOST, which, studio.part(which))
-    said = f"{len(noisy)} frames, {len(lacking)} parts of the reference in {time.process_time() - start:.0f} processor seconds"
-    if not unjoined:
-        return said
-    noise = join_parts(options.out, view, parts)
-    rows = table.rows()
-    seconds = sum(float(rows[view.part(which)]["seconds"]) for which in parts)
-    table.record(view, view.reference, len(parts) * _PART_MOST, parts, seconds, f"{noise:.3g}")
-    return f"{said}, noise left {noise:.3g}"
+    wanted = parts if table.missing(view.noisy(*_DEFAULTS)) else parts + "+"
+    unjoined = parts and len(table.sources(view.reference)) < len(wanted)
+    if unjoined:
+        join(table, view, parts)
+    if not (frames or lacking or unjoined):
+        return None
+    seconds = time.process_time() - start
+    return f"{len(frames)} frames, {len(lacking)} parts in {seconds:.0f} processor seconds, reference of {table.sources(view.reference) or 'nothing yet'}"
 
 
 def main():
@@ -230,12 +253,15 @@ def main():
     cl.quiet_stdout()
     logging.disable(logging.INFO)  # the glTF importer tells every step
     cl.make_folder(os.path.join(options.out, "parts"))
-    cl.end_at_once(lambda: None)
+    cl.end_at_once(lambda: None)  # a frame is whole or not there: nothing to tidy
     library, table, failed = Library(options.assets), Table(options.out), 0
-    for ladder, parts in _STEPS:
-        for view in options.views:
+    dozen, others = options.views[:_DOZEN], options.views[_DOZEN:]
+    steps = ((dozen, _FIRST, "ab"), (dozen, (_DEFAULTS,), "ab"), (others, _FIRST, "ab"), (options.views, _THEN, "ab"),
+             (others, (_DEFAULTS,), "ab"), (options.views, (), "abcd"), (options.views, (), "abcdefgh"))
+    for views, frames, parts in steps:
+        for view in views:
             try:
-                said = render_view(options, library, table, view, ladder, parts)
+                said = render_view(options, library, table, view, frames, parts)
             except Exception as error:  # one bad view must not stop a night of rendering
                 failed += 1
                 said = f"failed, {cl.reason(error)}"
