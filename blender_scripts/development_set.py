@@ -2,6 +2,7 @@
 
     python development_set.py --out DIR --assets ASSETS             with bpy from PyPI
     python development_set.py --out DIR --check                     compares the files with their hashes
+    python development_set.py --out DIR --assets ASSETS --credits   says whose assets the views show
 
 Choices between methods are made on this set; what is trained must never see its scenes, whose seeds
 generate_scenes.py refuses. Every view is a scene of its own seed, or a second look at one, 240 by 135 pixels:
@@ -75,15 +76,16 @@ class View:
 
 # Many kinds first, so that a set that is under way serves already.
 VIEWS = (
-    View("print", 41), View("screens", 44, crop=True), View("embossed", 8, crop=True), View("glass", 6),
-    View("cutout", 12), View("glints", 41), View("foliage", 41), View("backdrop", 52),
-    View("sunlit", 2, crop=True), View("hair", 51), View("beams", 62), View("pool", 40),
-    View("room", 1), View("stars", 61), View("bokeh", 43), View("manylights", 14, crop=True),
-    View("street", 17), View("skin", 20, crop=True), View("materials", 21), View("panorama", 43),
-    View("outdoor", 23), View("fog", 19), View("print", 43, crop=True, box=True), View("screens", 27),
-    View("cutout", 42), View("relief", 50, crop=True), View("foliage", 43, box=True), View("backdrop", 54, crop=True),
-    View("glints", 11, crop=True), View("room", 26, crop=True), View("pool", 43, crop=True), View("beams", 56),
-    View("hair", 53, crop=True), View("glass", 6, 1, box=True), View("street", 17, 1, crop=True), View("stars", 58, crop=True),
+    View("print", 41), View("embossed", 8, crop=True), View("glass", 6), View("cutout", 12),
+    View("glints", 41), View("foliage", 41), View("backdrop", 52), View("pool", 40),
+    View("screens", 27), View("beams", 51), View("sunlit", 2, crop=True), View("hair", 51),
+    View("stars", 61), View("street", 17), View("materials", 21), View("skin", 20, crop=True),
+    View("panorama", 43), View("bokeh", 43), View("room", 1), View("print", 43, crop=True, box=True),
+    View("cutout", 42), View("fog", 19), View("outdoor", 23), View("foliage", 43, box=True),
+    View("backdrop", 54, crop=True), View("glints", 11, crop=True), View("pool", 43, crop=True), View("beams", 56),
+    View("glass", 6, 1, box=True), View("relief", 50, crop=True), View("stars", 58, crop=True), View("street", 17, 1, crop=True),
+    View("manylights", 14, crop=True), View("screens", 44, crop=True), View("room", 26, crop=True), View("beams", 71),
+    View("hair", 53, crop=True),
 )
 
 
@@ -98,6 +100,8 @@ def parse(arguments):
     parser.add_argument("--views", metavar="a,b", help="these views only (default: all)")
     parser.add_argument("--spp", type=cl.counts, metavar="N[,N]", help="these sample counts only and no references, for a first look")
     parser.add_argument("--check", action="store_true", help="render nothing, compare files with their hashes")
+    parser.add_argument("--credits", action="store_true",
+                        help="render nothing, write credits.csv: each asset with its author, licence and views")
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     options = parser.parse_args(arguments)
     known = {view.name: view for view in VIEWS}
@@ -243,6 +247,19 @@ def render_view(options, library, table, view, frames, parts):
     return f"{len(frames)} frames, {len(lacking)} parts in {seconds:.0f} processor seconds, reference of {table.sources(view.reference) or 'nothing yet'}"
 
 
+def write_credits(options, library):
+    """Builds every view and writes credits.csv (asset,author,licence,views) from the indices of the assets' folders."""
+    shown = {}
+    for view in options.views:
+        stage, _ = making.build(library, view.seed, view.kind, {})
+        for credit in {*map(library.credit, stage.files())} - {None}:
+            shown.setdefault(credit, []).append(view.name)
+    with open(os.path.join(options.out, "credits.csv"), "w", encoding="utf-8", newline="") as file:
+        rows = [(*credit, " ".join(names_)) for credit, names_ in sorted(shown.items())]
+        csv.writer(file, lineterminator="\n").writerows([("asset", "author", "licence", "views"), *rows])
+    print(f"{len(shown)} assets in {len(options.views)} views")
+
+
 def main():
     """Entry point of the script."""
     options = parse(cl.script_arguments())
@@ -255,6 +272,9 @@ def main():
     cl.make_folder(os.path.join(options.out, "parts"))
     cl.end_at_once(lambda: None)  # a frame is whole or not there: nothing to tidy
     library, table, failed = Library(options.assets), Table(options.out), 0
+    if options.credits:
+        write_credits(options, library)
+        return
     dozen, others = options.views[:_DOZEN], options.views[_DOZEN:]
     steps = ((dozen, _FIRST, "ab"), (dozen, (_DEFAULTS,), "ab"), (others, _FIRST, "ab"), (options.views, _THEN, "ab"),
              (others, (_DEFAULTS,), "ab"), (options.views, (), "abcd"), (options.views, (), "abcdefgh"))

@@ -42,7 +42,7 @@ from demc_scenes.kinds import KINDS
 
 _LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
 _LEAST_CLEAN = 512  # of a pixel in a clean one
-_CLEAN_RATIO = 8  # a denoised reference teaches nothing about frames of a larger part of its samples than one in this
+_CLEAN_RATIO = 8  # frames of more than one in so many of its samples, a denoised reference is too coarse for
 _DROPPED = (".Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
@@ -90,7 +90,7 @@ def parse(arguments):
                              "64 to 128 samples then serve as well as many more")
     parser.add_argument("--clean-share", type=float, default=0.0, metavar="F",
                         help=f"share of scenes whose references have at least {_LEAST_CLEAN} samples everywhere and are not denoised. Only "
-                             f"these get noisy crops of more than a {_CLEAN_RATIO}th of the samples that a reference has beside --denoise-references (default 0)")
+                             f"these get noisy crops, and means, of more than an {_CLEAN_RATIO}th of --ref-spp beside --denoise-references (default 0)")
     parser.add_argument("--clean-spp", type=cl.positive, default=2048, metavar="N", help="samples of such references, at most (default 2048)")
     parser.add_argument("--clean-noise", type=float, default=0.005, metavar="T", help="and their noise threshold (default 0.005)")
     parser.add_argument("--guides-only", action="store_true",
@@ -166,7 +166,7 @@ class Crop:
 
     def _counts(self, options):
         counts = options.spp
-        most = options.ref_spp // _CLEAN_RATIO
+        most = options.ref_spp // _CLEAN_RATIO // (options.noisy_seeds if options.means else 1)
         if options.clean_share and options.denoise_references and not self.clean:
             counts = [spp for spp in counts if spp <= most] or [min(counts)]
         rng = random.Random(f"counts {self.name}")

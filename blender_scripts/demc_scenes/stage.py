@@ -65,6 +65,11 @@ class Stage:
             self.scene.collection.objects.link(copy)
         return Group(copies)
 
+    def files(self):
+        """The files of everything that was put into the scene: models, textures, environments, pictures."""
+        images = [bpy.path.abspath(image.filepath) for image in bpy.data.images if image.source == "FILE" and image.filepath]
+        return sorted({*self._imported, *images})
+
     def _vary_materials(self, meshes):
         """Now and then a part of a model gets another material, or another gloss."""
         rng = self.rng
