@@ -53,10 +53,15 @@ def parse(arguments):
         epilog=f"Kinds: {', '.join(KINDS)}, and with --blend the names of its scenes.")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pairs")
     parser.add_argument("--seeds", type=cl.seed_range, metavar="A:B", help="scenes A to B-1")
-    parser.add_argument("--check", action="store_true", help="render nothing, compare files with their hashes")
-    parser.add_argument("--development-seeds", action="store_true",
-                        help=f"allow the seeds {_span(making.DEVELOPMENT_SEEDS)}, of which development_set.py makes what "
-                             "trained models are judged on: never train on these pairs")
+    parser.add_argument(
+        "--check", action="store_true", help="render nothing, compare files with their hashes"
+    )
+    parser.add_argument(
+        "--development-seeds",
+        action="store_true",
+        help=f"allow the seeds {_span(making.DEVELOPMENT_SEEDS)}, of which development_set.py makes what "
+        "trained models are judged on: never train on these pairs",
+    )
     parser.add_argument("--assets", action="append", default=[], metavar="DIR",
                         help="models, textures, HDRIs and pictures to furnish with; may be repeated")
     parser.add_argument("--blend", metavar="DIR", help="also render random views of the .blend scenes below DIR")
@@ -67,32 +72,67 @@ def parse(arguments):
                         help="crops of N by N pixels, or of N by M (default 128)")
     parser.add_argument("--crops", type=cl.positive, default=1, metavar="N", help="crops per scene (default 1)")
     parser.add_argument("--spp", type=cl.counts, default=[4], metavar="N[,N]", help="samples of the noisy crops (default 4)")
-    parser.add_argument("--draw-spp", type=cl.positive, metavar="N",
-                        help="only N of the --spp counts for each crop, spread over them (default: all)")
-    parser.add_argument("--adaptive-share", type=float, default=0.0, metavar="F",
-                        help=f"a share of the crops is also rendered at Blender's defaults, {rendering.DEFAULT_SAMPLES} samples and a "
-                             f"noise threshold of {rendering.DEFAULT_NOISE} (default 0)")
+    parser.add_argument(
+        "--draw-spp",
+        type=cl.positive,
+        metavar="N",
+        help="only N of the --spp counts for each crop, spread over them (default: all)",
+    )
+    parser.add_argument(
+        "--adaptive-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help=f"a share of the crops is also rendered at Blender's defaults: {rendering.DEFAULT_SAMPLES} "
+        f"samples and a noise threshold of {rendering.DEFAULT_NOISE} (default 0)",
+    )
     parser.add_argument("--also-spp", type=cl.counts, default=[], metavar="N[,N]",
                         help="a share of the crops is also rendered with one of these sample counts")
     parser.add_argument("--also-share", type=float, default=0.25, metavar="F", help="that share (default 0.25)")
     parser.add_argument("--noisy-seeds", type=cl.positive, default=1, metavar="N",
                         help="noisy renders of each crop and sample count (default 1)")
-    parser.add_argument("--means", action="store_true",
-                        help="also the mean of a crop's noisy renders of one sample count, as a frame of so many times more "
-                             "samples that costs nothing")
-    parser.add_argument("--filter-share", type=float, default=0.0, metavar="F",
-                        help="share of crops with another pixel filter than Blender's default, mostly a box of one pixel (default 0)")
+    parser.add_argument(
+        "--means",
+        action="store_true",
+        help="also the mean of a crop's noisy renders of one sample count, as a frame of so many times more "
+        "samples that costs nothing",
+    )
+    parser.add_argument(
+        "--filter-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="share of crops with a pixel filter that is not Blender's default, half of them a box",
+    )
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
     parser.add_argument("--ref-noise", type=float, default=0.01, metavar="T",
                         help="references stop early below this noise threshold, 0 for never (default 0.01)")
     parser.add_argument("--denoise-references", action="store_true",
                         help="clean the references' last noise with Blender's own denoiser, guides denoised first: "
                              "64 to 128 samples then serve as well as many more")
-    parser.add_argument("--clean-share", type=float, default=0.0, metavar="F",
-                        help=f"share of scenes whose references have at least {_LEAST_CLEAN} samples everywhere and are not denoised. Only "
-                             f"these get noisy crops, and means, of more than an {_CLEAN_RATIO}th of --ref-spp beside --denoise-references (default 0)")
-    parser.add_argument("--clean-spp", type=cl.positive, default=2048, metavar="N", help="samples of such references, at most (default 2048)")
-    parser.add_argument("--clean-noise", type=float, default=0.005, metavar="T", help="and their noise threshold (default 0.005)")
+    parser.add_argument(
+        "--clean-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help=f"share of scenes whose references have at least {_LEAST_CLEAN} samples everywhere and are not "
+        f"denoised. Beside --denoise-references, only these get frames and means of more than an "
+        f"{_CLEAN_RATIO}th of --ref-spp (default 0)",
+    )
+    parser.add_argument(
+        "--clean-spp",
+        type=cl.positive,
+        default=2048,
+        metavar="N",
+        help="samples of such references, at most (default 2048)",
+    )
+    parser.add_argument(
+        "--clean-noise",
+        type=float,
+        default=0.005,
+        metavar="T",
+        help="and their noise threshold (default 0.005)",
+    )
     parser.add_argument("--guides-only", action="store_true",
                         help="trace no light beyond the surface that guides are of, in two thirds of the time: pairs for a "
                              "prefilter (their Combined is of no use), whose references keep albedo and normal")
@@ -104,7 +144,9 @@ def parse(arguments):
     if options.seeds is None:
         parser.error("--seeds is missing: which scenes to make, for example 0:100")
     if not options.development_seeds and _overlap(options.seeds, making.DEVELOPMENT_SEEDS):
-        parser.error(f"the seeds {_span(making.DEVELOPMENT_SEEDS)} are kept for judging what was trained: take others")
+        parser.error(
+            f"the seeds {_span(making.DEVELOPMENT_SEEDS)} are kept for judging what was trained: take others"
+        )
     if options.clean_share and not options.clean_spp > _LEAST_CLEAN:
         parser.error(f"--clean-spp must be above {_LEAST_CLEAN}, which every pixel gets")
     for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
@@ -157,11 +199,20 @@ class Crop:
         self.counts = self._counts(options)
         rng = random.Random(f"adaptive {name}")
         # Where the reference is denoised, a frame that is cleaner than it has nothing to aim at.
-        self.adaptive = rng.random() < options.adaptive_share and (self.clean or not options.denoise_references)
+        self.adaptive = rng.random() < options.adaptive_share and (
+            self.clean or not options.denoise_references
+        )
         rng = random.Random(f"filter {name}")
         self.filter = None
         if rng.random() < options.filter_share:
-            self.filter = rng.choice((("BOX", 1.0), ("BOX", 1.0), ("BLACKMAN_HARRIS", round(rng.uniform(0.8, 2.5), 2)), ("GAUSSIAN", 1.5)))
+            self.filter = rng.choice(
+                (
+                    ("BOX", 1.0),
+                    ("BOX", 1.0),
+                    ("BLACKMAN_HARRIS", round(rng.uniform(0.8, 2.5), 2)),
+                    ("GAUSSIAN", 1.5),
+                )
+            )
         self.seeds, self.means = options.noisy_seeds, options.means and options.noisy_seeds > 1
 
     def _counts(self, options):
@@ -254,8 +305,8 @@ class Records:
 
 
 def render_crop(options, ledger, scene, region, crop, facts):
-    """Renders a crop: noisy images with all passes, their means, then the reference with its guides; where it is
-    denoised, also the Noisy Image that it was denoised from. `facts` are what the ledger tells of it besides."""
+    """Renders a crop: noisy images with all passes, their means, then the reference with its guides; where it
+    is denoised, also the Noisy Image that it was denoised from. `facts` are what the ledger tells of it too."""
     layers = [layer for layer in scene.view_layers if layer.use][:1]
     facts = facts | {"view": crop.name, "frame": "{}x{}+{}+{}".format(*region[2:], *region[:2])}
     with Edits() as edits:
@@ -267,19 +318,27 @@ def render_crop(options, ledger, scene, region, crop, facts):
         if crop.filter:
             edits.set(scene.cycles, "pixel_filter_type", crop.filter[0])
             edits.set(scene.cycles, "filter_width", crop.filter[1])
-        facts["filter"] = f"{scene.cycles.pixel_filter_type.lower().replace('_', '-')} {scene.cycles.filter_width:.2f}"
+        facts["filter"] = (
+            f"{scene.cycles.pixel_filter_type.lower().replace('_', '-')} {scene.cycles.filter_width:.2f}"
+        )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             rendering.enable_passes(passes, layers)
             store_position(passes, layers)
             for file, spp, n in crop.noisy():
                 noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0
-                rendering.set_sampling(passes, scene, spp, rendering.mixed_seed(crop.seed, crop.name, spp, n), noise)
+                rendering.set_sampling(
+                    passes, scene, spp, rendering.mixed_seed(crop.seed, crop.name, spp, n), noise
+                )
                 seconds = render_compact(scene, os.path.join(options.out, file))
                 ledger.add(file=file, spp=spp, noise_seed=n, seconds=f"{seconds:.1f}", **facts)
         for spp in crop.counts[0] if crop.means else []:
-            write_mean(options.out, crop.mean_of(spp), [file for file, count, _ in crop.noisy() if count == spp])
-            ledger.add(file=crop.mean_of(spp), spp=spp * crop.seeds, noise_seed="mean", seconds="0.0", **facts)
+            write_mean(
+                options.out, crop.mean_of(spp), [file for file, count, _ in crop.noisy() if count == spp]
+            )
+            ledger.add(
+                file=crop.mean_of(spp), spp=spp * crop.seeds, noise_seed="mean", seconds="0.0", **facts
+            )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             for layer in layers:
@@ -289,15 +348,28 @@ def render_crop(options, ledger, scene, region, crop, facts):
             if crop.clean:
                 rendering.set_sampling(passes, scene, spp, seed, options.clean_noise, _LEAST_CLEAN)
             else:
-                rendering.set_sampling(passes, scene, spp, seed, options.ref_noise, _LEAST_SAMPLES if options.denoise_references else 0)
+                rendering.set_sampling(
+                    passes,
+                    scene,
+                    spp,
+                    seed,
+                    options.ref_noise,
+                    _LEAST_SAMPLES if options.denoise_references else 0,
+                )
                 if options.denoise_references:
                     rendering.denoise(passes, scene, layers)
             seconds = render_compact(scene, os.path.join(options.out, crop.reference))
-            ledger.add(file=crop.reference, spp=spp, noise_seed="clean" if crop.clean else "reference", seconds=f"{seconds:.1f}", **facts)
+            ledger.add(
+                file=crop.reference,
+                spp=spp,
+                noise_seed="clean" if crop.clean else "reference",
+                seconds=f"{seconds:.1f}",
+                **facts,
+            )
 
 
 def render_compact(scene, path):
-    """Renders, drops what no network reads, and stores the rest as half in one part; returns the processor seconds."""
+    """Renders, drops what no network reads, stores the rest as half in one part; returns processor seconds."""
     partial = f"{path}.render.tmp"
     start = time.process_time()
     rendering.render_to(scene, partial)
@@ -311,7 +383,10 @@ def render_compact(scene, path):
 def write_mean(folder, name, files):
     """Writes the mean of several renders, of the guides too."""
     frames = [exr.read(os.path.join(folder, file)) for file in files]
-    exr.write_half(os.path.join(folder, name), {c: sum(frame[c].astype("f4") for frame in frames) / len(frames) for c in frames[0]})
+    exr.write_half(
+        os.path.join(folder, name),
+        {c: sum(frame[c].astype("f4") for frame in frames) / len(frames) for c in frames[0]},
+    )
 
 
 def render_scene(options, library, records, ledger, seed, kind, scene_name):

@@ -1,7 +1,7 @@
 """The table of what was rendered into a folder: one row a file, with its seeds, its cost and its SHA-256.
 
-A file counts as done once its row is there, which is written last: a killed run leaves at most a file without a row,
-and the next run makes it again.
+A file counts as done once its row is there, which is written last: a killed run leaves at most a file
+without a row, and the next run makes it again.
 """
 
 import csv
@@ -9,11 +9,24 @@ import hashlib
 import os
 
 NAME = "views.csv"
-COLUMNS = ("view", "kind", "seed", "camera", "frame", "filter", "file", "spp", "noise_seed", "seconds", "noise", "sha256")
+COLUMNS = (
+    "view",
+    "kind",
+    "seed",
+    "camera",
+    "frame",
+    "filter",
+    "file",
+    "spp",
+    "noise_seed",
+    "seconds",
+    "noise",
+    "sha256",
+)
 
 
 class Ledger:
-    """The folder's table. `seconds` are those of all processors together; `noise` is what is left in a reference."""
+    """The folder's table. `seconds` are those of all processors together, `noise` is a reference's own."""
 
     def __init__(self, folder):
         self.folder, self.path = folder, os.path.join(folder, NAME)
@@ -37,12 +50,16 @@ class Ledger:
             file.write(("" if file.tell() else ",".join(COLUMNS) + "\n") + line)
 
     def check(self):
-        """Compares the files with their hashes; prints a line for each that is missing or differs, and returns how
-        many those are."""
+        """Compares the files with their hashes; prints a line for each that is missing or differs, and
+        returns how many those are."""
         rows, bad = self.rows(), 0
         for name, row in rows.items():
             path = os.path.join(self.folder, name)
-            wrong = "is missing" if not os.path.exists(path) else f"is not what {NAME} lists" if _sha256(path) != row["sha256"] else ""
+            wrong = (
+                "is missing"
+                if not os.path.exists(path)
+                else f"is not what {NAME} lists" if _sha256(path) != row["sha256"] else ""
+            )
             if wrong:
                 bad += 1
                 print(f"{path}: {wrong}; delete it and render again")

@@ -18,9 +18,16 @@ def shown(stage, picture_share=0.5):
 def monitor(stage, at, turn, width):
     """A screen in its frame, on a foot; it shows a picture or a program."""
     rng = stage.rng
-    height, bar, foot = width * rng.uniform(0.5, 0.7), width * rng.uniform(0.01, 0.04), width * rng.uniform(0.05, 0.25)
-    body = [((width + 2 * bar, 0.02, height + 2 * bar), (0, 0.015, foot + height / 2)), ((width * 0.4, 0.12, 0.01), (0, 0.03, 0.005)),
-            ((width * 0.08, 0.02, foot), (0, 0.04, foot / 2))]
+    height, bar, foot = (
+        width * rng.uniform(0.5, 0.7),
+        width * rng.uniform(0.01, 0.04),
+        width * rng.uniform(0.05, 0.25),
+    )
+    body = [
+        ((width + 2 * bar, 0.02, height + 2 * bar), (0, 0.015, foot + height / 2)),
+        ((width * 0.4, 0.12, 0.01), (0, 0.03, 0.005)),
+        ((width * 0.08, 0.02, foot), (0, 0.04, foot / 2)),
+    ]
     stage.add(shapes.boxes(body, 0.003), m.plastic(rng), at, turn)
     pane = shapes.plane(width, height, unit_uv=True)
     pane.location = (0, 0.003, foot)
@@ -39,7 +46,12 @@ def sign(stage, at, turn):
     size = rng.uniform(0.1, 0.3)
     board = shapes.box((size * 3.4, 0.02, size * 1.4), 0.003, (size * 1.2, 0.03, size * 0.35))
     stage.add(board, palette.choose(rng, stage.library, "metal"), at, turn)
-    stage.add(shapes.text(words, size, 0.01), m.light(rng, rng.uniform(2, 20), m.color(rng, (0.4, 1.0), (0.8, 1.0))), at, turn)
+    stage.add(
+        shapes.text(words, size, 0.01),
+        m.light(rng, rng.uniform(2, 20), m.color(rng, (0.4, 1.0), (0.8, 1.0))),
+        at,
+        turn,
+    )
 
 
 def strip(stage, start, end):
@@ -72,7 +84,13 @@ def desk(stage):
         at = (rng.uniform(-0.9, 0.9), rng.uniform(-0.2, 0.5), 0)
         if lamps and rng.random() < 0.4:
             group = stage.model(rng.choice(lamps)).place(at, rng.uniform(0, 6.28))
-            stage.lamp("POINT", (at[0], at[1] - 0.02, group.size.z * 0.8), rng.uniform(1, 10), (1, 0.75, 0.5), shadow_soft_size=0.03)
+            stage.lamp(
+                "POINT",
+                (at[0], at[1] - 0.02, group.size.z * 0.8),
+                rng.uniform(1, 10),
+                (1, 0.75, 0.5),
+                shadow_soft_size=0.03,
+            )
         elif rng.random() < 0.5:
             props.candle(stage, at)
         else:  # a bare bulb in a glass
@@ -104,7 +122,9 @@ def starry(stage, level):
         power = n.math("POWER", cells.outputs["Color"], rng.uniform(8, 25))
         star = n.math("MULTIPLY", n.math("MULTIPLY", disc, power), bright * 40)
         total = star if total is None else n.math("ADD", total, star)
-    band = n.ramp(n.noise(direction, rng.uniform(1.5, 4), 8, 0.6), (0.45, 0.0), (0.75, rng.uniform(0.01, 0.5)))
+    band = n.ramp(
+        n.noise(direction, rng.uniform(1.5, 4), 8, 0.6), (0.45, 0.0), (0.75, rng.uniform(0.01, 0.5))
+    )
     haze = n.mix(band, m.color(rng, (0.3, 0.8), (0.0, 0.02)), m.color(rng, (0.0, 0.4), (0.02, 0.08)))
     n.set(background.inputs["Color"], n.mix(1.0, haze, total, "ADD"))
     background.inputs["Strength"].default_value = level
@@ -116,7 +136,13 @@ def night_sky(stage):
     if rng.random() < 0.5:
         outside.planted(stage)
         for target in rng.sample(stage.interest, min(len(stage.interest), 3)):
-            stage.lamp("POINT", Vector(target) + Vector((0, 0, rng.uniform(0.3, 1.5))), rng.uniform(5, 80), (1, 0.65, 0.35), shadow_soft_size=0.05)
+            stage.lamp(
+                "POINT",
+                Vector(target) + Vector((0, 0, rng.uniform(0.3, 1.5))),
+                rng.uniform(5, 80),
+                (1, 0.65, 0.35),
+                shadow_soft_size=0.05,
+            )
         outside.sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(20, 60)))  # the moon
     else:
         rocks = lib.with_role("nature")
@@ -125,8 +151,25 @@ def night_sky(stage):
             if rocks and rng.random() < 0.4:
                 stage.model(rng.choice(rocks)).place(at, rng.uniform(0, 6.28), rng.uniform(0.2, 0.8))
             else:
-                make = rng.choice((lambda: shapes.sphere(rng.uniform(0.05, 0.6), 5), lambda: shapes.gem(rng, rng.uniform(0.1, 0.5)), lambda: shapes.torus(0.4, 0.03)))
-                stage.add(make(), rng.choice((lambda: palette.choose(rng, lib, "stone"), lambda: m.embossed(rng, 0.2), lambda: palette.anything(rng, lib)))(), at, rng.uniform(0, 6.28))
+                make = rng.choice(
+                    (
+                        lambda: shapes.sphere(rng.uniform(0.05, 0.6), 5),
+                        lambda: shapes.gem(rng, rng.uniform(0.1, 0.5)),
+                        lambda: shapes.torus(0.4, 0.03),
+                    )
+                )
+                stage.add(
+                    make(),
+                    rng.choice(
+                        (
+                            lambda: palette.choose(rng, lib, "stone"),
+                            lambda: m.embossed(rng, 0.2),
+                            lambda: palette.anything(rng, lib),
+                        )
+                    )(),
+                    at,
+                    rng.uniform(0, 6.28),
+                )
             stage.interest.append(at)
         outside.sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(5, 50)))
     starry(stage, rng.uniform(0.3, 1.5))

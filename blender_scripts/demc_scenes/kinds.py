@@ -98,13 +98,16 @@ def _fog(stage):
 
 def _around(build, radius, height, lens, spread):
     """Cameras on rings around what is worth looking at: (nearest, farthest), heights, lenses."""
+
     def kind(stage):
         build(stage)
 
         def camera():
             target = stage.rng.choice(stage.interest) if stage.interest else (0, 0, 0.1)
             return views.around_camera(stage, target, radius, height, lens, spread)
+
         return camera
+
     return kind
 
 
@@ -115,16 +118,25 @@ def _beams(stage):
     if way == "window":
         shell = rooms.room(stage, "day", sunlit=True)
         rooms.dim(stage, rng.uniform(0.05, 0.3))
-        outside.add_fog(stage, (shell.width + 1, shell.depth + 1, shell.height), (shell.width / 2, shell.depth / 2, shell.height / 2), rng.uniform(0.01, 0.08))
+        outside.add_fog(
+            stage,
+            (shell.width + 1, shell.depth + 1, shell.height),
+            (shell.width / 2, shell.depth / 2, shell.height / 2),
+            rng.uniform(0.01, 0.08),
+        )
         return lambda: views.room_camera(stage, shell)
     if way == "street":
         half = outside.street(stage, night=True)
         outside.add_fog(stage, (60, 24, 14), (0, 0, 7.01), rng.uniform(0.01, 0.05))
-        return lambda: views.around_camera(stage, (rng.uniform(-8, 8), rng.uniform(-half, half), 1.8), (5, 14), (0.0, 2.0), (20, 40), 1.0)
+        return lambda: views.around_camera(
+            stage, (rng.uniform(-8, 8), rng.uniform(-half, half), 1.8), (5, 14), (0.0, 2.0), (20, 40), 1.0
+        )
     outside.many_lights(stage)
     outside.add_fog(stage, (8, 6, 4), (0, -0.8, 2.0), rng.uniform(0.02, 0.12))
     outside.spots_in_fog(stage, rng.randint(2, 6), 1.6, 3.2, 5.0)
-    return lambda: views.around_camera(stage, rng.choice(stage.interest), (1.2, 3.2), (0.2, 1.4), (20, 40), 0.2)
+    return lambda: views.around_camera(
+        stage, rng.choice(stage.interest), (1.2, 3.2), (0.2, 1.4), (20, 40), 0.2
+    )
 
 
 def _cutout(stage):
@@ -142,14 +154,18 @@ def _cutout(stage):
                 outside.tree(stage, at, rng.uniform(1.2, 2.5))
             stage.interest.append(Vector(at) + Vector((0, 0, 0.4)))
         outside.sun(stage)
-        return lambda: views.around_camera(stage, rng.choice(stage.interest), (1.5, 4), (0.0, 0.8), (30, 60), 0.1)
+        return lambda: views.around_camera(
+            stage, rng.choice(stage.interest), (1.5, 4), (0.0, 0.8), (30, 60), 0.1
+        )
     return _table(rng.choice((studio.hair, studio.hair, studio.glass, studio.studio, studio.skin)))(stage)
 
 
 def _bokeh(stage):
     """A wide aperture close up: discs of light, and nearly nothing that is sharp."""
     stage.defocus = 1.0
-    return stage.rng.choice((_many_lights, _table(studio.studio), _table(studio.glass), _table(glowing.desk), _outdoor))(stage)
+    return stage.rng.choice(
+        (_many_lights, _table(studio.studio), _table(studio.glass), _table(glowing.desk), _outdoor)
+    )(stage)
 
 
 def _stars(stage):
@@ -160,7 +176,10 @@ def _stars(stage):
     def camera():
         rng = stage.rng
         above = Vector((0, 0, rng.uniform(0.3, 1.8)))  # the sky, with the land at its foot
-        return views.around_camera(stage, rng.choice(stage.interest) + above, (2, 7), (-1.2, 0.3), (24, 50), 0.3)
+        return views.around_camera(
+            stage, rng.choice(stage.interest) + above, (2, 7), (-1.2, 0.3), (24, 50), 0.3
+        )
+
     return camera
 
 
@@ -171,6 +190,7 @@ def _panorama(stage):
     def camera():
         found = place()
         return found and views.all_around(stage, found)
+
     return camera
 
 

@@ -55,8 +55,8 @@ def set_up(edits, stage, threads=None, finished=False, size=None):
 
 
 def look(edits, stage, place_camera, crops, size, finished=False):
-    """Places the camera where it sees enough and exposes the scene; returns the crops, X,Y,W,H each, or raises
-    Unseen where three tries find none. Without a size the whole frame is the crop."""
+    """Places the camera where it sees enough and exposes the scene; returns the crops, X,Y,W,H each, or
+    raises Unseen where three tries find none. Without a size the whole frame is the crop."""
     reason = "no place for a camera"
     for _ in range(3):
         camera = place_camera()

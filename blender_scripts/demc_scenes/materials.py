@@ -345,20 +345,35 @@ def glowing_picture(rng, source):
 
 
 def embossed(rng, size):
-    """One colour, all detail in the normal: scales, weave, bricks, hammering, letters; `size` metres a repeat."""
+    """One colour, all detail in the normal: scales, weave, bricks, hammering; `size` metres a repeat."""
     n = Nodes("embossed")
     way = rng.choice(("scales", "waves", "bricks", "hammered", "weave", "cracks"))
     if way == "bricks":
         brick = n.new("ShaderNodeTexBrick", offset=rng.choice((0.0, 0.5)))
         n.set(brick.inputs["Vector"], n.uv(size))
-        for name, value in (("Scale", 1.0), ("Mortar Size", 0.03), ("Mortar Smooth", 0.2), ("Brick Width", 0.8), ("Row Height", 0.4)):
+        for name, value in (
+            ("Scale", 1.0),
+            ("Mortar Size", 0.03),
+            ("Mortar Smooth", 0.2),
+            ("Brick Width", 0.8),
+            ("Row Height", 0.4),
+        ):
             n.set(brick.inputs[name], value)
         height = n.math("SUBTRACT", n.math("MULTIPLY", n.noise(n.uv(size), 12.0), 0.2), brick.outputs[1])
     elif way == "waves":
-        height = n.shader("ShaderNodeTexWave", Vector=n.uv(size, rng.uniform(0, 3.1)), Scale=1.0, Distortion=rng.uniform(0, 8), Detail=3.0)
+        height = n.shader(
+            "ShaderNodeTexWave",
+            Vector=n.uv(size, rng.uniform(0, 3.1)),
+            Scale=1.0,
+            Distortion=rng.uniform(0, 8),
+            Detail=3.0,
+        )
     elif way == "weave":
-        height = n.math("ADD", n.shader("ShaderNodeTexWave", Vector=n.uv(size), Scale=1.0),
-                        n.shader("ShaderNodeTexWave", Vector=n.uv(size, 1.5708), Scale=1.0))
+        height = n.math(
+            "ADD",
+            n.shader("ShaderNodeTexWave", Vector=n.uv(size), Scale=1.0),
+            n.shader("ShaderNodeTexWave", Vector=n.uv(size, 1.5708), Scale=1.0),
+        )
     elif way == "hammered":
         height = n.noise(n.place(size), 4.0, 6, 0.6)
     else:
@@ -367,8 +382,12 @@ def embossed(rng, size):
         n.set(cells.inputs["Scale"], 3.0)
         height = n.math("MULTIPLY", cells.outputs["Distance"], 1.0 if way == "scales" else 3.0, clamp=True)
     metal_ = rng.random() < 0.35
-    return n.principled(Base_Color=color(rng, (0.0, 0.6), (0.3, 0.95)), Metallic=float(metal_), Roughness=rng.uniform(0.05, 0.7),
-                        Normal=n.bump(height, rng.uniform(0.3, 1.0), size * rng.uniform(0.05, 0.3)))
+    return n.principled(
+        Base_Color=color(rng, (0.0, 0.6), (0.3, 0.95)),
+        Metallic=float(metal_),
+        Roughness=rng.uniform(0.05, 0.7),
+        Normal=n.bump(height, rng.uniform(0.3, 1.0), size * rng.uniform(0.05, 0.3)),
+    )
 
 
 def principled_of(material):
@@ -379,7 +398,9 @@ def principled_of(material):
 def image(n, source, vector, data=False):
     """An image texture node of a Blender image or of a file; images are shared by path."""
     node = n.new("ShaderNodeTexImage")
-    node.image = source if isinstance(source, bpy.types.Image) else bpy.data.images.load(source, check_existing=True)
+    node.image = (
+        source if isinstance(source, bpy.types.Image) else bpy.data.images.load(source, check_existing=True)
+    )
     if data:
         node.image.colorspace_settings.name = "Non-Color"
     n.set(node.inputs["Vector"], vector)

@@ -187,7 +187,9 @@ def thicket(stage):
     height = height_field(rng, rng.uniform(0.0, 0.4))
     land = stage.add(shapes.terrain(14, 90, height), palette.choose(rng, lib, "ground", 0.05))
     if rng.random() < 0.5:
-        lawn = stage.add(shapes.terrain(5, 40, height), palette.choose(rng, lib, "ground", 0.05), (0, 0, 0.01))
+        lawn = stage.add(
+            shapes.terrain(5, 40, height), palette.choose(rng, lib, "ground", 0.05), (0, 0, 0.01)
+        )
         meadow(stage, lawn, (10000, 30000), (0.1, 0.4))
     plants = lib.with_role("plant", largest=4)
     for _ in range(rng.randint(14, 34)):
@@ -198,7 +200,12 @@ def thicket(stage):
             group = stage.model(rng.choice(plants))
             group.place(at, rng.uniform(0, 6.28), rng.uniform(0.6, 1.6) / max(group.size))
         else:
-            bush(stage, (x, y, at[2] + rng.choice((0.0, 0.0, rng.uniform(0.2, 1.2)))), rng.uniform(0.3, 1.3), rng.random() < 0.4)
+            bush(
+                stage,
+                (x, y, at[2] + rng.choice((0.0, 0.0, rng.uniform(0.2, 1.2)))),
+                rng.uniform(0.3, 1.3),
+                rng.random() < 0.4,
+            )
         if r < 2.5:
             stage.interest.append(Vector(at) + Vector((0, 0, 0.4)))
     environment(stage, DAY, rng.uniform(0.4, 1.3), ("night", "moon"))
@@ -216,7 +223,14 @@ def meadow(stage, ground, blades, length):
     mix.inputs[0].default_value = 0.35
     n.set(mix.inputs[1], n.shader("ShaderNodeBsdfDiffuse", Color=shade))
     n.set(mix.inputs[2], n.shader("ShaderNodeBsdfTranslucent", Color=shade))
-    settings = grow(stage, ground, rng.randint(*blades), rng.uniform(*length), n.finish(mix.outputs[0]), rng.uniform(0, 0.4))
+    settings = grow(
+        stage,
+        ground,
+        rng.randint(*blades),
+        rng.uniform(*length),
+        n.finish(mix.outputs[0]),
+        rng.uniform(0, 0.4),
+    )
     settings.radius_scale = 0.009
 
 
@@ -273,11 +287,23 @@ def glints(stage):
         level = rng.uniform(0.02, 0.1)
         waves = [(rng.uniform(2, 40), rng.uniform(2, 40), rng.uniform(0, 6.28)) for _ in range(7)]
         # The steeper a wave is the shorter it is; all are far too small for a pixel to show one whole glint.
-        lake = shapes.terrain(12, 300, lambda x, y: sum(0.02 / (a + b) * math.sin(a * x + b * y + c) for a, b, c in waves))
-        stage.add(lake, m.Nodes("water").principled(Base_Color=(0.01, 0.03, 0.03), Roughness=rng.uniform(0.0, 0.1), IOR=1.33), (0, 0, level))
+        lake = shapes.terrain(
+            12, 300, lambda x, y: sum(0.02 / (a + b) * math.sin(a * x + b * y + c) for a, b, c in waves)
+        )
+        stage.add(
+            lake,
+            m.Nodes("water").principled(
+                Base_Color=(0.01, 0.03, 0.03), Roughness=rng.uniform(0.0, 0.1), IOR=1.33
+            ),
+            (0, 0, level),
+        )
         stage.add(shapes.terrain(40, 60, height_field(rng, 0.3)), palette.choose(rng, lib, "ground"))
     else:
-        ground = m.embossed(rng, rng.uniform(0.05, 0.3)) if way == "metal" else wet(stage, palette.choose(rng, lib, "road"))
+        ground = (
+            m.embossed(rng, rng.uniform(0.05, 0.3))
+            if way == "metal"
+            else wet(stage, palette.choose(rng, lib, "road"))
+        )
         stage.add(shapes.box((40, 40, 0.1), 0, (0, 0, -0.05)), ground)
     things = lib.with_role("vehicle", "figure", "building", smallest=0.4, largest=7)
     for _ in range(rng.randint(6, 16)):
@@ -285,9 +311,21 @@ def glints(stage):
         if things and rng.random() < 0.4:
             stage.model(rng.choice(things)).place(at, rng.uniform(0, 6.28))
         else:
-            make = rng.choice((lambda: shapes.sphere(rng.uniform(0.1, 0.5), 5), lambda: shapes.monkey(rng.uniform(0.4, 1.2)), lambda: shapes.torus(0.4, 0.1),
-                               lambda: shapes.gem(rng, 0.5), lambda: shapes.vessel(rng, rng.uniform(0.4, 1.2), 0.01)))
-            stage.add(make(), rng.choice((m.metal, m.metal, m.glass, m.plastic, lambda r: m.embossed(r, 0.1)))(rng), at, rng.uniform(0, 6.28))
+            make = rng.choice(
+                (
+                    lambda: shapes.sphere(rng.uniform(0.1, 0.5), 5),
+                    lambda: shapes.monkey(rng.uniform(0.4, 1.2)),
+                    lambda: shapes.torus(0.4, 0.1),
+                    lambda: shapes.gem(rng, 0.5),
+                    lambda: shapes.vessel(rng, rng.uniform(0.4, 1.2), 0.01),
+                )
+            )
+            stage.add(
+                make(),
+                rng.choice((m.metal, m.metal, m.glass, m.plastic, lambda r: m.embossed(r, 0.1)))(rng),
+                at,
+                rng.uniform(0, 6.28),
+            )
         stage.interest.append(Vector(at) + Vector((0, 0, 0.3)))
     environment(stage, DAY, rng.uniform(0.2, 0.8), ("night", "moon"))
     sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(4, 25)))
@@ -303,10 +341,15 @@ def backdrop(stage):
             group = stage.model(rng.choice(things)).place(at, rng.uniform(0, 6.28))
             stage.interest.append(Vector(at) + Vector((0, 0, group.size.z * rng.uniform(0.5, 1.0))))
         else:
-            stage.add(shapes.monkey(rng.uniform(0.5, 1.2)), palette.anything(rng, lib), at, rng.uniform(0, 6.28))
+            stage.add(
+                shapes.monkey(rng.uniform(0.5, 1.2)), palette.anything(rng, lib), at, rng.uniform(0, 6.28)
+            )
             stage.interest.append(Vector(at) + Vector((0, 0, 0.6)))
     if rng.random() < 0.5:
-        stage.add(shapes.box((6, 6, 0.1), 0.02, (0, 0, -0.05)), palette.choose(rng, lib, rng.choice(("floor", "road", "ground"))))
+        stage.add(
+            shapes.box((6, 6, 0.1), 0.02, (0, 0, -0.05)),
+            palette.choose(rng, lib, rng.choice(("floor", "road", "ground"))),
+        )
     environment(stage, ("",), rng.uniform(0.5, 2.0))
     if rng.random() < 0.3:
         sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(15, 60)))
@@ -330,5 +373,12 @@ def spots_in_fog(stage, count, reach, height, strength=1.0):
     rng = stage.rng
     for _ in range(count):
         at = (rng.uniform(-reach, reach), rng.uniform(-reach, reach), height * rng.uniform(0.7, 1.0))
-        stage.lamp("SPOT", at, strength * rng.uniform(20, 100) * height * height, m.color(rng, (0, 0.6), (0.8, 1)),
-                   aim=(rng.uniform(-1, 1), rng.uniform(-1, 1), 0), spot_size=rng.uniform(0.3, 0.9), shadow_soft_size=0.03)
+        stage.lamp(
+            "SPOT",
+            at,
+            strength * rng.uniform(20, 100) * height * height,
+            m.color(rng, (0, 0.6), (0.8, 1)),
+            aim=(rng.uniform(-1, 1), rng.uniform(-1, 1), 0),
+            spot_size=rng.uniform(0.3, 0.9),
+            shadow_soft_size=0.03,
+        )

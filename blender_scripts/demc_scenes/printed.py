@@ -1,8 +1,9 @@
-"""Pixel-sharp images made from numbers: pages of text, charts, screens of programs, sprites and test patterns.
+"""Pixel-sharp images made from numbers: pages of text, charts, screens of programs, sprites and test
+patterns.
 
-Photographs, which the library's textures are, hold few edges of one pixel; print, signs, and screens hold little
-else. An image is a numpy array of (height, width, 3) sRGB values from the top; `image` makes one that Blender can
-render, without a file.
+Photographs, which the library's textures are, hold few edges of one pixel; print, signs, and screens hold
+little else. An image is a numpy array of (height, width, 3) sRGB values from the top; `image` makes one that
+Blender can render, without a file.
 """
 
 import math
@@ -15,8 +16,33 @@ from . import palette, shapes, studio
 from .props import small
 
 _UPRIGHT = math.pi / 2
-_WORDS = ("noise", "light", "of", "the", "shade", "render", "and", "sample", "lamp", "12.50", "a", "mirror", "to",
-          "path", "2026", "is", "colour", "edge", "glass", "pixel", "room", "in", "texture", "x=0.5", "frame")
+_WORDS = (
+    "noise",
+    "light",
+    "of",
+    "the",
+    "shade",
+    "render",
+    "and",
+    "sample",
+    "lamp",
+    "12.50",
+    "a",
+    "mirror",
+    "to",
+    "path",
+    "2026",
+    "is",
+    "colour",
+    "edge",
+    "glass",
+    "pixel",
+    "room",
+    "in",
+    "texture",
+    "x=0.5",
+    "frame",
+)
 
 
 def image(rng):
@@ -40,7 +66,7 @@ def _tones(draw, count):
 
 
 def _alphabet(draw):
-    """Forty letters of 7 by 5 pixels, each a few strokes: what print looks like to someone who cannot read it."""
+    """Forty letters of 7 by 5 pixels, each a few strokes: print as it looks to who cannot read it."""
     letters = np.zeros((40, 7, 5), bool)
     for letter in letters:
         for _ in range(draw.integers(2, 5)):
@@ -65,7 +91,7 @@ def _write(draw, canvas, letters, ink, top, left, bottom, right, scale=1):
                 x += 4 * scale
                 continue
             letter = np.kron(letters[draw.integers(len(letters))], np.ones((scale, scale), bool))
-            canvas[y:y + 7 * scale, x:x + 5 * scale][letter] = ink
+            canvas[y : y + 7 * scale, x : x + 5 * scale][letter] = ink
             x += 6 * scale
 
 
@@ -84,7 +110,7 @@ def page(draw):
     if draw.random() < 0.5:
         y, x = draw.integers(head, height - 60), draw.integers(8, width - 70)
         figure = sprite(draw)[:50, :60]
-        canvas[y:y + figure.shape[0], x:x + figure.shape[1]] = figure
+        canvas[y : y + figure.shape[0], x : x + figure.shape[1]] = figure
     return canvas
 
 
@@ -93,16 +119,16 @@ def chart(draw):
     height, width = 240, 320
     ground, ink, *rest = _tones(draw, 6)
     canvas = np.tile(ground, (height, width, 1))
-    canvas[20:-30:draw.integers(10, 30), 30:-10] = 0.5 * (ground + ink)
-    canvas[20:-30, 30:-10:draw.integers(10, 40)] = 0.5 * (ground + ink)
+    canvas[20 : -30 : draw.integers(10, 30), 30:-10] = 0.5 * (ground + ink)
+    canvas[20:-30, 30 : -10 : draw.integers(10, 40)] = 0.5 * (ground + ink)
     bars = draw.integers(4, 20)
     for i in range(bars):
         x0, x1 = (34 + (width - 50) * k // bars for k in (i, i + 1))
-        canvas[height - 30 - draw.integers(5, 180):height - 30, x0:x1 - 2] = rest[i % len(rest)]
+        canvas[height - 30 - draw.integers(5, 180) : height - 30, x0 : x1 - 2] = rest[i % len(rest)]
     curve = np.cumsum(draw.normal(0, 4, width - 40)) + height / 2
     for x, y in enumerate(np.clip(curve, 20, height - 32).astype(int)):
-        canvas[y:y + 2, 30 + x] = ink
-    canvas[20:height - 30, 30:32] = canvas[height - 32:height - 30, 30:-10] = ink
+        canvas[y : y + 2, 30 + x] = ink
+    canvas[20 : height - 30, 30:32] = canvas[height - 32 : height - 30, 30:-10] = ink
     _write(draw, canvas, _alphabet(draw), ink, height - 24, 30, height - 8, width - 10)
     return canvas
 
@@ -118,13 +144,22 @@ def interface(draw):
     side = draw.integers(60, 160)
     canvas[16:, :side] = 0.8 * ground + 0.2 * bar
     _write(draw, canvas, letters, ink, 24, 8, height - 8, side - 4)
-    canvas[24 + 10 * draw.integers(2, 20):, :side][:10] = accent
+    canvas[24 + 10 * draw.integers(2, 20) :, :side][:10] = accent
     for y in range(24, height - 30, 10):  # code: each line indented, each in the colour of its kind
         left = side + 8 + 12 * draw.integers(0, 4)
-        _write(draw, canvas, letters, [ink, *marks][draw.integers(len(marks) + 1)], y, left, y + 8, draw.integers(left + 20, width))
+        _write(
+            draw,
+            canvas,
+            letters,
+            [ink, *marks][draw.integers(len(marks) + 1)],
+            y,
+            left,
+            y + 8,
+            draw.integers(left + 20, width),
+        )
     for i in range(draw.integers(2, 6)):
         x = width - 20 - 60 * i
-        canvas[height - 18:height - 4, x - 50:x] = accent if i == 0 else bar
+        canvas[height - 18 : height - 4, x - 50 : x] = accent if i == 0 else bar
     return canvas
 
 
@@ -160,11 +195,16 @@ def paper(rng):
     n = m.Nodes("print")
     base = m.image(n, image(rng), n.uv(1.0))
     base.interpolation = rng.choice(("Closest", "Linear"))
-    return n.principled(Base_Color=base.outputs[0], Roughness=rng.uniform(0.2, 0.9), Coat_Weight=rng.choice((0, 0, 1)), Coat_Roughness=0.05)
+    return n.principled(
+        Base_Color=base.outputs[0],
+        Roughness=rng.uniform(0.2, 0.9),
+        Coat_Weight=rng.choice((0, 0, 1)),
+        Coat_Roughness=0.05,
+    )
 
 
 def sheet(stage, at, turn, width, height, tilt):
-    """A sheet of print on its lower edge: `tilt` is 0 where it lies, pi / 2 where it stands with its front to -Y."""
+    """A sheet of print on its lower edge: `tilt` is 0 where it lies, pi / 2 where it stands and faces -Y."""
     page_ = shapes.plane(width, height, unit_uv=True)
     page_.rotation_euler.x = tilt - _UPRIGHT
     return stage.add(page_, paper(stage.rng), at, turn)
@@ -195,7 +235,14 @@ def desk(stage):
     def thing(at):
         roll, turn = rng.random(), rng.uniform(-0.6, 0.6)
         if roll < 0.35:
-            sheet(stage, (at[0], at[1], rng.uniform(0.001, 0.004)), turn, rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.35), 0.0)
+            sheet(
+                stage,
+                (at[0], at[1], rng.uniform(0.001, 0.004)),
+                turn,
+                rng.uniform(0.1, 0.3),
+                rng.uniform(0.1, 0.35),
+                0.0,
+            )
         elif roll < 0.55:
             sheet(stage, at, turn, rng.uniform(0.08, 0.25), rng.uniform(0.08, 0.3), rng.uniform(1.2, 1.57))
         elif roll < 0.7:
@@ -203,13 +250,22 @@ def desk(stage):
         elif roll < 0.85:
             words = lettering(rng, rng.uniform(0.012, 0.04), rng.randint(2, 8))
             words.rotation_euler.x = rng.choice((0.0, 1.2))
-            stage.add(words, m.plastic(rng), (at[0] - 0.1, at[1], 0.12 if words.rotation_euler.x else 0.006), turn)
+            stage.add(
+                words, m.plastic(rng), (at[0] - 0.1, at[1], 0.12 if words.rotation_euler.x else 0.006), turn
+            )
         else:
             small(stage, at, 0.35)
 
     studio.cluster(stage, rng.randint(8, 18), 0.24, thing)
     for i in range(rng.randint(1, 4)):
-        sheet(stage, (rng.uniform(-0.8, 0.8), 1.0 + 0.01 * i, rng.uniform(0.05, 0.5)), 0.0, rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.7), _UPRIGHT)
+        sheet(
+            stage,
+            (rng.uniform(-0.8, 0.8), 1.0 + 0.01 * i, rng.uniform(0.05, 0.5)),
+            0.0,
+            rng.uniform(0.3, 0.9),
+            rng.uniform(0.3, 0.7),
+            _UPRIGHT,
+        )
     if rng.random() < 0.5:
         stage.add(shapes.box((3, 0.05, 1.5), 0, (0, 1.1, 0.75)), palette.walls(rng, lib))
     studio.base_light(stage, 0.2)

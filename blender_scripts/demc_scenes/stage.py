@@ -67,7 +67,11 @@ class Stage:
 
     def files(self):
         """The files of everything that was put into the scene: models, textures, environments, pictures."""
-        images = [bpy.path.abspath(image.filepath) for image in bpy.data.images if image.source == "FILE" and image.filepath]
+        images = [
+            bpy.path.abspath(image.filepath)
+            for image in bpy.data.images
+            if image.source == "FILE" and image.filepath
+        ]
         return sorted({*self._imported, *images})
 
     def _vary_materials(self, meshes):

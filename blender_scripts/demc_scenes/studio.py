@@ -135,20 +135,37 @@ def embossed(stage):
     rng = stage.rng
     sweep(stage, m.embossed(rng, rng.uniform(0.05, 0.4)))
     wall = shapes.box((2.4, 0.06, 1.4), 0.005, (0, 0, 0.7))
-    stage.add(wall, m.embossed(rng, rng.uniform(0.08, 0.5)), (rng.uniform(-0.3, 0.3), rng.uniform(0.5, 0.9), 0), rng.uniform(-0.4, 0.4))
+    stage.add(
+        wall,
+        m.embossed(rng, rng.uniform(0.08, 0.5)),
+        (rng.uniform(-0.3, 0.3), rng.uniform(0.5, 0.9), 0),
+        rng.uniform(-0.4, 0.4),
+    )
 
     def thing(at):
-        make = rng.choice((lambda: shapes.sphere(rng.uniform(0.06, 0.14), 5), lambda: shapes.monkey(rng.uniform(0.18, 0.3)),
-                           lambda: shapes.torus(0.08, 0.035), lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3)),
-                           lambda: shapes.box([rng.uniform(0.1, 0.2) for _ in range(3)], 0.01, (0, 0, 0.1))))
+        make = rng.choice(
+            (
+                lambda: shapes.sphere(rng.uniform(0.06, 0.14), 5),
+                lambda: shapes.monkey(rng.uniform(0.18, 0.3)),
+                lambda: shapes.torus(0.08, 0.035),
+                lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3)),
+                lambda: shapes.box([rng.uniform(0.1, 0.2) for _ in range(3)], 0.01, (0, 0, 0.1)),
+            )
+        )
         stage.add(make(), m.embossed(rng, rng.uniform(0.01, 0.08)), at, rng.uniform(0, 6.28))
 
     cluster(stage, rng.randint(4, 10), 0.28, thing)
     if rng.random() < 0.6:  # nearly along the wall
         darkness(stage, rng.uniform(0.02, 0.3))
         side = rng.choice((-1, 1))
-        stage.lamp("SPOT", (side * 2.0, rng.uniform(0.2, 0.45), rng.uniform(0.3, 1.2)), rng.uniform(100, 300), aim=(0, 0.3, 0.3), spot_size=1.2,
-                   shadow_soft_size=rng.uniform(0.01, 0.1))
+        stage.lamp(
+            "SPOT",
+            (side * 2.0, rng.uniform(0.2, 0.45), rng.uniform(0.3, 1.2)),
+            rng.uniform(100, 300),
+            aim=(0, 0.3, 0.3),
+            spot_size=1.2,
+            shadow_soft_size=rng.uniform(0.01, 0.1),
+        )
     else:
         base_light(stage)
 
@@ -164,20 +181,42 @@ def pool(stage):
     stage.add(shapes.box((8, 8, 0.1), 0, (0, 0, -0.12)), palette.choose(rng, lib, "stone"))
 
     def thing(at):
-        make = rng.choice((lambda: shapes.sphere(rng.uniform(0.03, 0.12), 5), lambda: shapes.torus(0.07, 0.02), lambda: shapes.gem(rng, 0.12),
-                           lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3))))
-        stage.add(make(), rng.choice((m.glass, m.metal, m.plastic, lambda r: palette.anything(r, lib)))(rng), at, rng.uniform(0, 6.28))
+        make = rng.choice(
+            (
+                lambda: shapes.sphere(rng.uniform(0.03, 0.12), 5),
+                lambda: shapes.torus(0.07, 0.02),
+                lambda: shapes.gem(rng, 0.12),
+                lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3)),
+            )
+        )
+        stage.add(
+            make(),
+            rng.choice((m.glass, m.metal, m.plastic, lambda r: palette.anything(r, lib)))(rng),
+            at,
+            rng.uniform(0, 6.28),
+        )
 
     cluster(stage, rng.randint(3, 9), width * 0.2, thing)
     if rng.random() < 0.7:
         level = depth * rng.uniform(0.4, 0.85)
         waves = [(rng.uniform(4, 40), rng.uniform(-30, 30), rng.uniform(0, 6.28)) for _ in range(5)]
-        surface = shapes.terrain(width - 0.1, 160, lambda x, y: level + sum(0.03 / (8 + abs(a) + abs(b)) * math.sin(a * x + b * y + c) for a, b, c in waves))
+        surface = shapes.terrain(
+            width - 0.1,
+            160,
+            lambda x, y: level
+            + sum(0.03 / (8 + abs(a) + abs(b)) * math.sin(a * x + b * y + c) for a, b, c in waves),
+        )
         stage.add(surface, m.glass(rng, True))
     environment(stage, ("studio", "indoor", "sunny", "sky"), rng.uniform(0.2, 1.0))
     angle = rng.uniform(0, 6.28)
-    stage.lamp("SPOT", (2 * math.cos(angle), 2 * math.sin(angle), rng.uniform(1.5, 3)), rng.uniform(100, 500), aim=(0, 0, 0), spot_size=0.9,
-               shadow_soft_size=rng.uniform(0.02, 0.15))
+    stage.lamp(
+        "SPOT",
+        (2 * math.cos(angle), 2 * math.sin(angle), rng.uniform(1.5, 3)),
+        rng.uniform(100, 500),
+        aim=(0, 0, 0),
+        spot_size=0.9,
+        shadow_soft_size=rng.uniform(0.02, 0.15),
+    )
     stage.scene.cycles.blur_glossy = rng.choice((0.0, 1.0))
 
 

@@ -197,7 +197,12 @@ def crops(stage, guides, count, size):
         part = np.s_[int(y * scale):max(int((y + size[1]) * scale), int(y * scale) + 2), int(x * scale):max(int((x + size[0]) * scale), int(x * scale) + 2)]
         light = image[part].mean(-1)
         covered = (np.abs(normal[part]).max(-1) > 0.1).mean()
-        if light.mean() < _DARK_SHARE * frame_level or covered < stage.least_covered or not stage.dark and starved(image[part], normal[part]) > _STARVED + 0.1:
+        if (
+            light.mean() < _DARK_SHARE * frame_level
+            or covered < stage.least_covered
+            or not stage.dark
+            and starved(image[part], normal[part]) > _STARVED + 0.1
+        ):
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)

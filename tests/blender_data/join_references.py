@@ -1,7 +1,7 @@
 """Joins the references of a development set from made-up parts whose noise is known; prints what comes out.
 
-Arguments: the scripts' folder, a folder for the set. Every part is a grey of 0.5 with noise of a standard deviation
-of 0.1, and the render at Blender's defaults of one of 0.05.
+Arguments: the scripts' folder, a folder for the set. Every part is a grey of 0.5 with noise of a standard
+deviation of 0.1, and the render at Blender's defaults of one of 0.05.
 """
 
 import os
