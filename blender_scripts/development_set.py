@@ -17,9 +17,9 @@ in parts/.
 
 manifest.csv (scene,noisy,reference,spp) lists every frame that has its reference; views.csv lists every file
 with its seeds, processor seconds, the noise that is left in a reference as RelMSE, and SHA-256. What is
-listed and there is not rendered again. The first dozen views, each of another kind, come first with 4 and 64
-samples, a reference of up to 1024, and the defaults; then the other views and all of the ladder; then more
-parts for all.
+listed and there is not rendered again. The first dozen views, each of another kind, come first with 1 to 64
+samples, a reference of up to 1024, and the defaults; then the other views and the rest of the ladder; then
+more parts for all.
 """
 
 import argparse
@@ -47,9 +47,9 @@ _PANORAMA = (240, 120)
 _LARGE = (480, 270)
 _DOZEN = 12
 # (samples, noise seed), in the order in which they come.
-_FIRST = ((4, 0), (64, 0))
+_FIRST = ((1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (64, 0))
 _DEFAULTS = (rendering.DEFAULT_SAMPLES, 0)
-_THEN = ((1, 0), (2, 0), (8, 0), (16, 0), (256, 0), (4, 1), (4, 2), (64, 1), (64, 2))
+_THEN = ((256, 0), (4, 1), (4, 2), (64, 1), (64, 2))
 _LADDER = _FIRST + _THEN
 # A part of a reference: adaptive, with enough samples first that stopping early has no say in the mean.
 _PART_NOISE, _PART_LEAST, _PART_MOST = 0.007, 64, 512
