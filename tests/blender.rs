@@ -445,6 +445,68 @@ fn references_of_the_development_set_share_no_sample_with_what_they_judge() {
 }
 
 #[test]
+fn makes_hard_cases_of_a_pair() {
+    let folder = tempfile::tempdir().unwrap();
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example");
+    let (noisy, reference) = (example.join("house_0004spp.exr"), example.join("house_ref.exr"));
+    let make = |from: &Path| {
+        let mut command = blender();
+        command.arg(script("make_cases.py")).arg(from).arg(&reference).arg("--out").arg(folder.path());
+        command
+    };
+    run(&mut make(&noisy));
+    let pairs = testset::read(folder.path().to_str().unwrap()).unwrap().pairs;
+    let scenes: Vec<_> = pairs.iter().map(|pair| pair.scene.as_str()).collect();
+    assert_eq!(
+        scenes,
+        ["black", "border", "identity", "inf_disc", "nan_pixels", "other_guides", "rolled"],
+        "a pair a case"
+    );
+    let load = |name: &str| passes::load(folder.path().join(name), None).unwrap();
+    let source = passes::load(&noisy, None).unwrap();
+    let clean = passes::load(&reference, None).unwrap();
+    let light = |set: &PassSet| set.get(Pass::Combined).unwrap().clone();
+    assert_eq!(light(&load("identity_0004spp.exr")), light(&clean));
+    assert!(light(&load("black_0004spp.exr")).data.iter().all(|value| *value == 0.0));
+
+    // A disc of 12 pixels across has some 113 pixels, in three channels.
+    let infinite = light(&load("inf_disc_0004spp.exr")).data.iter().filter(|v| **v == f32::INFINITY).count();
+    let brightest = light(&load("inf_disc_ref.exr")).data.iter().filter(|v| **v == 65504.0).count();
+    assert!(infinite == brightest && (300..360).contains(&infinite), "{infinite} and {brightest}");
+    let holes = light(&load("nan_pixels_0004spp.exr"));
+    let share = holes.data.iter().filter(|v| v.is_nan()).count() as f64 / holes.data.len() as f64;
+    assert!((share - 0.01).abs() < 0.002, "{share}");
+    assert_eq!(light(&load("nan_pixels_ref.exr")), light(&clean));
+
+    let (width, height) = (source.width, source.height);
+    let cut = load("border_0004spp.exr");
+    assert_eq!((cut.width, cut.height), (width - 2 * (width / 4), height - 2 * (height / 4)));
+    let value = |set: &PassSet, pass, x, y| set.get(pass).unwrap().channel(0)[y * set.width + x];
+    for pass in [Pass::Combined, Pass::DenoisingNormal] {
+        assert_eq!(value(&cut, pass, 0, 0), value(&source, pass, width / 4, height / 4), "{pass}");
+        let (whole, half) =
+            (value(&source, pass, 3, 5), value(&load("rolled_0004spp.exr"), pass, 3 + width / 2, 5));
+        assert_eq!(half, whole, "{pass}");
+    }
+    let other = load("other_guides_0004spp.exr");
+    assert_eq!(light(&other), light(&source));
+    let albedo = |set, x| value(set, Pass::DenoisingAlbedo, x, 60);
+    assert_eq!(albedo(&other, 100 + width / 5), albedo(&source, 100));
+
+    let output = make(&reference).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.code() == Some(2) && stderr.contains("is not named <scene>_<spp>spp.exr"),
+        "{stderr}"
+    );
+    let bare = folder.path().join("bare_0004spp.exr");
+    fs::copy(&reference, &bare).unwrap();
+    let output = make(&bare).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() == Some(2) && stderr.contains("has no Denoising Albedo"), "{stderr}");
+}
+
+#[test]
 fn guides_alone_are_the_guides_of_whole_renders() {
     let folder = tempfile::tempdir().unwrap();
     let load = |kind: &str, more: &str| {
