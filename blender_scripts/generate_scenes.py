@@ -1,6 +1,7 @@
 """Renders training pairs from seeded random scenes: noisy frames with every pass, and references.
 
     python generate_scenes.py --out DIR --seeds 0:100                with bpy from PyPI
+    python generate_scenes.py --out DIR --check                      compares the files with their hashes
     blender -b -P generate_scenes.py -- --out DIR --seeds 0:100      in Blender
 
 Each seed is one scene: an interior, a street, a garden, things in a studio ... furnished from
@@ -8,10 +9,11 @@ Each seed is one scene: an interior, a street, a garden, things in a studio ... 
 rendered out of larger frames, where there is something to see, so a pixel covers what it covers in
 a real frame. The same seed and options give the same scene and the same pixels.
 
-Writes s<seed>_<kind>_<spp>spp.exr with s<seed>_<kind>_ref.exr (all half float, one part), where
-several crops of a scene add _c0, _c1 ... to the name, and manifest.csv (scene,noisy,reference,spp),
-which lists the further noisy seeds (..._n1.exr, as scene ..._n1) too. Finished scenes are skipped; scenes with
-nothing to see go to rejected.csv and are not tried again.
+Writes s<seed>_<kind>_<spp>spp.exr with s<seed>_<kind>_ref.exr (all half float, one part; references
+keep their guides, which are what a prefilter aims at), where several crops of a scene add _c0, _c1 ... to
+the name. manifest.csv (scene,noisy,reference,spp) lists the further noisy seeds (..._n1.exr, as scene ..._n1)
+and their means (..._mean.exr) too; views.csv lists every file with its seeds, processor seconds and SHA-256.
+Finished scenes are skipped; scenes with nothing to see go to rejected.csv and are not tried again.
 """
 
 import argparse
@@ -31,15 +33,16 @@ sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 from demc_blender import command_line as cl
 from demc_blender import exr, names, rendering
 from demc_blender.edits import Edits
+from demc_blender.ledger import Ledger
 from demc_blender.position import store_position, write_position
-from demc_scenes import views
+from demc_scenes import making
 from demc_scenes.assets import Library
-from demc_scenes.blends import find_blends, open_blend
+from demc_scenes.blends import find_blends
 from demc_scenes.kinds import KINDS
-from demc_scenes.stage import Stage
 
-_FRAME_SIZES = ((480, 270), (480, 270), (480, 270), (640, 360), (640, 360), (960, 540))
 _LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
+_LEAST_CLEAN = 512  # of a pixel in a clean one
+_CLEAN_RATIO = 8  # frames of more than one in so many of its samples, a denoised reference is too coarse for
 _DROPPED = (".Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
@@ -49,7 +52,16 @@ def parse(arguments):
         prog="generate_scenes.py", description="Render training pairs from seeded random scenes.",
         epilog=f"Kinds: {', '.join(KINDS)}, and with --blend the names of its scenes.")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pairs")
-    parser.add_argument("--seeds", required=True, type=cl.seed_range, metavar="A:B", help="scenes A to B-1")
+    parser.add_argument("--seeds", type=cl.seed_range, metavar="A:B", help="scenes A to B-1")
+    parser.add_argument(
+        "--check", action="store_true", help="render nothing, compare files with their hashes"
+    )
+    parser.add_argument(
+        "--development-seeds",
+        action="store_true",
+        help=f"allow the seeds {_span(making.DEVELOPMENT_SEEDS)}, of which development_set.py makes what "
+        "trained models are judged on: never train on these pairs",
+    )
     parser.add_argument("--assets", action="append", default=[], metavar="DIR",
                         help="models, textures, HDRIs and pictures to furnish with; may be repeated")
     parser.add_argument("--blend", metavar="DIR", help="also render random views of the .blend scenes below DIR")
@@ -60,23 +72,83 @@ def parse(arguments):
                         help="crops of N by N pixels, or of N by M (default 128)")
     parser.add_argument("--crops", type=cl.positive, default=1, metavar="N", help="crops per scene (default 1)")
     parser.add_argument("--spp", type=cl.counts, default=[4], metavar="N[,N]", help="samples of the noisy crops (default 4)")
+    parser.add_argument(
+        "--draw-spp",
+        type=cl.positive,
+        metavar="N",
+        help="only N of the --spp counts for each crop, spread over them (default: all)",
+    )
+    parser.add_argument(
+        "--adaptive-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help=f"a share of the crops is also rendered at Blender's defaults: {rendering.DEFAULT_SAMPLES} "
+        f"samples and a noise threshold of {rendering.DEFAULT_NOISE} (default 0)",
+    )
     parser.add_argument("--also-spp", type=cl.counts, default=[], metavar="N[,N]",
                         help="a share of the crops is also rendered with one of these sample counts")
     parser.add_argument("--also-share", type=float, default=0.25, metavar="F", help="that share (default 0.25)")
     parser.add_argument("--noisy-seeds", type=cl.positive, default=1, metavar="N",
                         help="noisy renders of each crop and sample count (default 1)")
+    parser.add_argument(
+        "--means",
+        action="store_true",
+        help="also the mean of a crop's noisy renders of one sample count, as a frame of so many times more "
+        "samples that costs nothing",
+    )
+    parser.add_argument(
+        "--filter-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="share of crops with a pixel filter that is not Blender's default, half of them a box",
+    )
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
     parser.add_argument("--ref-noise", type=float, default=0.01, metavar="T",
                         help="references stop early below this noise threshold, 0 for never (default 0.01)")
     parser.add_argument("--denoise-references", action="store_true",
                         help="clean the references' last noise with Blender's own denoiser, guides denoised first: "
                              "64 to 128 samples then serve as well as many more")
+    parser.add_argument(
+        "--clean-share",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help=f"share of scenes whose references have at least {_LEAST_CLEAN} samples everywhere and are not "
+        f"denoised. Beside --denoise-references, only these get frames and means of more than an "
+        f"{_CLEAN_RATIO}th of --ref-spp (default 0)",
+    )
+    parser.add_argument(
+        "--clean-spp",
+        type=cl.positive,
+        default=2048,
+        metavar="N",
+        help="samples of such references, at most (default 2048)",
+    )
+    parser.add_argument(
+        "--clean-noise",
+        type=float,
+        default=0.005,
+        metavar="T",
+        help="and their noise threshold (default 0.005)",
+    )
     parser.add_argument("--guides-only", action="store_true",
                         help="trace no light beyond the surface that guides are of, in two thirds of the time: pairs for a "
                              "prefilter (their Combined is of no use), whose references keep albedo and normal")
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--stop-file", metavar="PATH", help="stop before the next scene once this file exists")
     options = parser.parse_args(arguments)
+    if options.check:
+        return options
+    if options.seeds is None:
+        parser.error("--seeds is missing: which scenes to make, for example 0:100")
+    if not options.development_seeds and _overlap(options.seeds, making.DEVELOPMENT_SEEDS):
+        parser.error(
+            f"the seeds {_span(making.DEVELOPMENT_SEEDS)} are kept for judging what was trained: take others"
+        )
+    if options.clean_share and not options.clean_spp > _LEAST_CLEAN:
+        parser.error(f"--clean-spp must be above {_LEAST_CLEAN}, which every pixel gets")
     for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
         for folder in folders:
             if not os.path.isdir(folder):
@@ -105,22 +177,79 @@ def kind_of(options, seed):
     return rng.choices(made, [KINDS[k][1] for k in made])[0]
 
 
+def _span(seeds):
+    return f"{seeds.start}:{seeds.stop}"
+
+
+def _overlap(one, other):
+    return max(one.start, other.start) < min(one.stop, other.stop)
+
+
 def crop_names(options, scene_name):
     """Names of a scene's crops."""
     return [scene_name] if options.crops == 1 else [f"{scene_name}_c{i}" for i in range(options.crops)]
 
 
-def noisy_names(options, crop):
-    """(file, spp, noise seed number) of every noisy render of a crop."""
-    for spp in options.spp:
-        for n in range(options.noisy_seeds):
-            plain = names.noisy_name(crop, spp)
-            yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n
-    rng = random.Random(f"also {crop}")
-    if options.also_spp and rng.random() < options.also_share:
-        spp = rng.choice(options.also_spp)
-        if spp not in options.spp:
-            yield names.noisy_name(crop, spp), spp, 0
+class Crop:
+    """What is rendered of a crop, drawn from its name alone: sample counts, reference, pixel filter."""
+
+    def __init__(self, options, scene_name, name, seed):
+        self.name, self.seed, self.reference = name, seed, names.reference_name(name)
+        self.clean = random.Random(f"clean {scene_name}").random() < options.clean_share
+        self.counts = self._counts(options)
+        rng = random.Random(f"adaptive {name}")
+        # Where the reference is denoised, a frame that is cleaner than it has nothing to aim at.
+        self.adaptive = rng.random() < options.adaptive_share and (
+            self.clean or not options.denoise_references
+        )
+        rng = random.Random(f"filter {name}")
+        self.filter = None
+        if rng.random() < options.filter_share:
+            self.filter = rng.choice(
+                (
+                    ("BOX", 1.0),
+                    ("BOX", 1.0),
+                    ("BLACKMAN_HARRIS", round(rng.uniform(0.8, 2.5), 2)),
+                    ("GAUSSIAN", 1.5),
+                )
+            )
+        self.seeds, self.means = options.noisy_seeds, options.means and options.noisy_seeds > 1
+
+    def _counts(self, options):
+        counts = options.spp
+        most = options.ref_spp // _CLEAN_RATIO // (options.noisy_seeds if options.means else 1)
+        if options.clean_share and options.denoise_references and not self.clean:
+            counts = [spp for spp in counts if spp <= most] or [min(counts)]
+        rng = random.Random(f"counts {self.name}")
+        if options.draw_spp and options.draw_spp < len(counts):
+            cuts = [len(counts) * i // options.draw_spp for i in range(options.draw_spp + 1)]
+            counts = [rng.choice(counts[a:b]) for a, b in zip(cuts, cuts[1:])]
+        rng = random.Random(f"also {self.name}")
+        if options.also_spp and rng.random() < options.also_share:
+            spp = rng.choice(options.also_spp)
+            return counts, [spp] if spp not in options.spp else []
+        return counts, []
+
+    def noisy(self):
+        """(file, samples, noise seed) of every noisy render."""
+        counts, also = self.counts
+        for spp in counts:
+            for n in range(self.seeds):
+                plain = names.noisy_name(self.name, spp)
+                yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n
+        for spp in also + [rendering.DEFAULT_SAMPLES] * self.adaptive:
+            yield names.noisy_name(self.name, spp), spp, 0
+
+    def mean_of(self, spp):
+        """The name of the mean of the noisy renders of one sample count."""
+        return names.noisy_name(self.name, spp * self.seeds).replace(".exr", "_mean.exr")
+
+    def pairs(self):
+        """(scene, file, samples) for the manifest."""
+        for file, spp, n in self.noisy():
+            yield self.name if n == 0 else f"{self.name}_n{n}", file, spp
+        for spp in self.counts[0] if self.means else []:
+            yield f"{self.name}_mean", self.mean_of(spp), spp * self.seeds
 
 
 class Records:
@@ -145,12 +274,10 @@ class Records:
         with open(path, "a", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(([header] if fresh else []) + rows)
 
-    def add_crop(self, options, crop):
-        reference = names.reference_name(crop)
-        rows = [[crop if n == 0 else f"{crop}_n{n}", file, reference, spp]
-                for file, spp, n in noisy_names(options, crop)]
+    def add_crop(self, crop):
+        rows = [[scene, file, crop.reference, spp] for scene, file, spp in crop.pairs()]
         self._append("manifest.csv", ["scene", "noisy", "reference", "spp"], rows)
-        self.done.add(crop)
+        self.done.add(crop.name)
 
     def reject(self, scene_name, reason):
         self._append("rejected.csv", ["scene", "reason"], [[scene_name, reason]])
@@ -177,113 +304,110 @@ class Records:
             os.remove(self.mark)
 
 
-def settings_of_scene(edits, scene, rng, options, is_blend):
-    """Render settings that artists use; those of a finished .blend are left as they are."""
-    rendering.prepare_scene(edits, scene)
-    rendering.set_output(edits, scene)
-    for name in ("use_stamp_date", "use_stamp_time", "use_stamp_render_time", "use_stamp_memory",
-                 "use_stamp_hostname", "use_stamp_filename"):
-        edits.set(scene.render, name, False)
-    if options.threads:
-        edits.set(scene.render, "threads_mode", "FIXED")
-        edits.set(scene.render, "threads", options.threads)
-    rendering.set_resolution(edits, scene, rng.choice(_FRAME_SIZES))
-    if scene.world:  # the map that Cycles builds by itself takes seconds, for every single crop
-        scene.world.cycles.sampling_method = "MANUAL"
-        scene.world.cycles.sample_map_resolution = 512
-    if is_blend:
-        return
-    cycles = scene.cycles
-    cycles.device = "CPU"
-    cycles.max_bounces, cycles.diffuse_bounces = rng.choice((6, 8)), rng.choice((2, 3, 4))
-    cycles.glossy_bounces, cycles.transmission_bounces, cycles.transparent_max_bounces = 4, 8, 8
-    cycles.sample_clamp_indirect = rng.choice((0.0, 0.0, 10.0, 10.0))
-    cycles.sample_clamp_direct = 0.0
-    cycles.blur_glossy = rng.choice((0.0, 1.0))
-    cycles.caustics_reflective = cycles.caustics_refractive = rng.random() < 0.85
-    cycles.use_light_tree = rng.random() < 0.7
-    scene.frame_set(1)
-
-
-def build(options, library, seed, kind):
-    """Builds a scene; returns its stage and the function that places a camera."""
-    rng = random.Random(f"scene {seed} {kind}")
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    stage = Stage(rng, library)
-    if kind in options.blends:
-        return stage, open_blend(stage, options.blends[kind])
-    stage.scene.render.engine = "CYCLES"
-    return stage, KINDS[kind][0](stage)
-
-
-def render_crop(options, scene, region, crop, seed, partial):
-    """Renders a crop: noisy images with all passes, then the reference: Combined, where it is denoised also
-    what it was denoised from (Noisy Image and the guides), and the guides where they are all that is wanted."""
+def render_crop(options, ledger, scene, region, crop, facts):
+    """Renders a crop: noisy images with all passes, their means, then the reference with its guides; where it
+    is denoised, also the Noisy Image that it was denoised from. `facts` are what the ledger tells of it too."""
     layers = [layer for layer in scene.view_layers if layer.use][:1]
+    facts = facts | {"view": crop.name, "frame": "{}x{}+{}+{}".format(*region[2:], *region[:2])}
     with Edits() as edits:
         rendering.set_region(edits, scene, region)
         for layer in scene.view_layers:
             edits.set(layer, "use", layer == layers[0])
         if options.guides_only:
             rendering.stop_at_guides(edits, scene)
+        if crop.filter:
+            edits.set(scene.cycles, "pixel_filter_type", crop.filter[0])
+            edits.set(scene.cycles, "filter_width", crop.filter[1])
+        facts["filter"] = (
+            f"{scene.cycles.pixel_filter_type.lower().replace('_', '-')} {scene.cycles.filter_width:.2f}"
+        )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             rendering.enable_passes(passes, layers)
             store_position(passes, layers)
-            for file, spp, n in noisy_names(options, crop):
-                rendering.set_sampling(passes, scene, spp, rendering.mixed_seed(seed, crop, spp, n))
-                render_compact(scene, os.path.join(options.out, file), partial)
+            for file, spp, n in crop.noisy():
+                noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0
+                rendering.set_sampling(
+                    passes, scene, spp, rendering.mixed_seed(crop.seed, crop.name, spp, n), noise
+                )
+                seconds = render_compact(scene, os.path.join(options.out, file))
+                ledger.add(file=file, spp=spp, noise_seed=n, seconds=f"{seconds:.1f}", **facts)
+        for spp in crop.counts[0] if crop.means else []:
+            write_mean(
+                options.out, crop.mean_of(spp), [file for file, count, _ in crop.noisy() if count == spp]
+            )
+            ledger.add(
+                file=crop.mean_of(spp), spp=spp * crop.seeds, noise_seed="mean", seconds="0.0", **facts
+            )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
-            rendering.set_sampling(passes, scene, options.ref_spp, rendering.mixed_seed(seed, crop, "reference"),
-                                   options.ref_noise, _LEAST_SAMPLES if options.denoise_references else 0)
-            if options.denoise_references:
-                rendering.denoise(passes, scene, layers)
-            if options.denoise_references or options.guides_only:
-                for layer in layers:
-                    passes.set(layer.cycles, "denoising_store_passes", True)
-            render_compact(scene, os.path.join(options.out, names.reference_name(crop)), partial)
+            for layer in layers:
+                passes.set(layer.cycles, "denoising_store_passes", True)
+            seed = rendering.mixed_seed(crop.seed, crop.name, "reference")
+            spp = options.clean_spp if crop.clean else options.ref_spp
+            if crop.clean:
+                rendering.set_sampling(passes, scene, spp, seed, options.clean_noise, _LEAST_CLEAN)
+            else:
+                rendering.set_sampling(
+                    passes,
+                    scene,
+                    spp,
+                    seed,
+                    options.ref_noise,
+                    _LEAST_SAMPLES if options.denoise_references else 0,
+                )
+                if options.denoise_references:
+                    rendering.denoise(passes, scene, layers)
+            seconds = render_compact(scene, os.path.join(options.out, crop.reference))
+            ledger.add(
+                file=crop.reference,
+                spp=spp,
+                noise_seed="clean" if crop.clean else "reference",
+                seconds=f"{seconds:.1f}",
+                **facts,
+            )
 
 
-def render_compact(scene, path, partial):
-    """Renders, drops what no network reads, and stores the rest as half in one part."""
+def render_compact(scene, path):
+    """Renders, drops what no network reads, stores the rest as half in one part; returns processor seconds."""
+    partial = f"{path}.render.tmp"
+    start = time.process_time()
     rendering.render_to(scene, partial)
+    seconds = time.process_time() - start
     channels = {name: plane for name, plane in exr.read(partial).items() if not name.endswith(_DROPPED)}
     exr.write_half(path, channels)
     os.remove(partial)
+    return seconds
 
 
-def render_scene(options, library, records, seed, kind, scene_name):
+def write_mean(folder, name, files):
+    """Writes the mean of several renders, of the guides too."""
+    frames = [exr.read(os.path.join(folder, file)) for file in files]
+    exr.write_half(
+        os.path.join(folder, name),
+        {c: sum(frame[c].astype("f4") for frame in frames) / len(frames) for c in frames[0]},
+    )
+
+
+def render_scene(options, library, records, ledger, seed, kind, scene_name):
     """Builds and renders one scene; returns the words of its line."""
-    start = time.perf_counter()
-    stage, place_camera = build(options, library, seed, kind)
+    start, finished = time.perf_counter(), kind in options.blends
+    stage, place_camera = making.build(library, seed, kind, options.blends)
     with Edits() as edits:
-        settings_of_scene(edits, stage.scene, stage.rng, options, kind in options.blends)
-        reason = "no place for a camera"
-        for _ in range(3):
-            camera = place_camera()
-            if camera is None:
-                continue
-            if kind not in options.blends:
-                views.lens_effects(stage, camera)
-            guides = views.probe(stage.scene)
-            reason = views.refusal(guides)
-            regions = [] if reason else views.crops(stage.rng, stage.scene, guides, options.crops, options.size)
-            if len(regions) == options.crops:
-                break
-            reason = reason or "featureless"
-        else:  # no camera of three sees enough
-            records.reject(scene_name, reason)
+        making.set_up(edits, stage, options.threads, finished)
+        try:
+            regions = making.look(edits, stage, place_camera, options.crops, options.size, finished)
+        except making.Unseen as reason:
+            records.reject(scene_name, str(reason))
             return f"rejected, {reason}"
-        if kind not in options.blends:
-            views.expose(stage.rng, stage.scene, guides[0])
         built = time.perf_counter() - start
         write_position(edits, list(stage.scene.view_layers))
-        for region, crop in zip(regions, crop_names(options, scene_name)):
-            if crop in records.done:  # before the script was stopped
+        for i, (region, name) in enumerate(zip(regions, crop_names(options, scene_name))):
+            if name in records.done:  # before the script was stopped
                 continue
-            render_crop(options, stage.scene, region, crop, seed, os.path.join(options.out, f"{scene_name}.tmp"))
-            records.add_crop(options, crop)
+            crop = Crop(options, scene_name, name, seed)
+            render_crop(options, ledger, stage.scene, region, crop, {"kind": kind, "seed": seed, "camera": i})
+            records.add_crop(crop)
     objects = sum(o.type == "MESH" for o in stage.scene.objects)
     return f"{len(regions)} crops, {objects} meshes, built in {built:.1f} s, rendered in {time.perf_counter() - start - built:.1f} s"
 
@@ -291,11 +415,14 @@ def render_scene(options, library, records, seed, kind, scene_name):
 def main():
     """Entry point of the script."""
     options = parse(cl.script_arguments())
+    if options.check:
+        cl.finish(Ledger(options.out).check())
+        return
     cl.quiet_stdout()
     logging.disable(logging.INFO)  # the glTF importer tells every step
     cl.make_folder(options.out)
     options.out = os.path.abspath(options.out)
-    library, records, failed = Library(options.assets), Records(options.out), 0
+    library, records, ledger, failed = Library(options.assets), Records(options.out), Ledger(options.out), 0
     cl.end_at_once(records.end)
     for seed in options.seeds:
         if options.stop_file and os.path.exists(options.stop_file):
@@ -310,7 +437,7 @@ def main():
             print(f"{scene_name}: rejected, Blender crashed on it twice")
             continue
         try:
-            print(f"{scene_name}: {render_scene(options, library, records, seed, kind, scene_name)}")
+            print(f"{scene_name}: {render_scene(options, library, records, ledger, seed, kind, scene_name)}")
         except Exception as error:  # one bad scene must not stop a night of rendering
             failed += 1
             if os.environ.get("DEMC_TRACEBACK"):

@@ -265,6 +265,248 @@ fn generates_the_same_pixels_for_the_same_seed() {
 }
 
 #[test]
+fn draws_sample_counts_and_says_what_each_file_cost() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    generate(
+        &out,
+        "--seeds 13:15 --kinds embossed --size 32 --spp 1,2,4,8,16,32 --draw-spp 2 --noisy-seeds 2 --means --ref-spp 64 \
+         --denoise-references --clean-share 0.5 --clean-spp 520 --filter-share 1",
+    );
+    let pairs = testset::read(out.join("manifest.csv").to_str().unwrap()).unwrap().pairs;
+    let table = fs::read_to_string(out.join("views.csv")).unwrap();
+    let rows: Vec<Vec<_>> = table.lines().skip(1).map(|line| line.split(',').collect()).collect();
+    let mut kinds_of_reference = Vec::new();
+    for seed in ["13", "14"] {
+        let scene = format!("s00{seed}_embossed");
+        let of_view: Vec<_> = rows.iter().filter(|row| row[0] == scene).collect();
+        // Two counts, each by two seeds and their mean, and the reference.
+        assert_eq!(of_view.len(), 2 * 3 + 1, "{table}");
+        let reference = of_view.iter().find(|row| row[6].ends_with("_ref.exr")).unwrap();
+        kinds_of_reference.push(reference[8]);
+        let counts: Vec<u32> =
+            of_view.iter().filter(|row| row[8] == "0").map(|row| row[7].parse().unwrap()).collect();
+        // A mean of two has twice the samples, and must still have no more than an eighth of the reference's.
+        let most = if reference[8] == "clean" { 32 } else { 64 / 8 / 2 };
+        assert!(counts[0] < counts[1] && counts[1] <= most, "{} reference: {counts:?}", reference[8]);
+        for row in &of_view {
+            assert_eq!((row[1], row[2]), ("embossed", seed), "{row:?}");
+            assert!(row[8] == "mean" || row[9].parse::<f64>().unwrap() > 0.0, "it took time: {row:?}");
+            assert!(row[5] == of_view[0][5] && row[5] != "blackman-harris 1.50", "{row:?}");
+        }
+        let load = |file: &str| passes::load(out.join(file), None).unwrap();
+        let mean_row = of_view.iter().find(|row| row[8] == "mean").unwrap();
+        let single: u32 = mean_row[7].parse::<u32>().unwrap() / 2;
+        let mean = load(mean_row[6]);
+        let [first, second] = ["", "_n1"].map(|n| load(&format!("{scene}_{single:04}spp{n}.exr")));
+        assert_ne!(first.get(Pass::Combined), second.get(Pass::Combined), "every seed has noise of its own");
+        for pass in [Pass::Combined, Pass::DenoisingAlbedo] {
+            let [mean, first, second] = [&mean, &first, &second].map(|set| set.get(pass).unwrap());
+            for ((m, a), b) in mean.data.iter().zip(&first.data).zip(&second.data) {
+                assert!((m - (a + b) / 2.0).abs() <= 1e-3 * m.abs().max(1e-3), "{pass}: {m} of {a} and {b}");
+            }
+        }
+        let reference = load(reference[6]);
+        for pass in [Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+            assert!(reference.get(pass).is_some(), "references keep {pass}");
+        }
+        assert_eq!(pairs.iter().filter(|pair| pair.scene.starts_with(&scene)).count(), 2 * 3);
+    }
+    kinds_of_reference.sort_unstable();
+    assert_eq!(kinds_of_reference, ["clean", "reference"], "half of the references are clean");
+
+    let check = |folder: &Path| {
+        let mut command = blender();
+        command.arg(script("generate_scenes.py")).arg("--out").arg(folder).arg("--check");
+        command
+    };
+    assert!(run(&mut check(&out)).contains("14 of 14 files are as listed"));
+    fs::write(out.join(rows[0][6]), "damaged").unwrap();
+    fs::remove_file(out.join(rows[1][6])).unwrap();
+    let said = run_with_failures(&mut check(&out));
+    assert!(said.contains("is not what views.csv lists") && said.contains("is missing"), "{said}");
+    assert!(said.contains("12 of 14 files are as listed"), "{said}");
+}
+
+#[test]
+fn keeps_the_seeds_of_the_development_set_out_of_training() {
+    let folder = tempfile::tempdir().unwrap();
+    for (seeds, expected) in [
+        ("--seeds 8999999:9000001", "the seeds 9000000:10000000 are kept"),
+        ("--seeds 9999999", "the seeds 9000000:10000000 are kept"),
+        ("", "--seeds is missing"),
+    ] {
+        let mut command = blender();
+        command.arg(script("generate_scenes.py")).arg("--out").arg(folder.path());
+        let output = command.args(seeds.split_whitespace()).output().unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{seeds}: {stderr}");
+        assert!(stderr.contains(expected), "{seeds}: {stderr}");
+    }
+    // On the border, outside.
+    let stop = folder.path().join("stop");
+    fs::write(&stop, "").unwrap();
+    for seeds in ["8999999", "10000000", "9000000 --development-seeds"] {
+        let said = generate(folder.path(), &format!("--seeds {seeds} --stop-file {}", stop.display()));
+        assert!(said.starts_with("stopped"), "{seeds}: {said}");
+    }
+}
+
+#[test]
+fn renders_views_of_the_development_set_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("set");
+    let render = |more: &str| {
+        let mut command = blender();
+        command.arg(script("development_set.py")).arg("--out").arg(&out);
+        run(command.args(more.split_whitespace()))
+    };
+    let said = render("--views dev08_embossed,dev12_cutout --spp 1,2");
+    assert_eq!(said.lines().count(), 2, "a line a view: {said}");
+    let frame = |name: &str| passes::load(out.join(name), None).unwrap();
+    let (crop, cutout) = (frame("dev08_embossed_0001spp.exr"), frame("dev12_cutout_0002spp.exr"));
+    for frame in [&crop, &cutout] {
+        assert_eq!((frame.width, frame.height), (240, 135));
+        for pass in
+            [Pass::Combined, Pass::Alpha, Pass::DenoisingAlbedo, Pass::DenoisingNormal, Pass::Position]
+        {
+            assert!(frame.get(pass).is_some(), "{pass}");
+        }
+    }
+    let alpha = cutout.get(Pass::Alpha).unwrap();
+    let clear = alpha.data.iter().filter(|a| **a == 0.0).count();
+    assert!(clear > 1000 && clear < alpha.data.len() - 1000, "{clear} clear pixels");
+    assert_ne!(
+        crop.get(Pass::Combined),
+        frame("dev08_embossed_0002spp.exr").get(Pass::Combined),
+        "no two frames share their noise"
+    );
+    // A frame without its row, as a killed run leaves it, is rendered again; the others are not.
+    let table = fs::read_to_string(out.join("views.csv")).unwrap();
+    let (kept, last) = table.trim_end().rsplit_once('\n').unwrap();
+    fs::write(out.join("views.csv"), format!("{kept}\n")).unwrap();
+    let said = render("--views dev08_embossed,dev12_cutout --spp 1,2");
+    assert!(said.lines().count() == 1 && said.starts_with("dev12_cutout: 1 frames, 0 parts"), "{said}");
+    let again = fs::read_to_string(out.join("views.csv")).unwrap();
+    let hash = |row: &str| row.rsplit_once(',').unwrap().1.to_owned();
+    assert_eq!(hash(again.trim_end().lines().last().unwrap()), hash(last), "the same pixels");
+    assert!(render("--check").contains("4 of 4 files are as listed"));
+    let assets = folder.path().join("assets");
+    let texture = assets.join("textures/metal_sheet");
+    fs::create_dir_all(&texture).unwrap();
+    let image = Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example/sheet.png");
+    fs::copy(image, texture.join("color.png")).unwrap();
+    fs::write(
+        assets.join("images.tsv"),
+        "name\tkind\tauthor\tlicence\nmetal_sheet\tmetal\tSomebody\tCC-BY-4.0\nunused\tleaf\tNobody\tCC0\n",
+    )
+    .unwrap();
+    render(&format!("--credits --views dev44_screens,dev27_screens --assets {}", assets.display()));
+    let credits = fs::read_to_string(out.join("credits.csv")).unwrap();
+    assert!(
+        credits.starts_with("asset,author,licence,views\nmetal_sheet,Somebody,CC-BY-4.0,dev"),
+        "{credits}"
+    );
+    assert_eq!(credits.lines().count(), 2, "what no view shows is not named: {credits}");
+}
+
+#[test]
+fn references_of_the_development_set_share_no_sample_with_what_they_judge() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("set");
+    let said = run(blender().arg(snippet("join_references.py")).arg(script("")).arg(&out));
+    let rows: Vec<Vec<_>> = said
+        .lines()
+        .filter_map(|line| line.strip_prefix("REFERENCE "))
+        .map(|line| line.split(' ').collect())
+        .collect();
+    // Two parts; four parts beside the defaults, which weigh as much as they; four parts alone.
+    for (row, (sources, seconds, noise)) in rows.iter().zip([
+        ("ab", "20.0", 0.01 / 2.0),
+        ("abcd+", "50.0", (0.01 / 4.0 + 0.0025) / 4.0),
+        ("abcd", "40.0", 0.01 / 4.0),
+    ]) {
+        assert_eq!((row[1], row[2]), (sources, seconds), "{said}");
+        for figure in &row[3..5] {
+            let relmse: f64 = figure.parse().unwrap();
+            assert!(
+                (relmse / (noise / 0.251) - 1.0).abs() < 0.08,
+                "{sources}: {relmse}, expected {}",
+                noise / 0.251
+            );
+        }
+    }
+    assert_eq!(rows.len(), 3, "{said}");
+    assert!(rows[2][0].ends_with("_adaptive_ref.exr"), "the defaults are judged by parts alone: {said}");
+    let mut pairs = testset::read(out.join("manifest.csv").to_str().unwrap()).unwrap().pairs;
+    pairs.sort_by_key(|pair| pair.spp);
+    let names = pairs.iter().map(|pair| pair.reference.file_name().unwrap().to_str().unwrap());
+    assert_eq!(names.collect::<Vec<_>>(), [rows[1][0], rows[2][0]]);
+}
+
+#[test]
+fn makes_hard_cases_of_a_pair() {
+    let folder = tempfile::tempdir().unwrap();
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example");
+    let (noisy, reference) = (example.join("house_0004spp.exr"), example.join("house_ref.exr"));
+    let make = |from: &Path| {
+        let mut command = blender();
+        command.arg(script("make_cases.py")).arg(from).arg(&reference).arg("--out").arg(folder.path());
+        command
+    };
+    run(&mut make(&noisy));
+    let pairs = testset::read(folder.path().to_str().unwrap()).unwrap().pairs;
+    let scenes: Vec<_> = pairs.iter().map(|pair| pair.scene.as_str()).collect();
+    assert_eq!(
+        scenes,
+        ["black", "border", "identity", "inf_disc", "nan_pixels", "other_guides", "rolled"],
+        "a pair a case"
+    );
+    let load = |name: &str| passes::load(folder.path().join(name), None).unwrap();
+    let source = passes::load(&noisy, None).unwrap();
+    let clean = passes::load(&reference, None).unwrap();
+    let light = |set: &PassSet| set.get(Pass::Combined).unwrap().clone();
+    assert_eq!(light(&load("identity_0004spp.exr")), light(&clean));
+    assert!(light(&load("black_0004spp.exr")).data.iter().all(|value| *value == 0.0));
+
+    // A disc of 12 pixels across has some 113 pixels, in three channels.
+    let infinite = light(&load("inf_disc_0004spp.exr")).data.iter().filter(|v| **v == f32::INFINITY).count();
+    let brightest = light(&load("inf_disc_ref.exr")).data.iter().filter(|v| **v == 65504.0).count();
+    assert!(infinite == brightest && (300..360).contains(&infinite), "{infinite} and {brightest}");
+    let holes = light(&load("nan_pixels_0004spp.exr"));
+    let share = holes.data.iter().filter(|v| v.is_nan()).count() as f64 / holes.data.len() as f64;
+    assert!((share - 0.01).abs() < 0.002, "{share}");
+    assert_eq!(light(&load("nan_pixels_ref.exr")), light(&clean));
+
+    let (width, height) = (source.width, source.height);
+    let cut = load("border_0004spp.exr");
+    assert_eq!((cut.width, cut.height), (width - 2 * (width / 4), height - 2 * (height / 4)));
+    let value = |set: &PassSet, pass, x, y| set.get(pass).unwrap().channel(0)[y * set.width + x];
+    for pass in [Pass::Combined, Pass::DenoisingNormal] {
+        assert_eq!(value(&cut, pass, 0, 0), value(&source, pass, width / 4, height / 4), "{pass}");
+        let (whole, half) =
+            (value(&source, pass, 3, 5), value(&load("rolled_0004spp.exr"), pass, 3 + width / 2, 5));
+        assert_eq!(half, whole, "{pass}");
+    }
+    let other = load("other_guides_0004spp.exr");
+    assert_eq!(light(&other), light(&source));
+    let albedo = |set, x| value(set, Pass::DenoisingAlbedo, x, 60);
+    assert_eq!(albedo(&other, 100 + width / 5), albedo(&source, 100));
+
+    let output = make(&reference).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.code() == Some(2) && stderr.contains("is not named <scene>_<spp>spp.exr"),
+        "{stderr}"
+    );
+    let bare = folder.path().join("bare_0004spp.exr");
+    fs::copy(&reference, &bare).unwrap();
+    let output = make(&bare).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() == Some(2) && stderr.contains("has no Denoising Albedo"), "{stderr}");
+}
+
+#[test]
 fn guides_alone_are_the_guides_of_whole_renders() {
     let folder = tempfile::tempdir().unwrap();
     let load = |kind: &str, more: &str| {
@@ -292,7 +534,7 @@ fn guides_alone_are_the_guides_of_whole_renders() {
 fn builds_every_kind_of_scene_without_assets() {
     let said = run(blender().arg(snippet("every_kind.py")).arg(script("")));
     let kinds: Vec<_> = said.lines().filter_map(|line| line.strip_prefix("KIND ")).collect();
-    assert_eq!(kinds.len(), 12, "{said}");
+    assert_eq!(kinds.len(), 24, "{said}");
     for kind in kinds {
         let meshes: usize = kind.rsplit(' ').next().unwrap().parse().unwrap();
         assert!(meshes >= 3, "{kind}");

@@ -40,21 +40,30 @@ def read(path):
 
 def write_half(path, channels):
     """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all."""
-    names = sorted(channels)
-    height, width = channels[names[0]].shape
     limit = float(np.finfo(np.float16).max)
-    planes = [np.clip(channels[n], -limit, limit).astype("<f2") for n in names]
+    _write(path, {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}, 1)
+
+
+def write_float(path, channels):
+    """The same as 32-bit floats."""
+    _write(path, {name: plane.astype("<f4") for name, plane in channels.items()}, 2)
+
+
+def _write(path, channels, kind):
+    names = sorted(channels)
+    planes = [channels[name] for name in names]
+    height, width = planes[0].shape
     header = struct.pack("<II", _MAGIC, 2 | (0x400 if max(map(len, names)) > 31 else 0))
-    listed = b"".join(n.encode() + b"\0" + struct.pack("<iiii", 1, 0, 1, 1) for n in names) + b"\0"
+    listed = b"".join(n.encode() + b"\0" + struct.pack("<iiii", kind, 0, 1, 1) for n in names) + b"\0"
     box = struct.pack("<iiii", 0, 0, width - 1, height - 1)
-    for name, kind, value in (
+    for name, type_, value in (
         ("channels", "chlist", listed), ("compression", "compression", bytes([_ZIP])),
         ("dataWindow", "box2i", box), ("displayWindow", "box2i", box),
         ("lineOrder", "lineOrder", b"\0"), ("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
         ("screenWindowCenter", "v2f", struct.pack("<ff", 0.0, 0.0)),
         ("screenWindowWidth", "float", struct.pack("<f", 1.0)),
     ):
-        header += name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+        header += name.encode() + b"\0" + type_.encode() + b"\0" + struct.pack("<i", len(value)) + value
     header += b"\0"
     chunks = []
     for top in range(0, height, _LINES[_ZIP]):

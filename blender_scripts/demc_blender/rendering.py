@@ -16,6 +16,11 @@ DATA_PASSES = (
 )
 
 
+# What Blender renders with as it comes: adaptive, this many samples at most.
+DEFAULT_SAMPLES = 4096
+DEFAULT_NOISE = 0.01
+
+
 def prepare_scene(edits, scene):
     """What holds for every render: Cycles, no denoising, no post-processing, nothing kept between
     renders (persistent data gave materials wrong textures on the second render of a process)."""

@@ -50,15 +50,18 @@ class Library:
 
     def __init__(self, folders=()):
         self.models, self.textures, self.environments, self.pictures = [], {}, [], []
+        self._indexed = {}  # name -> row of models.tsv or images.tsv
         for folder in folders:
             self._read(folder)
 
     def _read(self, folder):
         rows = _table(os.path.join(folder, "models.tsv"))
+        images = _table(os.path.join(folder, "images.tsv"))
+        self._indexed |= rows | images
         for name, path in _files(os.path.join(folder, "models"), (".glb", ".gltf")):
             row = rows.get(name, {})
             self.models.append(Model(name, path, row.get("category", ""), _number(row.get("size_m"))))
-        kinds = {name: row.get("kind", "") for name, row in _table(os.path.join(folder, "images.tsv")).items()}
+        kinds = {name: row.get("kind", "") for name, row in images.items()}
         self._read_textures(os.path.join(folder, "textures"), kinds)
         for name, path in _files(os.path.join(folder, "hdri"), (".exr", ".hdr")):
             self.environments.append((path, f"{name} {kinds.get(name, '')}".lower()))
@@ -70,6 +73,13 @@ class Library:
             if "color" in maps:
                 kind = kinds.get(name) or name.split("_")[0]
                 self.textures.setdefault(kind, []).append(maps)
+
+    def credit(self, path):
+        """(name, author, licence) of the asset that a file belongs to, None for files that are none."""
+        parts = os.path.normpath(path).split(os.sep)
+        name = parts[-2] if parts[-3:-2] == ["textures"] else os.path.splitext(parts[-1])[0]
+        row = self._indexed.get(name)
+        return row and (name, row.get("author", ""), row.get("licence", ""))
 
     def with_role(self, *roles, smallest=0.0, largest=1e9):
         """Models of these roles whose size lies in a range (unknown sizes pass)."""

@@ -18,6 +18,13 @@ class Nodes:
         self.tree.nodes.clear()
         self.output = self.new("ShaderNodeOutputMaterial")
 
+    @classmethod
+    def on(cls, tree):
+        """More nodes for a tree that exists."""
+        nodes = cls.__new__(cls)
+        nodes.tree = tree
+        return nodes
+
     def new(self, kind, **properties):
         """A node of this kind; keywords set its properties."""
         node = self.tree.nodes.new(kind)
@@ -323,11 +330,64 @@ def picture(rng, path):
     return n.principled(Base_Color=base.outputs[0], Roughness=rng.uniform(0.1, 0.9), Coat_Weight=rng.choice((0, 1)), Coat_Roughness=0.02)
 
 
-def screen(rng, path):
-    """A glowing screen showing an image."""
+def screen(rng, source):
+    """A glowing screen showing an image, behind its glass."""
     n = Nodes("screen")
-    base = image(n, path, n.uv(1.0))
+    base = image(n, source, n.uv(1.0))
     return n.principled(Base_Color=(0.01,) * 3, Roughness=0.05, Emission_Color=base.outputs[0], Emission_Strength=rng.uniform(0.5, 4))
+
+
+def glowing_picture(rng, source):
+    """An image that shines and reflects nothing: a light box, a projection."""
+    n = Nodes("glowing picture")
+    base = image(n, source, n.uv(1.0))
+    return n.finish(n.shader("ShaderNodeEmission", Color=base.outputs[0], Strength=rng.uniform(0.5, 6)))
+
+
+def embossed(rng, size):
+    """One colour, all detail in the normal: scales, weave, bricks, hammering; `size` metres a repeat."""
+    n = Nodes("embossed")
+    way = rng.choice(("scales", "waves", "bricks", "hammered", "weave", "cracks"))
+    if way == "bricks":
+        brick = n.new("ShaderNodeTexBrick", offset=rng.choice((0.0, 0.5)))
+        n.set(brick.inputs["Vector"], n.uv(size))
+        for name, value in (
+            ("Scale", 1.0),
+            ("Mortar Size", 0.03),
+            ("Mortar Smooth", 0.2),
+            ("Brick Width", 0.8),
+            ("Row Height", 0.4),
+        ):
+            n.set(brick.inputs[name], value)
+        height = n.math("SUBTRACT", n.math("MULTIPLY", n.noise(n.uv(size), 12.0), 0.2), brick.outputs[1])
+    elif way == "waves":
+        height = n.shader(
+            "ShaderNodeTexWave",
+            Vector=n.uv(size, rng.uniform(0, 3.1)),
+            Scale=1.0,
+            Distortion=rng.uniform(0, 8),
+            Detail=3.0,
+        )
+    elif way == "weave":
+        height = n.math(
+            "ADD",
+            n.shader("ShaderNodeTexWave", Vector=n.uv(size), Scale=1.0),
+            n.shader("ShaderNodeTexWave", Vector=n.uv(size, 1.5708), Scale=1.0),
+        )
+    elif way == "hammered":
+        height = n.noise(n.place(size), 4.0, 6, 0.6)
+    else:
+        cells = n.new("ShaderNodeTexVoronoi", feature="F1" if way == "scales" else "DISTANCE_TO_EDGE")
+        n.set(cells.inputs["Vector"], n.place(size))
+        n.set(cells.inputs["Scale"], 3.0)
+        height = n.math("MULTIPLY", cells.outputs["Distance"], 1.0 if way == "scales" else 3.0, clamp=True)
+    metal_ = rng.random() < 0.35
+    return n.principled(
+        Base_Color=color(rng, (0.0, 0.6), (0.3, 0.95)),
+        Metallic=float(metal_),
+        Roughness=rng.uniform(0.05, 0.7),
+        Normal=n.bump(height, rng.uniform(0.3, 1.0), size * rng.uniform(0.05, 0.3)),
+    )
 
 
 def principled_of(material):
@@ -335,10 +395,12 @@ def principled_of(material):
     return next((n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
 
 
-def image(n, path, vector, data=False):
-    """An image texture node; images are shared by path."""
+def image(n, source, vector, data=False):
+    """An image texture node of a Blender image or of a file; images are shared by path."""
     node = n.new("ShaderNodeTexImage")
-    node.image = bpy.data.images.load(path, check_existing=True)
+    node.image = (
+        source if isinstance(source, bpy.types.Image) else bpy.data.images.load(source, check_existing=True)
+    )
     if data:
         node.image.colorspace_settings.name = "Non-Color"
     n.set(node.inputs["Vector"], vector)

@@ -58,12 +58,10 @@ def facade(stage, at, turn, night):
 
 def wet(stage, material):
     """Puddles: patches of a surface turn smooth and dark."""
-    tree = material.node_tree
     shader = m.principled_of(material)
     if shader is None:
         return material
-    n = m.Nodes.__new__(m.Nodes)
-    n.material, n.tree = material, tree
+    n = m.Nodes.on(material.node_tree)
     patches = n.ramp(n.noise(n.place(1.0), stage.rng.uniform(0.2, 0.8), 4), (0.45, 1.0), (0.55, 0.05))
     old = shader.inputs["Roughness"]
     n.set(old, n.math("MULTIPLY", old.links[0].from_socket if old.is_linked else old.default_value, patches))
@@ -137,22 +135,20 @@ def height_field(rng, amount):
 
 
 def outdoor(stage):
-    """A garden or wood: ground, grass, trees, rocks, a pond, a bench of things."""
+    """A garden or wood by day."""
+    land = planted(stage)
+    sun(stage, stage.rng.random() < 0.3)
+    return land
+
+
+def planted(stage):
+    """Ground, grass, trees, rocks, a pond, a fence: a garden or wood without its light."""
     rng, lib = stage.rng, stage.library
     height = height_field(rng, rng.uniform(0.2, 1.2))
     land = stage.add(shapes.terrain(40, 120, height), palette.choose(rng, lib, "ground", 0.05))
     if rng.random() < 0.65:
         lawn = stage.add(shapes.terrain(9, 48, height), palette.choose(rng, lib, "ground", 0.05), (0, 0, 0.01))
-        blade = m.Nodes("grass")
-        tint = rng.choice(((0.08, 0.2, 0.03), (0.2, 0.25, 0.06), (0.3, 0.25, 0.1)))
-        info = blade.new("ShaderNodeHairInfo")
-        shade = blade.mix(info.outputs["Random"], tint, tuple(c * 2 for c in tint))
-        mix = blade.new("ShaderNodeMixShader")
-        mix.inputs[0].default_value = 0.35
-        blade.set(mix.inputs[1], blade.shader("ShaderNodeBsdfDiffuse", Color=shade))
-        blade.set(mix.inputs[2], blade.shader("ShaderNodeBsdfTranslucent", Color=shade))
-        settings = grow(stage, lawn, rng.randint(15000, 40000), rng.uniform(0.08, 0.3), blade.finish(mix.outputs[0]), rng.uniform(0, 0.4))
-        settings.radius_scale = 0.009
+        meadow(stage, lawn, (15000, 40000), (0.08, 0.3))
     plants = lib.with_role("plant")
     rocks = lib.with_role("nature")
     others = lib.with_role("figure", "chair", "vehicle", largest=3) + lib.with_role("building", smallest=2, largest=8)
@@ -182,13 +178,65 @@ def outdoor(stage):
     if rng.random() < 0.3:
         planks = [((0.09, 0.02, 1.1), (i * 0.12 - 6, 0, 0.5)) for i in range(100)] + [((12, 0.03, 0.08), (0, 0.03, z)) for z in (0.25, 0.85)]
         stage.add(shapes.boxes(planks, 0.004), palette.choose(rng, lib, "furniture"), (0, 4, height(0, 4)), rng.uniform(-0.5, 0.5))
-    sun(stage, rng.random() < 0.3)
     return land
 
 
-def bush(stage, at, size):
+def thicket(stage):
+    """Leaves and blades close by, one before the other, with the sun among them."""
+    rng, lib = stage.rng, stage.library
+    height = height_field(rng, rng.uniform(0.0, 0.4))
+    land = stage.add(shapes.terrain(14, 90, height), palette.choose(rng, lib, "ground", 0.05))
+    if rng.random() < 0.5:
+        lawn = stage.add(
+            shapes.terrain(5, 40, height), palette.choose(rng, lib, "ground", 0.05), (0, 0, 0.01)
+        )
+        meadow(stage, lawn, (10000, 30000), (0.1, 0.4))
+    plants = lib.with_role("plant", largest=4)
+    for _ in range(rng.randint(14, 34)):
+        r, a = rng.uniform(0.0, 3.5), rng.uniform(0, 6.28)
+        x, y = r * math.cos(a), r * math.sin(a)
+        at = (x, y, height(x, y))
+        if plants and rng.random() < 0.35:
+            group = stage.model(rng.choice(plants))
+            group.place(at, rng.uniform(0, 6.28), rng.uniform(0.6, 1.6) / max(group.size))
+        else:
+            bush(
+                stage,
+                (x, y, at[2] + rng.choice((0.0, 0.0, rng.uniform(0.2, 1.2)))),
+                rng.uniform(0.3, 1.3),
+                rng.random() < 0.4,
+            )
+        if r < 2.5:
+            stage.interest.append(Vector(at) + Vector((0, 0, 0.4)))
+    environment(stage, DAY, rng.uniform(0.4, 1.3), ("night", "moon"))
+    sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(8, 55)))
+    return land
+
+
+def meadow(stage, ground, blades, length):
+    """Grass on a ground that is its own; blades and their length are ranges."""
+    rng = stage.rng
+    n = m.Nodes("grass")
+    tint = rng.choice(((0.08, 0.2, 0.03), (0.2, 0.25, 0.06), (0.3, 0.25, 0.1)))
+    shade = n.mix(n.new("ShaderNodeHairInfo").outputs["Random"], tint, tuple(c * 2 for c in tint))
+    mix = n.new("ShaderNodeMixShader")
+    mix.inputs[0].default_value = 0.35
+    n.set(mix.inputs[1], n.shader("ShaderNodeBsdfDiffuse", Color=shade))
+    n.set(mix.inputs[2], n.shader("ShaderNodeBsdfTranslucent", Color=shade))
+    settings = grow(
+        stage,
+        ground,
+        rng.randint(*blades),
+        rng.uniform(*length),
+        n.finish(mix.outputs[0]),
+        rng.uniform(0, 0.4),
+    )
+    settings.radius_scale = 0.009
+
+
+def bush(stage, at, size, translucent=False):
     """Leaf cards on the ground."""
-    rng, sets = stage.rng, stage.library.texture_sets("leaf")
+    rng, sets = stage.rng, [] if translucent else stage.library.texture_sets("leaf")
     green = m.from_maps(rng, rng.choice(sets), 1.0, alpha=True) if sets else m.translucent(rng, (rng.uniform(0.05, 0.3), rng.uniform(0.2, 0.4), 0.05))
     stage.add(shapes.leaves(rng, rng.randint(300, 1200), size * 0.5, size * rng.uniform(0.06, 0.2)), green, (at[0], at[1], at[2] + size * 0.35))
 
@@ -231,6 +279,83 @@ def many_lights(stage):
     darkness(stage, rng.uniform(0, 0.02))
 
 
+def glints(stage):
+    """A low sun mirrored in small things: wet ground, ripples, chrome, flakes of metal, cars."""
+    rng, lib = stage.rng, stage.library
+    way = rng.choice(("wet", "water", "metal"))
+    if way == "water":
+        level = rng.uniform(0.02, 0.1)
+        waves = [(rng.uniform(2, 40), rng.uniform(2, 40), rng.uniform(0, 6.28)) for _ in range(7)]
+        # The steeper a wave is the shorter it is; all are far too small for a pixel to show one whole glint.
+        lake = shapes.terrain(
+            12, 300, lambda x, y: sum(0.02 / (a + b) * math.sin(a * x + b * y + c) for a, b, c in waves)
+        )
+        stage.add(
+            lake,
+            m.Nodes("water").principled(
+                Base_Color=(0.01, 0.03, 0.03), Roughness=rng.uniform(0.0, 0.1), IOR=1.33
+            ),
+            (0, 0, level),
+        )
+        stage.add(shapes.terrain(40, 60, height_field(rng, 0.3)), palette.choose(rng, lib, "ground"))
+    else:
+        ground = (
+            m.embossed(rng, rng.uniform(0.05, 0.3))
+            if way == "metal"
+            else wet(stage, palette.choose(rng, lib, "road"))
+        )
+        stage.add(shapes.box((40, 40, 0.1), 0, (0, 0, -0.05)), ground)
+    things = lib.with_role("vehicle", "figure", "building", smallest=0.4, largest=7)
+    for _ in range(rng.randint(6, 16)):
+        at = (rng.gauss(0, 2.0), rng.gauss(0, 2.0), 0.0)
+        if things and rng.random() < 0.4:
+            stage.model(rng.choice(things)).place(at, rng.uniform(0, 6.28))
+        else:
+            make = rng.choice(
+                (
+                    lambda: shapes.sphere(rng.uniform(0.1, 0.5), 5),
+                    lambda: shapes.monkey(rng.uniform(0.4, 1.2)),
+                    lambda: shapes.torus(0.4, 0.1),
+                    lambda: shapes.gem(rng, 0.5),
+                    lambda: shapes.vessel(rng, rng.uniform(0.4, 1.2), 0.01),
+                )
+            )
+            stage.add(
+                make(),
+                rng.choice((m.metal, m.metal, m.glass, m.plastic, lambda r: m.embossed(r, 0.1)))(rng),
+                at,
+                rng.uniform(0, 6.28),
+            )
+        stage.interest.append(Vector(at) + Vector((0, 0, 0.3)))
+    environment(stage, DAY, rng.uniform(0.2, 0.8), ("night", "moon"))
+    sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(4, 25)))
+
+
+def backdrop(stage):
+    """Figures, vehicles and things before a photographed place that fills half the frame."""
+    rng, lib = stage.rng, stage.library
+    things = lib.with_role("figure", "vehicle", "plant", "nature", "chair", "prop", smallest=0.3, largest=6)
+    for _ in range(rng.randint(3, 8)):
+        at = (rng.gauss(0, 1.5), rng.gauss(0, 1.5), 0.0)
+        if things and rng.random() < 0.8:
+            group = stage.model(rng.choice(things)).place(at, rng.uniform(0, 6.28))
+            stage.interest.append(Vector(at) + Vector((0, 0, group.size.z * rng.uniform(0.5, 1.0))))
+        else:
+            stage.add(
+                shapes.monkey(rng.uniform(0.5, 1.2)), palette.anything(rng, lib), at, rng.uniform(0, 6.28)
+            )
+            stage.interest.append(Vector(at) + Vector((0, 0, 0.6)))
+    if rng.random() < 0.5:
+        stage.add(
+            shapes.box((6, 6, 0.1), 0.02, (0, 0, -0.05)),
+            palette.choose(rng, lib, rng.choice(("floor", "road", "ground"))),
+        )
+    environment(stage, ("",), rng.uniform(0.5, 2.0))
+    if rng.random() < 0.3:
+        sun_lamp(stage, rng.uniform(0, 6.28), math.radians(rng.uniform(15, 60)))
+    stage.least_covered = 0.2
+
+
 def add_fog(stage, size, center, density):
     """A box of haze around the scene, even or in drifts."""
     rng = stage.rng
@@ -243,10 +368,17 @@ def add_fog(stage, size, center, density):
     stage.scene.cycles.volume_bounces = rng.choice((0, 1, 2))
 
 
-def spots_in_fog(stage, count, reach, height):
+def spots_in_fog(stage, count, reach, height, strength=1.0):
     """Beams that show in the haze."""
     rng = stage.rng
     for _ in range(count):
         at = (rng.uniform(-reach, reach), rng.uniform(-reach, reach), height * rng.uniform(0.7, 1.0))
-        stage.lamp("SPOT", at, rng.uniform(20, 100) * height * height, m.color(rng, (0, 0.6), (0.8, 1)),
-                   aim=(rng.uniform(-1, 1), rng.uniform(-1, 1), 0), spot_size=rng.uniform(0.3, 0.9), shadow_soft_size=0.03)
+        stage.lamp(
+            "SPOT",
+            at,
+            strength * rng.uniform(20, 100) * height * height,
+            m.color(rng, (0, 0.6), (0.8, 1)),
+            aim=(rng.uniform(-1, 1), rng.uniform(-1, 1), 0),
+            spot_size=rng.uniform(0.3, 0.9),
+            shadow_soft_size=0.03,
+        )

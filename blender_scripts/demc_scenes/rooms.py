@@ -365,6 +365,16 @@ def sunbeams(shell):
     stage.interest = lit + rng.sample(stage.interest, min(len(stage.interest), 3))
 
 
+def dim(stage, factor):
+    """Dims the sky and the soft lights in the windows, so that the sun alone is bright."""
+    for node in stage.scene.world.node_tree.nodes:
+        if node.bl_idname == "ShaderNodeBackground":
+            node.inputs["Strength"].default_value *= factor
+    for obj in stage.scene.objects:
+        if obj.type == "LIGHT" and obj.data.type == "AREA":
+            obj.data.energy *= factor
+
+
 def daylight(shell, mood):
     """Portals that guide samples to the sky, or soft area lights in the windows: both are what
     artists do for interiors; some do neither."""

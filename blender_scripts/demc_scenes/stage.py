@@ -18,6 +18,11 @@ class Stage:
         self.taken = []  # occupied rectangles of the ground plan: (x0, y0, x1, y1)
         self.tops = []  # objects with a surface to put things on
         self.interest = []  # points worth looking at
+        self.backdrop = True  # whether things on a table have one
+        self.defocus = 0.3  # share of cameras with depth of field
+        self.least_covered = 0.4  # share of a crop that surfaces cover: the sky alone teaches nothing
+        self.dark = False  # whether most of the frame may be black
+        self.panorama = False  # whether the camera sees all around
         self._imported = {}
 
     def add(self, obj, material=None, at=(0, 0, 0), turn=0.0):
@@ -59,6 +64,15 @@ class Stage:
         for copy in copies:
             self.scene.collection.objects.link(copy)
         return Group(copies)
+
+    def files(self):
+        """The files of everything that was put into the scene: models, textures, environments, pictures."""
+        images = [
+            bpy.path.abspath(image.filepath)
+            for image in bpy.data.images
+            if image.source == "FILE" and image.filepath
+        ]
+        return sorted({*self._imported, *images})
 
     def _vary_materials(self, meshes):
         """Now and then a part of a model gets another material, or another gloss."""

@@ -64,8 +64,10 @@ def cluster(stage, count, spread, maker):
 
 
 def ground(stage):
-    """Backdrop or table top."""
+    """Backdrop or table top, where there is to be one."""
     rng, lib = stage.rng, stage.library
+    if not stage.backdrop:
+        return
     material = m.paint(rng, (0.05, 0.95)) if rng.random() < 0.35 else palette.choose(rng, lib, rng.choice(("floor", "furniture", "fabric", "stone", "metal")))
     sweep(stage, material)
 
@@ -126,6 +128,96 @@ def glass(stage):
         at = (math.cos(angle) * 1.2, math.sin(angle) * 1.2, rng.uniform(0.6, 1.6))
         stage.lamp("SPOT", at, rng.uniform(20, 120), aim=(0, 0, 0.05), spot_size=0.6, shadow_soft_size=rng.uniform(0.005, 0.05))
     stage.scene.cycles.blur_glossy = rng.choice((0.0, 0.0, 1.0))
+
+
+def embossed(stage):
+    """Shapes and walls of one colour each, whose detail is all in their normals, under grazing light."""
+    rng = stage.rng
+    sweep(stage, m.embossed(rng, rng.uniform(0.05, 0.4)))
+    wall = shapes.box((2.4, 0.06, 1.4), 0.005, (0, 0, 0.7))
+    stage.add(
+        wall,
+        m.embossed(rng, rng.uniform(0.08, 0.5)),
+        (rng.uniform(-0.3, 0.3), rng.uniform(0.5, 0.9), 0),
+        rng.uniform(-0.4, 0.4),
+    )
+
+    def thing(at):
+        make = rng.choice(
+            (
+                lambda: shapes.sphere(rng.uniform(0.06, 0.14), 5),
+                lambda: shapes.monkey(rng.uniform(0.18, 0.3)),
+                lambda: shapes.torus(0.08, 0.035),
+                lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3)),
+                lambda: shapes.box([rng.uniform(0.1, 0.2) for _ in range(3)], 0.01, (0, 0, 0.1)),
+            )
+        )
+        stage.add(make(), m.embossed(rng, rng.uniform(0.01, 0.08)), at, rng.uniform(0, 6.28))
+
+    cluster(stage, rng.randint(4, 10), 0.28, thing)
+    if rng.random() < 0.6:  # nearly along the wall
+        darkness(stage, rng.uniform(0.02, 0.3))
+        side = rng.choice((-1, 1))
+        stage.lamp(
+            "SPOT",
+            (side * 2.0, rng.uniform(0.2, 0.45), rng.uniform(0.3, 1.2)),
+            rng.uniform(100, 300),
+            aim=(0, 0.3, 0.3),
+            spot_size=1.2,
+            shadow_soft_size=rng.uniform(0.01, 0.1),
+        )
+    else:
+        base_light(stage)
+
+
+def pool(stage):
+    """Water over tiles, or rings and glasses in a hard light: caustics everywhere."""
+    rng, lib = stage.rng, stage.library
+    width, depth = rng.uniform(0.8, 2.0), rng.uniform(0.15, 0.5)
+    tiled = m.tiles(rng) if rng.random() < 0.6 else palette.choose(rng, lib, "floor")
+    walls = [((width, 0.1, depth), (0, side * width / 2, depth / 2)) for side in (-1, 1)]
+    walls += [((0.1, width, depth), (side * width / 2, 0, depth / 2)) for side in (-1, 1)]
+    stage.add(shapes.boxes([((width, width, 0.05), (0, 0, -0.02)), *walls], 0.005), tiled)
+    stage.add(shapes.box((8, 8, 0.1), 0, (0, 0, -0.12)), palette.choose(rng, lib, "stone"))
+
+    def thing(at):
+        make = rng.choice(
+            (
+                lambda: shapes.sphere(rng.uniform(0.03, 0.12), 5),
+                lambda: shapes.torus(0.07, 0.02),
+                lambda: shapes.gem(rng, 0.12),
+                lambda: shapes.vessel(rng, rng.uniform(0.1, 0.3)),
+            )
+        )
+        stage.add(
+            make(),
+            rng.choice((m.glass, m.metal, m.plastic, lambda r: palette.anything(r, lib)))(rng),
+            at,
+            rng.uniform(0, 6.28),
+        )
+
+    cluster(stage, rng.randint(3, 9), width * 0.2, thing)
+    if rng.random() < 0.7:
+        level = depth * rng.uniform(0.4, 0.85)
+        waves = [(rng.uniform(4, 40), rng.uniform(-30, 30), rng.uniform(0, 6.28)) for _ in range(5)]
+        surface = shapes.terrain(
+            width - 0.1,
+            160,
+            lambda x, y: level
+            + sum(0.03 / (8 + abs(a) + abs(b)) * math.sin(a * x + b * y + c) for a, b, c in waves),
+        )
+        stage.add(surface, m.glass(rng, True))
+    environment(stage, ("studio", "indoor", "sunny", "sky"), rng.uniform(0.2, 1.0))
+    angle = rng.uniform(0, 6.28)
+    stage.lamp(
+        "SPOT",
+        (2 * math.cos(angle), 2 * math.sin(angle), rng.uniform(1.5, 3)),
+        rng.uniform(100, 500),
+        aim=(0, 0, 0),
+        spot_size=0.9,
+        shadow_soft_size=rng.uniform(0.02, 0.15),
+    )
+    stage.scene.cycles.blur_glossy = rng.choice((0.0, 1.0))
 
 
 def hair_material(rng):

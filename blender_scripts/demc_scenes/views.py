@@ -16,8 +16,6 @@ _PROBE = 160
 _DARKEST = 1e-5
 _LEAST_DETAIL = 0.05
 _LEAST_BUSY = 0.15
-# A crop of the sky alone teaches nothing: surfaces must cover this share of it.
-_COVERED = 0.4
 # Where light finds so few samples at 4 spp that more surface pixels than this stay black, no
 # affordable reference comes clean.
 _STARVED = 0.5
@@ -70,7 +68,7 @@ def around_camera(stage, center, radius, height, lens=(28, 70), spread=0.25):
 def lens_effects(stage, camera):
     """Depth of field on what the middle of the view shows, and motion blur now and then."""
     rng, scene = stage.rng, stage.scene
-    if rng.random() < 0.3:
+    if rng.random() < stage.defocus and not stage.panorama:
         direction = camera.matrix_world.to_quaternion() @ Vector((0, 0, -1))
         hit, point, *_ = scene.ray_cast(bpy.context.evaluated_depsgraph_get(), camera.location, direction)
         camera.data.dof.use_dof = True
@@ -87,6 +85,16 @@ def lens_effects(stage, camera):
             move(rng, obj, max(obj.dimensions) * 0.12)
         if rng.random() < 0.4:
             move(rng, camera, 0.02)
+
+
+def all_around(stage, camera):
+    """Makes a camera see all around, as a panorama of twice its height."""
+    stage.panorama = True
+    camera.data.type = "PANO"
+    owner = camera.data if hasattr(camera.data, "panorama_type") else camera.data.cycles  # before Blender 5
+    owner.panorama_type = "EQUIRECTANGULAR"
+    camera.rotation_euler.x, camera.rotation_euler.y = math.pi / 2, 0.0
+    return camera
 
 
 def move(rng, obj, distance):
@@ -131,16 +139,16 @@ def starved(image, normal):
     return float((image.max(-1)[covered] <= 1e-7).mean()) if covered.any() else 0.0
 
 
-def refusal(guides):
-    """Why a probe frame is not worth rendering, or None."""
+def refusal(guides, dark=False):
+    """Why a probe frame is not worth rendering, or None; `dark` where most of it may be black."""
     image, _, normal = guides
     luminance = image @ np.array([0.2126, 0.7152, 0.0722], np.float32)
     # A few samples leave most pixels of an interior black: judge means of small blocks.
     height, width = (n // 8 * 8 for n in luminance.shape)
     blocks = luminance[:height, :width].reshape(height // 8, 8, width // 8, 8).mean((1, 3))
-    if brightness(image) < _DARKEST or np.median(blocks) < 0.01 * blocks.mean():
+    if brightness(image) < _DARKEST or not dark and np.median(blocks) < 0.01 * blocks.mean():
         return "black"
-    if starved(image, normal) > _STARVED:
+    if not dark and starved(image, normal) > _STARVED:
         return "too noisy"
     return None
 
@@ -168,9 +176,17 @@ def expose(rng, scene, image):
     return factor
 
 
-def crops(rng, scene, guides, count, size):
+def shows(stage, guides):
+    """Whether a whole frame shows enough: half of what a crop must, as no crop was chosen for it."""
+    _, albedo, normal = guides
+    covered = (np.abs(normal).max(-1) > 0.1).mean()
+    return covered > stage.least_covered / 2 and busy(albedo, normal) > _LEAST_BUSY / 3
+
+
+def crops(stage, guides, count, size):
     """Up to `count` regions X,Y,W,H of the frame, the likelier the more they show. Crops with too
     little detail, or darkness alone, are not offered."""
+    rng, scene = stage.rng, stage.scene
     image, albedo, normal = guides
     width, height = rendering.frame_size(scene)
     size = (min(size[0], width), min(size[1], height))
@@ -181,7 +197,12 @@ def crops(rng, scene, guides, count, size):
         part = np.s_[int(y * scale):max(int((y + size[1]) * scale), int(y * scale) + 2), int(x * scale):max(int((x + size[0]) * scale), int(x * scale) + 2)]
         light = image[part].mean(-1)
         covered = (np.abs(normal[part]).max(-1) > 0.1).mean()
-        if light.mean() < _DARK_SHARE * frame_level or covered < _COVERED or starved(image[part], normal[part]) > _STARVED + 0.1:
+        if (
+            light.mean() < _DARK_SHARE * frame_level
+            or covered < stage.least_covered
+            or not stage.dark
+            and starved(image[part], normal[part]) > _STARVED + 0.1
+        ):
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)

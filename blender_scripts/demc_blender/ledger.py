@@ -1,0 +1,72 @@
+"""The table of what was rendered into a folder: one row a file, with its seeds, its cost and its SHA-256.
+
+A file counts as done once its row is there, which is written last: a killed run leaves at most a file
+without a row, and the next run makes it again.
+"""
+
+import csv
+import hashlib
+import os
+
+NAME = "views.csv"
+COLUMNS = (
+    "view",
+    "kind",
+    "seed",
+    "camera",
+    "frame",
+    "filter",
+    "file",
+    "spp",
+    "noise_seed",
+    "seconds",
+    "noise",
+    "sha256",
+)
+
+
+class Ledger:
+    """The folder's table. `seconds` are those of all processors together, `noise` is a reference's own."""
+
+    def __init__(self, folder):
+        self.folder, self.path = folder, os.path.join(folder, NAME)
+
+    def rows(self):
+        """File name -> its latest row."""
+        if not os.path.exists(self.path):
+            return {}
+        with open(self.path, encoding="utf-8", newline="") as file:
+            return {row["file"]: row for row in csv.DictReader(file)}
+
+    def missing(self, name):
+        """Whether a file is still to be rendered: not there, or without its row."""
+        return not os.path.exists(os.path.join(self.folder, name)) or name not in self.rows()
+
+    def add(self, **row):
+        """Adds a row for a file that is there; columns that are not named stay empty."""
+        row["sha256"] = _sha256(os.path.join(self.folder, row["file"]))
+        line = ",".join(str(row.get(column, "")) for column in COLUMNS) + "\n"
+        with open(self.path, "a", encoding="utf-8", newline="") as file:
+            file.write(("" if file.tell() else ",".join(COLUMNS) + "\n") + line)
+
+    def check(self):
+        """Compares the files with their hashes; prints a line for each that is missing or differs, and
+        returns how many those are."""
+        rows, bad = self.rows(), 0
+        for name, row in rows.items():
+            path = os.path.join(self.folder, name)
+            wrong = (
+                "is missing"
+                if not os.path.exists(path)
+                else f"is not what {NAME} lists" if _sha256(path) != row["sha256"] else ""
+            )
+            if wrong:
+                bad += 1
+                print(f"{path}: {wrong}; delete it and render again")
+        print(f"{len(rows) - bad} of {len(rows)} files are as listed")
+        return bad
+
+
+def _sha256(path):
+    with open(path, "rb") as file:
+        return hashlib.sha256(file.read()).hexdigest()
