@@ -1,6 +1,6 @@
 //! Changes to a frame that leave it as good a picture: flips, quarter turns, a permutation of RGB, exposure.
 //!
-//! A vector pass must change with the picture. Camera-space normals turn as the image turns. World
+//! A pass of vectors must change with the picture. Camera-space normals and motion turn as the image turns. World
 //! space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
 //! world, so the same flip and turn are applied to the horizontal axes of normals and positions,
 //! about the vertical one, which gravity makes special.
@@ -59,8 +59,9 @@ impl Augment {
     pub fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
         let mut planes = self.moved(planes);
         match pass {
-            Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes),
-            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Vector => {}
+            Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes, 0),
+            Pass::Vector => [0, 2].into_iter().for_each(|first| self.turn_vectors(&mut planes, first)),
+            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth => {}
             _ if self.rgb != Self::IDENTITY.rgb => planes = self.permuted(&planes),
             _ => {}
         }
@@ -92,10 +93,10 @@ impl Augment {
         })
     }
 
-    /// Turns the first two axes of a vector pass as the picture turned (y points up).
-    fn turn_vectors(&self, planes: &mut Planes) {
+    /// Turns the vectors of two channels as the picture turned; the second of them points up.
+    fn turn_vectors(&self, planes: &mut Planes, first: usize) {
         let n = planes.pixels();
-        let (xs, rest) = planes.data.split_at_mut(n);
+        let (xs, rest) = planes.data[first * n..].split_at_mut(n);
         for (x, y) in xs.iter_mut().zip(rest) {
             if self.flip {
                 *x = -*x;
@@ -145,6 +146,31 @@ mod tests {
         let turned = (0..4).fold(start.clone(), |p, _| turn.pass(Pass::Normal, &p));
         let flipped = (0..2).fold(start.clone(), |p, _| flip.pass(Pass::Normal, &p));
         assert_eq!((turned, flipped), (start.clone(), start));
+    }
+
+    /// Pixel (x, y), y downwards, was at (x + X, y - Y) one frame before and will be at (x - Z, y + W) one later.
+    #[test]
+    fn motion_leads_to_the_same_places_of_a_picture_that_was_flipped_and_turned() {
+        const SIDE: usize = 5;
+        let plane = |values: [f32; SIDE * SIDE]| Planes::from_vec(1, SIDE, SIDE, values.into());
+        let marks = |at: usize| plane(std::array::from_fn(|i| if i == at { 1.0 } else { 0.0 }));
+        let place = |planes: &Planes| planes.data.iter().position(|v| *v == 1.0).expect("a mark stays one");
+        // What is at column 3, row 1 was at 1, 0 and will be at 4, 4.
+        let at = |x: usize, y: usize| marks(y * SIDE + x);
+        let [before, now, later] = [at(1, 0), at(3, 1), at(4, 4)];
+        let motion = [-2.0, 1.0, -1.0, 3.0].map(|v| [v; SIDE * SIDE]).concat();
+        let motion = Planes::from_vec(4, SIDE, SIDE, motion);
+        for (flip, turns) in (0..8).map(|i| (i >= 4, i % 4)) {
+            let augment = Augment { flip, turns, ..Augment::IDENTITY };
+            let changed = augment.pass(Pass::Vector, &motion);
+            let [before, now, later] = [&before, &now, &later].map(|marks| place(&augment.moved(marks)));
+            let [x, y, z, w] = std::array::from_fn(|c| changed.channel(c)[now] as isize);
+            let from = |columns: isize, rows: isize| {
+                let (column, row) = ((now % SIDE) as isize + columns, (now / SIDE) as isize + rows);
+                (row * SIDE as isize + column) as usize
+            };
+            assert_eq!((from(x, -y), from(-z, w)), (before, later), "flip {flip}, {turns} turns");
+        }
     }
 
     #[test]
