@@ -24,7 +24,7 @@
 //! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits weights;
 //! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
 //! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
-//! [`nn`] is differentiable image operations on dfdx's tape; [`passes`] says what a channel means; [`frame`] is an EXR exactly
+//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given; [`passes`] says what a channel means; [`frame`] is an EXR exactly
 //! as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
@@ -45,6 +45,7 @@ pub mod passes;
 pub mod planes;
 #[cfg(feature = "report")]
 pub mod report;
+pub mod shot;
 #[cfg(feature = "report")]
 pub mod stability;
 #[cfg(feature = "test-sets")]

@@ -12,8 +12,9 @@ use demc::{
     Error, Result,
     denoise::{self, Batch, End, Job, Options, Outcome},
     models::{self, Denoiser},
-    passes::{Pass, PassSet},
+    passes::Pass,
     planes::Planes,
+    shot::Shot,
 };
 
 const FRAME: &str = "s0000_room_0004spp.exr";
@@ -58,10 +59,10 @@ impl Denoiser for Waits {
         &[Pass::Combined]
     }
 
-    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
         self.0.wait();
         self.0.wait();
-        Ok(passes.require(Pass::Combined, self.name())?.clone())
+        Ok(shot.passes.require(Pass::Combined, self.name())?.clone())
     }
 }
 

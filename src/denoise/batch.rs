@@ -19,7 +19,7 @@ use super::{
     Job, Options, Report, Views,
     job::{self, Denoised},
 };
-use crate::{Error, Result, error::attempt, models::Denoiser, passes::PassSet};
+use crate::{Error, Result, error::attempt, models::Denoiser, shot::Shot};
 
 /// What became of one file.
 pub enum Outcome {
@@ -166,7 +166,7 @@ fn spawn(
         .expect("the system has room for three threads");
 }
 
-fn load_all(shared: &Shared, next: &SyncSender<(usize, Views<PassSet>)>, ended: &Sender<Message>) {
+fn load_all(shared: &Shared, next: &SyncSender<(usize, Views<Shot>)>, ended: &Sender<Message>) {
     for (index, job) in shared.jobs.iter().enumerate() {
         let existing = if shared.options.overwrite { None } else { job::existing(&job.output) };
         if let Some(headers) = existing {
@@ -185,7 +185,7 @@ fn load_all(shared: &Shared, next: &SyncSender<(usize, Views<PassSet>)>, ended: 
 
 fn denoise_all(
     shared: &Shared,
-    frames: &Receiver<(usize, Views<PassSet>)>,
+    frames: &Receiver<(usize, Views<Shot>)>,
     next: &SyncSender<(usize, Views<Denoised>)>,
     ended: &Sender<Message>,
 ) {

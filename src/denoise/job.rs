@@ -12,6 +12,7 @@ use crate::{
     models::Denoiser,
     passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassSet, is_bare},
     planes::Planes,
+    shot::{self, Shot},
 };
 
 /// One file to do.
@@ -91,7 +92,7 @@ pub struct Views<T> {
 ///
 /// # Errors
 /// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is not demc's.
-pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<PassSet>> {
+pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     if let Some(Err(why)) = options.layer.as_deref().map(check_layer_name) {
         return Err(Error::Usage(format!("layer '{}': {why}", options.layer.as_deref().unwrap_or_default())));
     }
@@ -111,7 +112,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
-    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha, Pass::NoisyImage]].concat();
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha]].concat();
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -120,19 +121,22 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     let mut views = Vec::new();
     for layer in eyes {
-        let mut set = passes::read_layer(&frame, layer, &wanted)?;
-        if set.use_noisy_image() {
+        let mut shot = shot::prepare_layer(&frame, layer, &wanted)?;
+        if shot.was_denoised {
             report.notes.push(
                 "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
             );
         }
         // Before any work: a missing pass is the user's commonest mistake.
-        set.require_all(needed.iter().copied(), model.name())?;
-        for (pass, count) in set.sanitize() {
+        shot.passes.require_all(needed.iter().copied(), model.name())?;
+        if model.reads_halves() {
+            shot.read_halves()?;
+        }
+        for (pass, count) in &shot.repaired {
             *report.repaired.entry(pass.to_string()).or_default() += count;
         }
-        (report.width, report.height) = (set.width, set.height);
-        views.push((layer.clone(), set));
+        (report.width, report.height) = (shot.passes.width, shot.passes.height);
+        views.push((layer.clone(), shot));
     }
     report.notes.dedup(); // stereo views repeat them
     Ok(Views { frame, views, report })
@@ -160,26 +164,27 @@ pub struct Denoised {
 ///
 /// # Errors
 /// The model cannot denoise the frame.
-pub fn denoise(loaded: Views<PassSet>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
+pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up first.
     rayon::scope(|_| denoise_here(loaded, model, options))
 }
 
-fn denoise_here(loaded: Views<PassSet>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
+fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     let Views { frame, views, mut report } = loaded;
     let mut done = Vec::with_capacity(views.len());
-    for (layer, mut set) in views {
-        report.notes.extend(model.notes(&set).filter(|note| !report.notes.contains(note)));
+    for (layer, mut shot) in views {
+        report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
         let start = Instant::now();
-        let radiance = model.denoise_tiled(&set, options.tile)?;
+        let radiance = model.denoise_tiled(&shot, options.tile)?;
         report.seconds += start.elapsed().as_secs_f64();
-        if (radiance.channels, radiance.width, radiance.height) != (3, set.width, set.height) {
+        let size = (shot.passes.width, shot.passes.height);
+        if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
             return Err(Error::invalid(
-                &set.path,
+                &shot.passes.path,
                 format!("model {} returned an image of the wrong size; choose another model", model.name()),
             ));
         }
-        let alpha = set.remove(Pass::Alpha);
+        let alpha = shot.passes.remove(Pass::Alpha);
         let radiance = finite(radiance, &mut report);
         done.push((layer, Denoised { radiance, alpha }));
     }
