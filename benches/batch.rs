@@ -21,6 +21,7 @@ use demc::{
     frame::{Frame, NewChannel},
     models,
     passes::{self, Pass},
+    shot,
 };
 use exr::prelude::*;
 use half::f16;
@@ -178,15 +179,14 @@ fn overlap(options: &Options) {
     let wanted: Vec<Pass> = [Pass::Combined, Pass::Alpha].iter().chain(model.passes()).copied().collect();
     let (mut reads, mut denoises, mut writes) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..=5 {
-        let ((frame, mut set), read) = timed(|| {
+        let ((frame, shot), read) = timed(|| {
             let frame = Frame::read(&first).expect("just written");
             let layers = passes::layers(&frame);
             let layer = passes::choose(&frame, &layers, None).expect("a render has a view layer");
-            let set = passes::read_layer(&frame, layer, &wanted).expect("its passes are known");
-            (frame, set)
+            let shot = shot::prepare_layer(&frame, layer, &wanted).expect("its passes are known");
+            (frame, shot)
         });
-        set.sanitize();
-        let (image, denoise) = timed(|| model.denoise(&set).expect("the passes are there"));
+        let (image, denoise) = timed(|| model.denoise(&shot).expect("the passes are there"));
         let ((), write) = timed(|| store(frame, &image, &folder.path().join("alone.exr")));
         if round > 0 {
             reads.push(read);

@@ -26,6 +26,7 @@ use demc::{
     nn::{Precision, Rng, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
+    shot::Shot,
     train::{Loss, Optimizer, Rule},
 };
 use dfdx::tensor_ops::Backward;
@@ -115,8 +116,8 @@ fn jobs(small: bool) -> Vec<Job> {
                 flops: Some(2.0 * macs * (width * height) as f64),
                 make: Box::new(move || {
                     let model = models::open(name).expect("it is built in");
-                    let passes = frame(width, height);
-                    Box::new(move || drop(model.denoise(&passes).expect("every pass is there")))
+                    let shot = Shot::new(frame(width, height));
+                    Box::new(move || drop(model.denoise(&shot).expect("every pass is there")))
                 }),
             });
         }
@@ -268,9 +269,9 @@ fn cost_by_size(csv: &PathBuf, options: &Options) {
         let mut times = vec![Vec::new(); sizes.len()];
         for round in 1..=options.rounds {
             for (&(width, height), times) in sizes.iter().zip(&mut times) {
-                let passes = frame(width, height);
+                let shot = Shot::new(frame(width, height));
                 clear_buffers();
-                let run = || drop(model.denoise(&passes).expect("every pass is there"));
+                let run = || drop(model.denoise(&shot).expect("every pass is there"));
                 run();
                 times.push(seconds(run));
                 eprintln!("{name} {width}x{height} round {round}: {:.3} s", times[times.len() - 1]);

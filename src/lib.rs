@@ -1,16 +1,38 @@
 //! Removes Monte Carlo noise from Blender Cycles renders stored as multilayer EXR.
 //!
+//! A frame is read, denoised, and written with everything it held and a layer more:
+//!
+//! ```
+//! # fn main() -> demc::Result<()> {
+//! # let folder = tempfile::tempdir().expect("a folder for temporary files");
+//! # let input = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/s0000_room_0004spp.exr");
+//! # let output = folder.path().join("room.exr");
+//! use demc::{denoise, models};
+//!
+//! let model = models::open("demc-m")?;
+//! let options = denoise::Options { layer: Some("Clean".into()), ..Default::default() };
+//! let report = denoise::file(&input, &output, &*model, &options)?;
+//! println!("{}x{} pixels in {:.2} s", report.width, report.height, report.seconds);
+//! # assert!(output.is_file() && report.seconds > 0.0);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The features `cli`, `report` and `train` (all on by default) add the program `demc`, reports over test sets, and training.
+//!
 //! Modules point downwards only:
-//! [`cli`] dispatches; [`stability`] changes inputs and [`report`] scores methods over a test set; [`train`] fits weights;
-//! [`models`] holds every denoising method behind one trait; [`augment`] changes a frame to another that is as good;
-//! [`features`] turns passes into network inputs; [`filters`] are classical building blocks; [`nn`] is differentiable image
-//! operations on dfdx's tape; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions;
-//! [`kernels`] holds the arithmetic, and the only `unsafe`.
+//! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits weights;
+//! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
+//! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
+//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given; [`passes`] says what a channel means; [`frame`] is an EXR exactly
+//! as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
 pub mod augment;
+#[cfg(feature = "cli")]
 pub mod cli;
+pub mod denoise;
 pub mod error;
 pub mod features;
 pub mod filters;
@@ -21,9 +43,14 @@ pub mod models;
 pub mod nn;
 pub mod passes;
 pub mod planes;
+#[cfg(feature = "report")]
 pub mod report;
+pub mod shot;
+#[cfg(feature = "report")]
 pub mod stability;
+#[cfg(feature = "test-sets")]
 pub mod testset;
+#[cfg(feature = "train")]
 pub mod train;
 
 pub use error::{Error, Result};

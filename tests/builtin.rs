@@ -19,6 +19,7 @@ use demc::{
     models::{self, learned, network::Architecture},
     passes::{self, Pass, PassSet},
     planes::Planes,
+    shot::Shot,
 };
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
@@ -158,8 +159,10 @@ fn a_frame_of_many_samples_is_never_made_worse() {
     let [noisy, reference] = pair.each_ref().map(|set| set.require(Pass::Combined, "this test").unwrap());
     let before = metrics::error::relmse(noisy, reference);
     for model in ["demc-s", "demc-m", "demc-l"] {
-        let after =
-            metrics::error::relmse(&models::open(model).unwrap().denoise(&pair[0]).unwrap(), reference);
+        let after = metrics::error::relmse(
+            &models::open(model).unwrap().denoise(&Shot::new(pair[0].clone())).unwrap(),
+            reference,
+        );
         assert!(after < before, "{model}: RelMSE {before} became {after}");
     }
 }
@@ -223,12 +226,14 @@ fn radiance_256_times_darker_or_brighter_is_denoised_alike() {
     edit(&mut plain, Pass::DenoisingAlbedo, |v| v.iter_mut().for_each(|v| *v = v.min(0.9)));
     for name in ["demc-s", "demc-m", "demc-l"] {
         let model = models::open(name).unwrap();
-        let expected = model.denoise(&plain).unwrap();
+        let expected = model.denoise(&Shot::new(plain.clone())).unwrap();
         for stops in [-8, 8] {
             let factor = 2f32.powi(stops);
             let mut scaled = plain.clone();
             edit(&mut scaled, Pass::Combined, |v| v.iter_mut().for_each(|v| *v *= factor));
-            for (got, want) in model.denoise(&scaled).unwrap().data.iter().zip(&expected.data) {
+            for (got, want) in
+                model.denoise(&Shot::new(scaled.clone())).unwrap().data.iter().zip(&expected.data)
+            {
                 assert!(
                     (got / factor - want).abs() <= 0.01 * want.abs(),
                     "{name}, 2^{stops}: {got} for {want}"
@@ -246,7 +251,7 @@ fn a_black_background_stays_black_to_the_bit() {
         edit(&mut frame, pass, |v| v.chunks_mut(WIDTH).for_each(|row| row[WIDTH / 2..].fill(0.0)));
     }
     for name in ["demc-s", "demc-m", "demc-l"] {
-        let image = models::open(name).unwrap().denoise(&frame).unwrap();
+        let image = models::open(name).unwrap().denoise(&Shot::new(frame.clone())).unwrap();
         for row in image.data.chunks(WIDTH) {
             // Two columns see the light beside them.
             let (lit, black) = row.split_at(WIDTH / 2 + 2);
@@ -287,7 +292,7 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
         [Pass::Combined, Pass::DenoisingAlbedo].map(|p| frame.require(p, "test").unwrap());
     let (exposure, samples) = (features::exposure(radiance), frame.samples);
     shrink(&mut mean, &Render { radiance, albedo, exposure, samples, firefly: features::FIREFLY });
-    assert_eq!(twice.denoise(&frame).unwrap(), mean);
+    assert_eq!(twice.denoise(&Shot::new(frame.clone())).unwrap(), mean);
 }
 
 #[test]
@@ -302,7 +307,7 @@ fn a_firefly_near_the_border_is_no_company_for_its_mirror_image() {
     // What the second look lets through of it, beside what the first does.
     let deviation = |model: &str| {
         let model = models::open(model).unwrap();
-        let [lit, clean] = [&lit, &clean].map(|frame| model.denoise(frame).unwrap());
+        let [lit, clean] = [&lit, &clean].map(|frame| model.denoise(&Shot::new(frame.clone())).unwrap());
         let relative =
             lit.data.iter().zip(&clean.data).map(|(lit, clean)| ((lit - clean) / (clean + 0.01)).abs());
         relative.fold(0.0, f32::max)
@@ -345,8 +350,9 @@ fn what_a_frame_is_padded_with_does_no_harm_at_its_end() {
         let ratios = HEIGHTS.map(|height| {
             // RelMSE of the last rows of a frame that ends at `height`; one of 112 rows needs no padding.
             let error = |rows: usize| {
-                let image =
-                    model.denoise(&noisy.rows(&GUIDE_PASSES, height - rows..height)).expect("all is there");
+                let image = model
+                    .denoise(&Shot::new(noisy.rows(&GUIDE_PASSES, height - rows..height)))
+                    .expect("all is there");
                 let end = |planes: &Planes, height| planes.window((0, height - END), (noisy.width, END));
                 metrics::error::relmse(&end(&image, rows), &end(reference, height))
             };
@@ -374,7 +380,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
 fn arithmetic_can_be_chosen_and_changes_little() {
     let passes = window(130, 70);
     for name in ["demc-s", "demc-m", "demc-l"] {
-        let image = |name: &str| models::open(name).unwrap().denoise(&passes).unwrap().data;
+        let image =
+            |name: &str| models::open(name).unwrap().denoise(&Shot::new(passes.clone())).unwrap().data;
         let exact = image(&format!("{name}:f32"));
         let energy: f32 = exact.iter().map(|v| v * v).sum();
         let mut all = vec![exact.clone()];

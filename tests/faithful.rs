@@ -12,6 +12,7 @@ use demc::{
     models::{self, Denoiser},
     passes::{self, Pass, PassSet},
     planes::Planes,
+    shot::Shot,
 };
 
 const MODELS: [&str; 3] = ["demc-s", "demc-m", "demc-l"];
@@ -61,7 +62,7 @@ fn light_without_noise_comes_back_as_it_was() {
     for name in MODELS {
         for samples in [None, Some(4), Some(64)] {
             frame.samples = samples;
-            let error = relmse(&model(name).denoise(&frame).unwrap(), combined(&frame));
+            let error = relmse(&model(name).denoise(&Shot::new(frame.clone())).unwrap(), combined(&frame));
             assert!(error < 1e-4, "{name}, {samples:?}: {error}");
         }
     }
@@ -71,10 +72,10 @@ fn light_without_noise_comes_back_as_it_was() {
 fn a_result_denoised_again_stays() {
     let first = part(160, 90);
     for name in MODELS {
-        let once = model(name).denoise(&first).unwrap();
+        let once = model(name).denoise(&Shot::new(first.clone())).unwrap();
         let mut second = first.clone();
         second.insert(Pass::Combined, once.clone());
-        let twice = model(name).denoise(&second).unwrap();
+        let twice = model(name).denoise(&Shot::new(second.clone())).unwrap();
         let change = |from: &Planes, to: &Planes| relmse(from, to).sqrt();
         let [before, again] = [change(combined(&first), &once), change(&once, &twice)];
         assert!(again < 0.1 * before, "{name}: {before}, then {again}");
@@ -91,8 +92,8 @@ fn a_region_is_denoised_as_a_frame_of_its_own() {
         frame.insert(pass, planes.placed_in(size, place));
     }
     for name in MODELS {
-        let alone = model(name).denoise(&region).unwrap();
-        let image = model(name).denoise(&frame).unwrap();
+        let alone = model(name).denoise(&Shot::new(region.clone())).unwrap();
+        let image = model(name).denoise(&Shot::new(frame.clone())).unwrap();
         assert_eq!(image, alone.placed_in(size, place), "{name}");
     }
 }
@@ -126,7 +127,7 @@ fn highlights_of_many_samples_keep_their_light() {
     for samples in [64, 256, 4096] {
         let (frame, reference) = of_more_samples(samples);
         for name in MODELS {
-            let kept = brightest(&model(name).denoise(&frame).unwrap(), &reference);
+            let kept = brightest(&model(name).denoise(&Shot::new(frame.clone())).unwrap(), &reference);
             assert!((0.98..1.02).contains(&kept), "{name}, {samples} samples: {kept}");
         }
     }
@@ -146,7 +147,7 @@ fn lone_pixels_of_many_samples_vanish() {
     }
     frame.insert(Pass::Combined, radiance);
     for name in MODELS {
-        let image = model(name).denoise(&frame).unwrap();
+        let image = model(name).denoise(&Shot::new(frame.clone())).unwrap();
         for &at in &fireflies {
             let left = (0..3).map(|c| image.data[c * pixels + at]).fold(0.0, f32::max);
             assert!(left < most, "{name}: a firefly left {left} at {at}, the frame has at most {most}");
@@ -172,7 +173,7 @@ fn a_disc_too_bright_for_half_floats_is_no_hole() {
     }
     frame.sanitize();
     for name in MODELS {
-        let image = model(name).denoise(&frame).unwrap();
+        let image = model(name).denoise(&Shot::new(frame.clone())).unwrap();
         assert_eq!(image.non_finite(), 0);
         for c in 0..3 {
             let mut disc = image.channel(c).iter().enumerate().filter(|(i, _)| in_disc(*i));
@@ -187,7 +188,7 @@ fn more_samples_never_make_a_result_worse_nor_worse_than_its_input() {
         let mut last = f64::INFINITY;
         for samples in [4, 16, 64, 256, 1024, 4096] {
             let (frame, reference) = of_more_samples(samples);
-            let error = relmse(&model(name).denoise(&frame).unwrap(), &reference);
+            let error = relmse(&model(name).denoise(&Shot::new(frame.clone())).unwrap(), &reference);
             let input = relmse(combined(&frame), &reference);
             assert!(error < last, "{name}: {error} of {samples} samples, {last} of fewer");
             assert!(error <= input, "{name}: {error} of {samples} samples, its input {input}");

@@ -18,8 +18,8 @@ use common::files::{bits, data, read_exr, samples};
 use demc::{
     kernels::{narrow::Engine, simd::Tier},
     models,
-    passes::{self, PassSet},
     planes::Planes,
+    shot::{self, Shot},
 };
 
 /// Trained networks with their arithmetic chosen, so that all of it is compared wherever it is not the fastest.
@@ -74,10 +74,9 @@ fn hash_of(image: &Planes) -> String {
 }
 
 /// What the methods are given.
-fn window() -> PassSet {
-    let mut whole = passes::load(frame(), None).unwrap();
-    whole.sanitize();
-    whole.map(SIZE, |_, planes| planes.window(PLACE, SIZE))
+fn window() -> Shot {
+    let whole = shot::prepare(frame(), None).unwrap().passes;
+    Shot::new(whole.map(SIZE, |_, planes| planes.window(PLACE, SIZE)))
 }
 
 /// The layer that the program adds to the whole frame.
@@ -97,8 +96,8 @@ fn stored() -> String {
 
 /// The hash of every method's result with the instructions that this process was told to use.
 fn hashes() -> Vec<(&'static str, String)> {
-    let passes = window();
-    let hash = |name| (name, hash_of(&models::open(name).unwrap().denoise(&passes).unwrap()));
+    let shot = window();
+    let hash = |name| (name, hash_of(&models::open(name).unwrap().denoise(&shot).unwrap()));
     METHODS.into_iter().map(hash).chain([(STORED, stored())]).collect()
 }
 

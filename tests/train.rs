@@ -15,7 +15,7 @@ use demc::{
     Error,
     models::{self, weights_file},
     nn::weights::{self, Tensor},
-    passes,
+    shot,
     train::{self, Event, Options},
 };
 use predicates::prelude::*;
@@ -97,10 +97,10 @@ fn weights_know_the_ranges_that_eight_bits_need() {
     assert_eq!(ranges.len(), 2 * 27, "every layer that ends in a ReLU, the prefilter's too: {ranges:?}");
     assert!(ranges.values().all(|range| *range > 0.0 && range.is_finite()), "{ranges:?}");
     let frame = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
-    let passes = passes::load(Path::new(&frame), None).expect("a frame");
+    let shot = shot::prepare(&frame, None).expect("a frame");
     let image = |arithmetic: &str| {
         let model = models::open(&format!("{}:{arithmetic}", weights.display())).expect("it has ranges");
-        model.denoise(&passes).expect("all passes are there").data
+        model.denoise(&shot).expect("all passes are there").data
     };
     let (exact, rounded) = (image("f32"), image("int8"));
     let energy: f32 = exact.iter().map(|v| v * v).sum();

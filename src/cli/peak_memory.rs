@@ -11,7 +11,7 @@ use std::{
 use clap::Args as ClapArgs;
 
 use super::print_line;
-use crate::{Error, Result, models, passes};
+use crate::{Error, Result, models, shot};
 
 /// Name of the subcommand.
 pub const COMMAND: &str = "peak-memory";
@@ -48,11 +48,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
     let model = models::open(&args.model)?;
-    let mut set = passes::load(&args.input, args.view_layer.as_deref())?;
-    set.use_noisy_image();
-    set.sanitize();
+    let mut shot = shot::prepare(&args.input, args.view_layer.as_deref())?;
+    if model.reads_halves() {
+        shot.read_halves()?;
+    }
     let before = status_mib("VmHWM:");
-    let (image, grown) = peak_mib(|| model.denoise(&set));
+    let (image, grown) = peak_mib(|| model.denoise(&shot));
     image?;
     let (Some(grown), Some(before), Some(after)) = (grown, before, status_mib("VmHWM:")) else {
         return Err(Error::Usage(format!("{COMMAND}: this system does not tell; run it on Linux")));

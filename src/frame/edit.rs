@@ -23,7 +23,7 @@ use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text, zip};
 use crate::Result;
 
 /// Largest finite half.
-pub(crate) const HALF_MAX: f32 = f16::MAX.to_f32_const();
+pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
 /// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is replaced.
 const MARK: &str = "demc";

@@ -24,8 +24,7 @@ use exr::{
     },
 };
 
-pub(crate) use edit::HALF_MAX;
-pub use edit::{NewChannel, Recoded};
+pub use edit::{HALF_MAX, NewChannel, Recoded};
 pub use write::atomically;
 
 use crate::{Error, Result};

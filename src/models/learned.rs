@@ -15,6 +15,7 @@ use crate::{
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
+    shot::Shot,
 };
 
 const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
@@ -132,15 +133,16 @@ impl Denoiser for Learned {
         self.network.optional_passes()
     }
 
-    fn notes(&self, _: &PassSet) -> Option<String> {
+    fn notes(&self, _: &Shot) -> Option<String> {
         self.network.notes().map(|note| format!("{}: {note}", self.name))
     }
 
-    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        self.denoise_tiled(passes, None)
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        self.denoise_tiled(shot, None)
     }
 
-    fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
+        let passes = &shot.passes;
         if self.metadata.network.architecture != Architecture::Pyramid {
             return self.network.infer(passes, tile);
         }

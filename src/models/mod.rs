@@ -14,12 +14,7 @@ use std::{path::Path, time::Instant};
 
 use network::{Architecture, Config, Network};
 
-use crate::{
-    Error, Result,
-    nn::Precision,
-    passes::{Pass, PassSet},
-    planes::Planes,
-};
+use crate::{Error, Result, nn::Precision, passes::Pass, planes::Planes, shot::Shot};
 
 /// One way to remove noise from a frame.
 pub trait Denoiser: Send + Sync {
@@ -34,26 +29,31 @@ pub trait Denoiser: Send + Sync {
         &[]
     }
 
+    /// Whether it makes use of half buffers, see [`Shot::read_halves`].
+    fn reads_halves(&self) -> bool {
+        false
+    }
+
     /// What the user should know about how it treats this frame.
-    fn notes(&self, passes: &PassSet) -> Option<String> {
-        let _ = passes;
+    fn notes(&self, shot: &Shot) -> Option<String> {
+        let _ = shot;
         None
     }
 
-    /// Denoised radiance, (3, H, W), of finite passes (see [`PassSet::sanitize`]).
+    /// Denoised radiance, (3, H, W).
     ///
     /// # Errors
     /// A pass is missing, or the method cannot run here; the message says why.
-    fn denoise(&self, passes: &PassSet) -> Result<Planes>;
+    fn denoise(&self, shot: &Shot) -> Result<Planes>;
 
     /// As [`Denoiser::denoise`], working on squares of at most `tile` pixels at a time where the method
     /// can, to bound its memory; a method that cannot ignores the hint.
     ///
     /// # Errors
     /// As [`Denoiser::denoise`].
-    fn denoise_tiled(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
         let _ = tile;
-        self.denoise(passes)
+        self.denoise(shot)
     }
 
     /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
@@ -61,9 +61,9 @@ pub trait Denoiser: Send + Sync {
     ///
     /// # Errors
     /// As [`Denoiser::denoise`].
-    fn denoise_timed(&self, passes: &PassSet) -> Result<Run> {
+    fn denoise_timed(&self, shot: &Shot) -> Result<Run> {
         let start = Instant::now();
-        let image = self.denoise(passes)?;
+        let image = self.denoise(shot)?;
         Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
     }
 
@@ -96,8 +96,8 @@ impl Denoiser for Noisy {
         &[Pass::Combined]
     }
 
-    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        Ok(passes.require(Pass::Combined, self.name())?.clone())
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        Ok(shot.passes.require(Pass::Combined, self.name())?.clone())
     }
 }
 

@@ -1,9 +1,9 @@
 //! NFOR: Bitterli, Rousselle, Moon, Iglesias-Guitian, Adler, Mitchell, Jarosz, Novak 2016, "Nonlinearly
 //! Weighted First-order Regression for Denoising Monte Carlo Renderings" (Computer Graphics Forum 35:4).
 //!
-//! In: Combined, Denoising Albedo, Denoising Normal, and a depth where there is one. Where two renders of
-//! other seeds lie beside the frame (`<scene>_<spp>spp_a.exr` and `_b.exr`), they alone are used, as
-//! published; else noise is estimated from neighbouring pixels, and the method says so.
+//! In: Combined, Denoising Albedo, Denoising Normal, and a depth where there is one. Where the shot has half
+//! buffers, they alone are used, as published; else noise is estimated from neighbouring pixels, and the
+//! method says so.
 //!
 //! Departures: (1) with half buffers variance comes from their difference, averaged over 7x7 pixels, not
 //! from the renderer's sample variance; (2) without them nothing is cross-buffered: variance is the
@@ -12,12 +12,7 @@
 //! the channels of a feature are prefiltered with common weights; (5) depth is mapped to 0..1, radiance is
 //! scaled to a mean of 1; (6) there is no visibility feature, because Cycles writes none.
 
-use std::{
-    path::{Path, PathBuf},
-    time::Instant,
-};
-
-use super::{Denoiser, Run};
+use super::Denoiser;
 use crate::{
     Error, Result,
     features::relative_depth,
@@ -26,9 +21,9 @@ use crate::{
         regression::{Fit, first_order},
         variance,
     },
-    frame::Frame,
-    passes::{self, Pass, PassSet},
+    passes::{Pass, PassSet},
     planes::Planes,
+    shot::Shot,
 };
 
 /// Its name.
@@ -64,8 +59,12 @@ impl Denoiser for Nfor {
         &[Pass::DenoisingDepth, Pass::Depth]
     }
 
-    fn notes(&self, passes: &PassSet) -> Option<String> {
-        half_paths(&passes.path).is_none().then(|| {
+    fn reads_halves(&self) -> bool {
+        true
+    }
+
+    fn notes(&self, shot: &Shot) -> Option<String> {
+        shot.halves.is_none().then(|| {
             format!(
                 "{NAME}: no half buffers (<scene>_<spp>spp_a.exr and _b.exr) beside the frame: noise is \
                  estimated from neighbouring pixels, and weights are not cross-buffered"
@@ -73,22 +72,14 @@ impl Denoiser for Nfor {
         })
     }
 
-    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        Ok(self.denoise_timed(passes)?.image)
-    }
-
-    fn denoise_timed(&self, passes: &PassSet) -> Result<Run> {
-        let whole = Buffer::new(passes)?;
-        let halves = match half_paths(&passes.path) {
-            Some(paths) => Some(load_halves(paths, passes)?),
-            None => None,
-        };
-        let start = Instant::now();
-        let image = match halves {
-            Some(halves) => from_halves(halves),
-            None => from_one(whole),
-        };
-        Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        let whole = Buffer::new(&shot.passes)?;
+        let Some([a, b]) = &shot.halves else { return Ok(from_one(whole)) };
+        let halves = [Buffer::new(a)?, Buffer::new(b)?];
+        if halves[0].features.len() != halves[1].features.len() {
+            return Err(Error::invalid(&b.path, "has other passes than the other half; render both alike"));
+        }
+        Ok(from_halves(halves))
     }
 
     fn is_warm(&self) -> bool {
@@ -116,39 +107,6 @@ impl Buffer {
         features.extend(passes.get(Pass::DenoisingDepth).or(passes.get(Pass::Depth)).map(relative_depth));
         Ok(Self { colour, features })
     }
-}
-
-/// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to
-/// `shot_0004spp.0017.exr`, where both exist.
-pub fn half_paths(noisy: &Path) -> Option<[PathBuf; 2]> {
-    let name = noisy.file_name()?.to_str()?;
-    let (head, tail) = name.rsplit_once("spp.")?;
-    let paths = ["a", "b"].map(|half| noisy.with_file_name(format!("{head}spp_{half}.{tail}")));
-    paths.iter().all(|p| p.is_file()).then_some(paths)
-}
-
-fn load_halves(paths: [PathBuf; 2], whole: &PassSet) -> Result<[Buffer; 2]> {
-    let load = |path: &PathBuf| {
-        let frame = Frame::read(path)?;
-        if frame.views().len() > 1 {
-            return Err(Error::invalid(path, "half buffers of stereo frames are not read; move them away"));
-        }
-        let mut set = passes::read(&frame, Some(&whole.view_layer))?;
-        set.use_noisy_image();
-        set.sanitize();
-        if (set.width, set.height) != (whole.width, whole.height) {
-            return Err(Error::invalid(
-                path,
-                format!("is not of the size of {}; render both alike, or move it away", whole.path.display()),
-            ));
-        }
-        Buffer::new(&set)
-    };
-    let halves = [load(&paths[0])?, load(&paths[1])?];
-    if halves[0].features.len() != halves[1].features.len() {
-        return Err(Error::invalid(&paths[1], "has other passes than the other half; render both alike"));
-    }
-    Ok(halves)
 }
 
 /// The method as published.
@@ -302,8 +260,6 @@ fn join(parts: &[Planes]) -> Planes {
 
 #[cfg(test)]
 mod tests {
-    use exr::prelude::WritableImage as _;
-
     use super::*;
     use crate::filters::variance::tests::noise;
 
@@ -340,68 +296,42 @@ mod tests {
     fn one_buffer_loses_most_of_its_noise_and_keeps_the_edge() {
         let clean = clean(75, 41);
         let noisy = noisy(&clean, 1);
-        let out = Nfor.denoise(&noisy).unwrap();
+        let out = Nfor.denoise(&Shot::new(noisy.clone())).unwrap();
         let (before, after) =
             (relative_error(noisy.get(Pass::Combined).unwrap(), &clean), relative_error(&out, &clean));
         assert!((0.2..0.3).contains(&before) && after < 0.02 * before, "{before} {after}");
-        let note = Nfor.notes(&noisy).unwrap();
+        let note = Nfor.notes(&Shot::new(noisy)).unwrap();
         assert!(note.contains("not cross-buffered"), "{note}");
     }
 
     #[test]
-    fn half_buffers_beside_the_frame_replace_it() {
-        let dir = tempfile::tempdir().unwrap();
+    fn half_buffers_replace_the_frame() {
         let clean = clean(40, 30);
-        let path = dir.path().join("shot_0004spp.0017.exr");
-        let mut whole = noisy(&clean, 9);
-        whole.path = path;
-        assert!(half_paths(&whole.path).is_none());
-        for (half, seed) in [("a", 1), ("b", 2)] {
-            write(&dir.path().join(format!("shot_0004spp_{half}.0017.exr")), &noisy(&clean, seed));
-        }
-        assert!(half_paths(&whole.path).is_some() && Nfor.notes(&whole).is_none());
-        let out = Nfor.denoise(&whole).unwrap();
+        let mut shot = Shot::new(noisy(&clean, 9));
+        shot.halves = Some([1, 2].map(|seed| noisy(&clean, seed)));
+        assert!(Nfor.notes(&shot).is_none());
+        let out = Nfor.denoise(&shot).unwrap();
         let after = relative_error(&out, &clean);
         assert!(after < 0.02 * 0.125, "{after}: less than a fiftieth of the halves' mean");
         // The frame itself does not count.
-        whole.insert(Pass::Combined, Planes::new(3, 40, 30));
-        assert_eq!(Nfor.denoise(&whole).unwrap(), out);
-        // Halves of another frame are an error, not a result.
-        write(&dir.path().join("shot_0004spp_b.0017.exr"), &self::clean(40, 29));
-        let message = Nfor.denoise(&whole).unwrap_err().to_string();
-        assert!(message.contains("shot_0004spp_b.0017.exr") && message.contains("size"), "{message}");
-    }
-
-    /// Stores the passes as Blender 4 does, in one part.
-    fn write(path: &Path, set: &PassSet) {
-        let mut list = Vec::new();
-        for (pass, planes) in set.iter() {
-            let names = if pass == Pass::DenoisingNormal { ["X", "Y", "Z"] } else { ["R", "G", "B"] };
-            for (c, component) in names.into_iter().enumerate() {
-                let samples = exr::prelude::FlatSamples::F32(planes.channel(c).to_vec());
-                let name = format!("ViewLayer.{pass}.{component}");
-                list.push(exr::prelude::AnyChannel::new(name.as_str(), samples));
-            }
-        }
-        exr::prelude::Image::from_channels(
-            (set.width, set.height),
-            exr::prelude::AnyChannels::sort(list.into()),
-        )
-        .write()
-        .to_file(path)
-        .unwrap();
+        shot.passes.insert(Pass::Combined, Planes::new(3, 40, 30));
+        assert_eq!(Nfor.denoise(&shot).unwrap(), out);
+        // Halves must have the same passes.
+        shot.halves.as_mut().unwrap()[1].insert(Pass::Depth, Planes::new(1, 40, 30));
+        let message = Nfor.denoise(&shot).unwrap_err().to_string();
+        assert!(message.contains("other passes"), "{message}");
     }
 
     #[test]
     fn channels_and_brightness_do_not_change_the_result() {
         let set = noisy(&clean(33, 20), 4);
-        let out = Nfor.denoise(&set).unwrap();
+        let out = Nfor.denoise(&Shot::new(set.clone())).unwrap();
         let mut other = set.clone();
         let colour = set.get(Pass::Combined).unwrap();
         let order = [1, 2, 0];
         let swapped = order.iter().flat_map(|&c| colour.channel(c)).map(|v| v * 64.0).collect();
         other.insert(Pass::Combined, Planes::from_vec(3, 33, 20, swapped));
-        let result = Nfor.denoise(&other).unwrap();
+        let result = Nfor.denoise(&Shot::new(other)).unwrap();
         for (c, from) in order.into_iter().enumerate() {
             for (a, b) in result.channel(c).iter().zip(out.channel(from)) {
                 assert!((a / 64.0 - b).abs() < 1e-3 * (1.0 + b.abs()), "{a} {b}");
@@ -418,10 +348,14 @@ mod tests {
             colour.data[0] = 1e12;
             *colour.data.last_mut().unwrap() = -1e6;
             set.insert(Pass::Combined, colour);
-            let out = Nfor.denoise(&set).unwrap();
+            let out = Nfor.denoise(&Shot::new(set.clone())).unwrap();
             assert!(out.data.iter().all(|v| v.is_finite() && *v >= 0.0), "{width} x {height}");
             set.insert(Pass::Combined, Planes::new(3, width, height));
-            assert_eq!(Nfor.denoise(&set).unwrap(), Planes::new(3, width, height), "black stays black");
+            assert_eq!(
+                Nfor.denoise(&Shot::new(set.clone())).unwrap(),
+                Planes::new(3, width, height),
+                "black stays black"
+            );
         }
     }
 
@@ -429,7 +363,7 @@ mod tests {
     fn a_missing_guide_is_named() {
         let mut set = clean(4, 4);
         set.remove(Pass::DenoisingNormal);
-        let message = Nfor.denoise(&set).unwrap_err().to_string();
+        let message = Nfor.denoise(&Shot::new(set.clone())).unwrap_err().to_string();
         assert!(message.contains("Denoising Normal") && message.contains(NAME), "{message}");
     }
 }

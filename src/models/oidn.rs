@@ -11,11 +11,7 @@ use std::{
 };
 
 use super::{Denoiser, Run};
-use crate::{
-    Error, Result,
-    passes::{Pass, PassSet},
-    planes::Planes,
-};
+use crate::{Error, Result, passes::Pass, planes::Planes, shot::Shot};
 
 /// Names of the methods, fastest first.
 pub const NAMES: [&str; 4] = ["oidn-fast", "oidn-balanced", "oidn-high", "oidn-high-prefilter"];
@@ -119,11 +115,12 @@ impl Denoiser for Oidn {
         &[Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal]
     }
 
-    fn denoise(&self, passes: &PassSet) -> Result<Planes> {
-        Ok(self.denoise_timed(passes)?.image)
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        Ok(self.denoise_timed(shot)?.image)
     }
 
-    fn denoise_timed(&self, passes: &PassSet) -> Result<Run> {
+    fn denoise_timed(&self, shot: &Shot) -> Result<Run> {
+        let passes = &shot.passes;
         let temporary = tempfile::tempdir().map_err(Error::io("create", std::env::temp_dir()))?;
         let folder = temporary.path();
         let inputs = [
@@ -221,6 +218,7 @@ fn parse_pfm(bytes: &[u8]) -> Option<Planes> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::passes::PassSet;
 
     #[test]
     fn pfm_round_trip_keeps_every_value_in_its_place() {
@@ -252,7 +250,7 @@ mod tests {
         for pass in method.passes() {
             passes.insert(*pass, Planes::new(3, 1, 1));
         }
-        let message = method.denoise(&passes).unwrap_err().to_string();
+        let message = method.denoise(&Shot::new(passes)).unwrap_err().to_string();
         assert!(message.contains("/no/such/program") && message.contains("--oidn"), "{message}");
         assert!(Oidn::new("oidn-best", None).is_none());
         let program = |path: &str| Oidn::new("oidn-high", Some(path.into())).unwrap().program;

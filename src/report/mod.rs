@@ -12,6 +12,7 @@ mod canvas;
 mod chart;
 mod figure;
 mod labels;
+#[cfg(feature = "train")]
 mod loss;
 mod page;
 mod palette;
@@ -25,6 +26,7 @@ mod summary;
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "train")]
 pub use loss::loss_chart;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
 pub use run::{Event, Loaded, evaluate, load, load_listed};

@@ -26,8 +26,9 @@ use crate::{
     error::attempt,
     metrics::{self, pairing},
     models::{Denoiser, Run},
-    passes::{self, Pass, PassSet},
+    passes::{self, Pass},
     planes::Planes,
+    shot::{self, Shot},
     testset::Pair,
 };
 
@@ -187,12 +188,17 @@ struct Scene {
 
 /// The decoded pair.
 pub struct Loaded {
-    /// As stored: what `noisy` is judged by.
-    pub noisy: Planes,
-    /// Non-finite values replaced: what methods see.
-    pub passes: PassSet,
+    /// What methods are given, without half buffers.
+    pub shot: Shot,
     /// The reference's radiance, of the same size.
     pub reference: Planes,
+}
+
+impl Loaded {
+    /// The render as stored: what `noisy` is judged by.
+    pub fn noisy(&self) -> &Planes {
+        self.shot.as_stored().expect("a pair without Combined is not loaded")
+    }
 }
 
 /// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the reference its namesake.
@@ -200,15 +206,13 @@ pub struct Loaded {
 /// # Errors
 /// A file is unusable or lacks Combined, or they do not hold the same pixels.
 pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
-    let mut passes = passes::load(&pair.noisy, view_layer)?;
-    passes.use_noisy_image();
-    let noisy = passes.require(Pass::Combined, NOISY)?.clone();
-    passes.sanitize();
-    let mut reference = passes::load_like(&pair.reference, &passes.view_layer)?;
-    passes.check_same_pixels(&reference)?;
+    let shot = shot::prepare(&pair.noisy, view_layer)?;
+    shot.passes.require(Pass::Combined, NOISY)?;
+    let mut reference = passes::load_like(&pair.reference, &shot.passes.view_layer)?;
+    shot.passes.check_same_pixels(&reference)?;
     reference.require(Pass::Combined, "a reference")?;
     let reference = reference.remove(Pass::Combined).expect("it is there");
-    Ok(Loaded { noisy, passes, reference })
+    Ok(Loaded { shot, reference })
 }
 
 /// As [`load`], of a pair whose reference may be missing.
@@ -239,14 +243,20 @@ fn run_pair(
         row.threads = options.threads;
         row
     };
-    let loaded = match load_listed(pair, options.view_layer.as_deref()) {
+    let mut loaded = match load_listed(pair, options.view_layer.as_deref()) {
         Ok(loaded) => loaded,
         Err(error) => {
             let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
             return Done { rows: open().map(fail).collect(), scene: None };
         }
     };
-    let (width, height) = (loaded.noisy.width, loaded.noisy.height);
+    let (width, height) = (loaded.noisy().width, loaded.noisy().height);
+    // Half buffers that are unusable fail those methods alone that read them.
+    let halves = if methods.iter().any(|method| method.denoiser.reads_halves()) {
+        attempt(&pair.noisy, || loaded.shot.read_halves()).map_err(|error| error.to_string())
+    } else {
+        Ok(())
+    };
     let mut rows: Vec<Option<Row>> = Vec::new();
     let mut images = Vec::new();
     for (method, &finished) in methods.iter().zip(finished) {
@@ -256,12 +266,18 @@ fn run_pair(
         }
         let mut row = new_row(method);
         (row.width, row.height) = (Some(width), Some(height));
-        let image = first_run(method, pair, &loaded, &mut row);
+        let image = match &halves {
+            Err(why) if method.denoiser.reads_halves() => {
+                row.reason.clone_from(why);
+                None
+            }
+            _ => first_run(method, pair, &loaded, &mut row),
+        };
         if !finished {
-            method.denoiser.notes(&loaded.passes).iter().for_each(|note| row.say(note));
+            method.denoiser.notes(&loaded.shot).iter().for_each(|note| row.say(note));
         }
         if !finished && method.name == NOISY {
-            let warning = pairing::warning(pair.id(), &loaded.noisy, &loaded.reference);
+            let warning = pairing::warning(pair.id(), loaded.noisy(), &loaded.reference);
             warning.iter().for_each(|warning| row.say(warning));
         }
         if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
@@ -279,7 +295,7 @@ fn run_pair(
             let Some(row) = rows[i].as_mut().filter(|row| row.is_valid() && method.name != NOISY) else {
                 continue;
             };
-            match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.passes)) {
+            match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.shot)) {
                 Ok(run) => times[i].push(run.seconds),
                 Err(error) => {
                     let (width, height) = (row.width, row.height);
@@ -303,19 +319,19 @@ fn run_pair(
 
 /// A run, right after one that does not count: cores that have waited for another process are slow for some 20 ms (twice as slow
 /// in a virtual machine), which must not be put down to whichever method comes next.
-fn timed_run(denoiser: &dyn Denoiser, passes: &PassSet) -> Result<Run> {
+fn timed_run(denoiser: &dyn Denoiser, shot: &Shot) -> Result<Run> {
     if !denoiser.is_warm() {
-        denoiser.denoise(passes)?;
+        denoiser.denoise(shot)?;
     }
-    denoiser.denoise_timed(passes)
+    denoiser.denoise_timed(shot)
 }
 
 /// The run that is scored. None, with a reason in the row, where it fails.
 fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
     let image = if method.name == NOISY {
-        loaded.noisy.clone()
+        loaded.noisy().clone()
     } else {
-        match attempt(&pair.noisy, || method.denoiser.denoise_timed(&loaded.passes)) {
+        match attempt(&pair.noisy, || method.denoiser.denoise_timed(&loaded.shot)) {
             Ok(run) => {
                 row.peak_mib = run.peak_mib;
                 run.image
@@ -364,7 +380,7 @@ mod tests {
             &[Pass::Combined]
         }
 
-        fn denoise(&self, _: &PassSet) -> Result<Planes> {
+        fn denoise(&self, _: &Shot) -> Result<Planes> {
             panic!("on purpose")
         }
     }
@@ -381,9 +397,9 @@ mod tests {
             &[Pass::Combined]
         }
 
-        fn denoise(&self, passes: &PassSet) -> Result<Planes> {
+        fn denoise(&self, shot: &Shot) -> Result<Planes> {
             match self.0.fetch_add(1, Ordering::Relaxed) {
-                0 => Noisy.denoise(passes),
+                0 => Noisy.denoise(shot),
                 _ => Err(Error::Usage("out of memory".into())),
             }
         }

@@ -13,7 +13,7 @@ use super::{
     provenance::Provenance,
     rows::{Row, write_file},
 };
-use crate::{Result, models::nfor, testset::Pair};
+use crate::{Result, shot, testset::Pair};
 
 /// The settings of a run, and stamps of what it read. Fields of other versions are passed over.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -99,7 +99,7 @@ pub fn name(noisy: &Path, reference: &Path) -> String {
 
 /// Of all files that a method may read for a pair.
 fn pair_stamp(noisy: &Path, reference: &Path) -> String {
-    let halves = nfor::half_paths(noisy).into_iter().flatten();
+    let halves = shot::half_paths(noisy).into_iter().flatten();
     let files = [noisy.into(), reference.into()].into_iter().chain(halves);
     files.map(|file: PathBuf| file_stamp(&file)).collect::<Vec<_>>().join(" ")
 }

@@ -13,6 +13,7 @@ use crate::{
     nn::Rng,
     passes::{self, Pass, PassSet},
     planes::Planes,
+    shot,
     testset::Pair,
 };
 
@@ -212,11 +213,8 @@ impl Stored {
         raw_references: bool,
         least: usize,
     ) -> Result<Self> {
-        let mut noisy = passes::load(&pair.noisy, None)?;
-        // As for inference: Combined may be what Blender made of the render.
-        noisy.use_noisy_image();
+        let noisy = shot::prepare(&pair.noisy, None)?.passes;
         noisy.require_all(needed.iter().copied(), "training")?;
-        noisy.sanitize();
         let mut reference = passes::load_like(&pair.reference, &noisy.view_layer)?;
         reference.sanitize();
         reference.require_all(targets.iter().copied(), "training")?;

@@ -1,22 +1,17 @@
 //! `demc denoise`: a batch of frames through one model, each output the input plus a layer.
 //!
 //! In: the command line. Out: files in `--out`, a line (or JSON object) for each, the exit status.
-//! The work itself is in [`frame_job`], its overlap in [`pipeline`].
+//! The work itself is [`crate::denoise`]'s.
 
-mod frame_job;
-mod pipeline;
-mod preview;
 mod progress;
 
 use std::{
-    collections::HashMap,
     fs,
     path::{Path, PathBuf},
     process::ExitCode,
 };
 
 use clap::Args as ClapArgs;
-use frame_job::Options;
 
 use super::{
     SOME_FAILED,
@@ -24,8 +19,9 @@ use super::{
     stop,
 };
 use crate::{
-    Error, Result, models,
-    passes::{NOISY_IMAGE, Pass, is_bare},
+    Error, Result,
+    denoise::{self, Batch, End, Job, Options, Outcome, preview},
+    models,
 };
 
 /// Arguments of `demc denoise`.
@@ -77,23 +73,16 @@ pub struct Args {
     json: bool,
 }
 
-/// One file to do.
-pub struct Job {
-    /// The render.
-    pub input: PathBuf,
-    /// The result.
-    pub output: PathBuf,
-}
-
 /// Runs the batch.
 ///
 /// # Errors
 /// The command line cannot be carried out; failures of single files are reported as they happen and
 /// only show in the exit status.
 pub fn run(args: Args) -> Result<ExitCode> {
-    check_layer_name(&args.layer)?;
+    denoise::check_layer_name(&args.layer)
+        .map_err(|why| Error::Usage(format!("--layer '{}': {why}", args.layer)))?;
     let Inputs { files, unusable } = inputs::expand(&args.inputs)?;
-    let jobs = plan(files, &args.out)?;
+    let jobs = denoise::plan(files, &args.out)?;
     // Before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
         rayon::ThreadPoolBuilder::new()
@@ -108,63 +97,23 @@ pub fn run(args: Args) -> Result<ExitCode> {
         view_layer: args.view_layer,
         layer: (!args.replace).then_some(args.layer),
         tile: args.tile.map(|t| t as usize),
-        preview: args.preview,
+        preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
     };
     let mut progress = progress::Progress::new(jobs.len() + unusable.len(), args.json);
     for (input, error) in unusable {
-        progress.report(&Job { input, output: PathBuf::new() }, &pipeline::Outcome::Failed(error));
+        progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
     }
-    let end = pipeline::run(jobs, model.into(), options, |job, outcome| progress.report(job, outcome))?;
-    let failed = progress.finish(end == pipeline::End::Stopped);
+    let batch = Batch::new(jobs, model.into(), options);
+    let stopper = batch.stopper();
+    stop::on_request(move || stopper.stop())?;
+    let end = batch.run(|job, outcome| progress.report(job, outcome));
+    let failed = progress.finish(end == End::Stopped);
     Ok(match end {
-        pipeline::End::Stopped => ExitCode::from(stop::INTERRUPTED),
-        pipeline::End::Complete if failed > 0 => ExitCode::from(SOME_FAILED),
-        pipeline::End::Complete => ExitCode::SUCCESS,
+        End::Stopped => ExitCode::from(stop::INTERRUPTED),
+        End::Complete if failed > 0 => ExitCode::from(SOME_FAILED),
+        End::Complete => ExitCode::SUCCESS,
     })
-}
-
-/// A layer name must make channel names that read back as this layer and no other.
-fn check_layer_name(name: &str) -> Result<()> {
-    let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
-    if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
-        Err(Error::Usage(format!("--layer '{name}': wants 1 to 100 characters in one line, without a dot")))
-    } else if name == NOISY_IMAGE || is_bare(name) || Pass::ALL.iter().any(reserved) {
-        Err(Error::Usage(format!(
-            "--layer '{name}': is a pass of the renderer; choose another name, or --replace for Combined"
-        )))
-    } else {
-        Ok(())
-    }
-}
-
-/// Output paths; no two alike, none its own input.
-fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
-    let mut by_name: HashMap<std::ffi::OsString, PathBuf> = HashMap::new();
-    let mut jobs = Vec::with_capacity(files.len());
-    for input in files {
-        let Some(name) = input.file_name() else {
-            return Err(Error::Usage(format!("{}: names no file", input.display())));
-        };
-        if let Some(other) = by_name.insert(name.to_owned(), input.clone()) {
-            return Err(Error::Usage(format!(
-                "{} and {} would both be written to {}; give each its own --out",
-                other.display(),
-                input.display(),
-                out.join(name).display()
-            )));
-        }
-        let output = out.join(name);
-        let same = |a: &Path, b: &Path| matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b);
-        if same(&input, &output) {
-            return Err(Error::Usage(format!(
-                "{}: the result would overwrite its input; choose another --out",
-                input.display()
-            )));
-        }
-        jobs.push(Job { input, output });
-    }
-    Ok(jobs)
 }
 
 /// Makes the output directory and finds out now, not after an hour, whether files can be made in it.

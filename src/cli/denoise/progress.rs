@@ -4,8 +4,10 @@
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use super::{Job, pipeline::Outcome};
-use crate::cli::{print_line, warn_line};
+use crate::{
+    cli::{print_line, warn_line},
+    denoise::{Job, Outcome},
+};
 
 /// Counts and prints outcomes.
 pub struct Progress {

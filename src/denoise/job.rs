@@ -1,4 +1,4 @@
-//! One frame in three steps that the pipeline overlaps: load, denoise, store.
+//! One frame in three steps that a batch overlaps: load, denoise, store.
 
 use std::{
     collections::BTreeMap,
@@ -6,31 +6,66 @@ use std::{
     time::Instant,
 };
 
-use super::preview;
 use crate::{
     Error, Result,
     frame::{Frame, NewChannel},
     models::Denoiser,
-    passes::{self, COMBINED, Layer, Pass, PassSet},
+    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassSet, is_bare},
     planes::Planes,
+    shot::{self, Shot},
 };
 
-/// What the user chose for every frame of the batch.
+/// One file to do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Job {
+    /// The render.
+    pub input: PathBuf,
+    /// The result.
+    pub output: PathBuf,
+}
+
+/// Writes radiance (3, H, W) as a picture: `preview::write`, where the feature `preview` is on.
+pub type WritePicture = fn(&Path, &Planes) -> Result<()>;
+
+/// What is chosen for every frame of a batch.
+#[derive(Clone, Debug)]
 pub struct Options {
-    /// `--view-layer`.
+    /// The view layer to denoise; without it the one with the most passes.
     pub view_layer: Option<String>,
-    /// The layer to add; none where the beauty is replaced.
+    /// The layer to add, see [`check_layer_name`]; none where the beauty is replaced.
     pub layer: Option<String>,
-    /// `--tile`.
+    /// Rows (and columns, where a model works on tiles) that are worked on at once, to bound memory.
     pub tile: Option<usize>,
-    /// `--preview`.
-    pub preview: bool,
-    /// `--overwrite`.
+    /// Writes a picture beside each result.
+    pub preview: Option<WritePicture>,
+    /// Whether a [`super::Batch`] denoises again what is finished.
     pub overwrite: bool,
 }
 
+impl Default for Options {
+    /// Adds the layer `Denoised` to the view layer with the most passes.
+    fn default() -> Self {
+        Self { view_layer: None, layer: Some("Denoised".into()), tile: None, preview: None, overwrite: false }
+    }
+}
+
+/// Whether a name can be a layer's: it must make channel names that read back as this layer and no other.
+///
+/// # Errors
+/// It cannot; says why.
+pub fn check_layer_name(name: &str) -> Result<(), &'static str> {
+    let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
+    if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
+        Err("wants 1 to 100 characters in one line, without a dot")
+    } else if name == NOISY_IMAGE || is_bare(name) || Pass::ALL.iter().any(reserved) {
+        Err("is a pass of the renderer; choose another name, or --replace for Combined")
+    } else {
+        Ok(())
+    }
+}
+
 /// What became of a frame, for the user.
-#[derive(Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The view layer denoised.
     pub view_layer: String,
@@ -46,15 +81,21 @@ pub struct Report {
     pub notes: Vec<String>,
 }
 
-/// A frame and, for each stereo view, where its beauty is and what to compute with.
-pub struct Frames<T> {
+/// A frame and, for each of its stereo views, where its beauty is and what to compute with.
+pub struct Views<T> {
     frame: Frame,
     views: Vec<(Layer, T)>,
     report: Report,
 }
 
 /// Reads a frame and decodes the passes the model needs.
-pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Frames<PassSet>> {
+///
+/// # Errors
+/// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is not demc's.
+pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
+    if let Some(Err(why)) = options.layer.as_deref().map(check_layer_name) {
+        return Err(Error::Usage(format!("layer '{}': {why}", options.layer.as_deref().unwrap_or_default())));
+    }
     let frame = Frame::read(input)?;
     let layers = passes::layers(&frame);
     let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
@@ -71,7 +112,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
     }
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
-    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha, Pass::NoisyImage]].concat();
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha]].concat();
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -80,22 +121,25 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Fra
     }
     let mut views = Vec::new();
     for layer in eyes {
-        let mut set = passes::read_layer(&frame, layer, &wanted)?;
-        if set.use_noisy_image() {
+        let mut shot = shot::prepare_layer(&frame, layer, &wanted)?;
+        if shot.was_denoised {
             report.notes.push(
                 "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
             );
         }
         // Before any work: a missing pass is the user's commonest mistake.
-        set.require_all(needed.iter().copied(), model.name())?;
-        for (pass, count) in set.sanitize() {
+        shot.passes.require_all(needed.iter().copied(), model.name())?;
+        if model.reads_halves() {
+            shot.read_halves()?;
+        }
+        for (pass, count) in &shot.repaired {
             *report.repaired.entry(pass.to_string()).or_default() += count;
         }
-        (report.width, report.height) = (set.width, set.height);
-        views.push((layer.clone(), set));
+        (report.width, report.height) = (shot.passes.width, shot.passes.height);
+        views.push((layer.clone(), shot));
     }
     report.notes.dedup(); // stereo views repeat them
-    Ok(Frames { frame, views, report })
+    Ok(Views { frame, views, report })
 }
 
 fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
@@ -117,25 +161,34 @@ pub struct Denoised {
 }
 
 /// Runs the model over each view.
-pub fn denoise(loaded: Frames<PassSet>, model: &dyn Denoiser, options: &Options) -> Result<Frames<Denoised>> {
-    let Frames { frame, views, mut report } = loaded;
+///
+/// # Errors
+/// The model cannot denoise the frame.
+pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
+    // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up first.
+    rayon::scope(|_| denoise_here(loaded, model, options))
+}
+
+fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
+    let Views { frame, views, mut report } = loaded;
     let mut done = Vec::with_capacity(views.len());
-    for (layer, mut set) in views {
-        report.notes.extend(model.notes(&set).filter(|note| !report.notes.contains(note)));
+    for (layer, mut shot) in views {
+        report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
         let start = Instant::now();
-        let radiance = model.denoise_tiled(&set, options.tile)?;
+        let radiance = model.denoise_tiled(&shot, options.tile)?;
         report.seconds += start.elapsed().as_secs_f64();
-        if (radiance.channels, radiance.width, radiance.height) != (3, set.width, set.height) {
+        let size = (shot.passes.width, shot.passes.height);
+        if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
             return Err(Error::invalid(
-                &set.path,
+                &shot.passes.path,
                 format!("model {} returned an image of the wrong size; choose another model", model.name()),
             ));
         }
-        let alpha = set.remove(Pass::Alpha);
+        let alpha = shot.passes.remove(Pass::Alpha);
         let radiance = finite(radiance, &mut report);
         done.push((layer, Denoised { radiance, alpha }));
     }
-    Ok(Frames { frame, views: done, report })
+    Ok(Views { frame, views: done, report })
 }
 
 /// Whatever a model returns, what is written is finite.
@@ -156,8 +209,11 @@ fn layer_name(view_layer: &str, name: &str) -> String {
 }
 
 /// Adds the layers, or replaces the beauty, and writes the file.
-pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Result<Report> {
-    let Frames { mut frame, views, mut report } = denoised;
+///
+/// # Errors
+/// The result does not fit into the file's format, or cannot be written.
+pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<Report> {
+    let Views { mut frame, views, mut report } = denoised;
     for (layer, Denoised { radiance, alpha }) in &views {
         let at = &layer.passes[&Pass::Combined];
         let recoded = match &options.layer {
@@ -191,11 +247,11 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
             report.notes.push(format!("{what}: {recoded}"));
         }
     }
-    if options.preview {
+    if let Some(write) = options.preview {
         for (layer, Denoised { radiance, .. }) in &views {
-            let path = preview::path(output, layer, views.len());
+            let path = preview_path(output, layer, views.len());
             if options.overwrite || !path.exists() {
-                preview::write(&path, radiance)?;
+                write(&path, radiance)?;
             } else {
                 report.notes.push(format!("{}: kept; --overwrite writes it anew", path.display()));
             }
@@ -206,8 +262,16 @@ pub fn store(denoised: Frames<Denoised>, output: &Path, options: &Options) -> Re
     Ok(report)
 }
 
+/// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.
+fn preview_path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
+    match layer.view.as_deref().filter(|_| views > 1) {
+        None => output.with_extension("png"),
+        Some(view) => output.with_extension(format!("{view}.png")),
+    }
+}
+
 /// The headers of what is at the output's place: an EXR, whole since results are written so.
-pub fn existing(output: &Path) -> Option<Frame> {
+pub(super) fn existing(output: &Path) -> Option<Frame> {
     Frame::read_headers(output).ok()
 }
 
@@ -215,7 +279,7 @@ pub fn existing(output: &Path) -> Option<Frame> {
 ///
 /// # Errors
 /// It is another: nothing is overwritten unasked. Or a preview cannot be written.
-pub fn take_up(headers: &Frame, options: &Options) -> Result<()> {
+pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers(headers);
     let chosen = &passes::choose(headers, &layers, options.view_layer.as_deref())?.name;
@@ -228,15 +292,16 @@ pub fn take_up(headers: &Frame, options: &Options) -> Result<()> {
         );
         return Err(Error::invalid(output, why));
     }
-    let previews = views.iter().map(|layer| (layer, preview::path(output, layer, views.len())));
-    let missing: Vec<_> = previews.filter(|(_, path)| options.preview && !path.exists()).collect();
+    let Some(write) = options.preview else { return Ok(()) };
+    let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));
+    let missing: Vec<_> = previews.filter(|(_, path)| !path.exists()).collect();
     if missing.is_empty() {
         return Ok(());
     }
     let frame = Frame::read(output)?;
     for (layer, path) in missing {
         let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
-        preview::write(&path, set.require(Pass::Combined, "--preview")?)?;
+        write(&path, set.require(Pass::Combined, "--preview")?)?;
     }
     Ok(())
 }

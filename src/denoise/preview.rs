@@ -2,7 +2,7 @@
 
 use std::{
     io::{BufWriter, Write},
-    path::{Path, PathBuf},
+    path::Path,
 };
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
@@ -10,19 +10,13 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use crate::{
     Error, Result, frame,
     metrics::display::{display, exposure},
-    passes::Layer,
     planes::Planes,
 };
 
-/// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.
-pub fn path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
-    match layer.view.as_deref().filter(|_| views > 1) {
-        None => output.with_extension("png"),
-        Some(view) => output.with_extension(format!("{view}.png")),
-    }
-}
-
 /// Writes radiance (3, H, W) as an 8-bit PNG.
+///
+/// # Errors
+/// The file cannot be written.
 pub fn write(path: &Path, radiance: &Planes) -> Result<()> {
     // A black frame has no exposure: any shows it black.
     let image = display(radiance, exposure(radiance).unwrap_or(1.0));

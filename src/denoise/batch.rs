@@ -1,0 +1,227 @@
+//! The batch: reading the next frame, denoising this one and writing the last overlap, so that a batch
+//! takes about as long as the model does. At most three frames are in memory.
+//!
+//! The threads report to the caller's thread, which alone talks to the user.
+
+use std::{
+    collections::HashMap,
+    ffi::OsString,
+    fs,
+    path::{Path, PathBuf},
+    sync::{
+        Arc, Mutex, PoisonError,
+        mpsc::{Receiver, Sender, SyncSender, channel, sync_channel},
+    },
+    thread,
+};
+
+use super::{
+    Job, Options, Report, Views,
+    job::{self, Denoised},
+};
+use crate::{Error, Result, error::attempt, models::Denoiser, shot::Shot};
+
+/// What became of one file.
+pub enum Outcome {
+    /// Written.
+    Done(Report),
+    /// The result was there already.
+    Skipped,
+    /// Nothing was written.
+    Failed(Error),
+}
+
+/// How the batch ended.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// Every file was tried.
+    Complete,
+    /// The user stopped it.
+    Stopped,
+}
+
+/// What the batch's thread is told.
+enum Message {
+    /// A file, by its number, has ended.
+    Ended(usize, Outcome),
+    Stop,
+}
+
+/// Frames that one model is to denoise.
+pub struct Batch {
+    shared: Arc<Shared>,
+    messages: Receiver<Message>,
+    to_batch: Sender<Message>,
+}
+
+/// What the stages share.
+struct Shared {
+    jobs: Vec<Job>,
+    model: Arc<dyn Denoiser>,
+    options: Options,
+    /// Held while a file is being written, and for good once the user has asked to stop.
+    writing: Mutex<()>,
+}
+
+/// Ends a batch before all is done, from any thread.
+#[derive(Clone)]
+pub struct Stopper(Sender<Message>);
+
+impl Stopper {
+    /// A file that is being written is finished, no other is begun. Does nothing once the batch has ended.
+    pub fn stop(&self) {
+        let _ = self.0.send(Message::Stop);
+    }
+}
+
+impl Batch {
+    /// A batch that waits to be [run](Batch::run).
+    pub fn new(jobs: Vec<Job>, model: Arc<dyn Denoiser>, options: Options) -> Self {
+        let (to_batch, messages) = channel();
+        let shared = Arc::new(Shared { jobs, model, options, writing: Mutex::new(()) });
+        Self { shared, messages, to_batch }
+    }
+
+    /// What stops it.
+    pub fn stopper(&self) -> Stopper {
+        Stopper(self.to_batch.clone())
+    }
+
+    /// Runs all jobs; `report` is called once for each as it ends, on this thread.
+    ///
+    /// # Panics
+    /// If the system has no room for three threads.
+    pub fn run(self, mut report: impl FnMut(&Job, &Outcome)) -> End {
+        let Self { shared, messages, to_batch } = self;
+        // Rendezvous channels: a stage holds its frame until the next one is free to take it.
+        let (to_denoise, loaded) = sync_channel(0);
+        let (to_store, denoised) = sync_channel(0);
+        spawn("read", &shared, &to_batch, move |shared, ended| load_all(shared, &to_denoise, ended));
+        spawn("denoise", &shared, &to_batch, move |shared, ended| {
+            denoise_all(shared, &loaded, &to_store, ended)
+        });
+        spawn("write", &shared, &to_batch, move |shared, ended| store_all(shared, &denoised, ended));
+
+        for _ in 0..shared.jobs.len() {
+            match messages.recv().expect("its own sender lives") {
+                Message::Ended(index, outcome) => report(&shared.jobs[index], &outcome),
+                Message::Stop => {
+                    // Let a file being written come to its end and no other begin; the process may then end
+                    // without waiting for the model.
+                    let gate = shared.writing.lock().unwrap_or_else(PoisonError::into_inner);
+                    std::mem::forget(gate);
+                    while let Ok(Message::Ended(index, outcome)) = messages.try_recv() {
+                        report(&shared.jobs[index], &outcome);
+                    }
+                    return End::Stopped;
+                }
+            }
+        }
+        End::Complete
+    }
+}
+
+/// The jobs that write each file's result into a folder, under the file's own name.
+///
+/// # Errors
+/// Two results would have one path, or one that of its input.
+pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
+    let mut by_name: HashMap<OsString, PathBuf> = HashMap::new();
+    let mut jobs = Vec::with_capacity(files.len());
+    for input in files {
+        let Some(name) = input.file_name() else {
+            return Err(Error::Usage(format!("{}: names no file", input.display())));
+        };
+        if let Some(other) = by_name.insert(name.to_owned(), input.clone()) {
+            return Err(Error::Usage(format!(
+                "{} and {} would both be written to {}; give each its own --out",
+                other.display(),
+                input.display(),
+                out.join(name).display()
+            )));
+        }
+        let output = out.join(name);
+        let same = |a: &Path, b: &Path| matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b);
+        if same(&input, &output) {
+            return Err(Error::Usage(format!(
+                "{}: the result would overwrite its input; choose another --out",
+                input.display()
+            )));
+        }
+        jobs.push(Job { input, output });
+    }
+    Ok(jobs)
+}
+
+fn spawn(
+    name: &str,
+    shared: &Arc<Shared>,
+    ended: &Sender<Message>,
+    stage: impl FnOnce(&Shared, &Sender<Message>) + Send + 'static,
+) {
+    let (shared, ended) = (Arc::clone(shared), ended.clone());
+    thread::Builder::new()
+        .name(name.into())
+        .spawn(move || stage(&shared, &ended))
+        .expect("the system has room for three threads");
+}
+
+fn load_all(shared: &Shared, next: &SyncSender<(usize, Views<Shot>)>, ended: &Sender<Message>) {
+    for (index, job) in shared.jobs.iter().enumerate() {
+        let existing = if shared.options.overwrite { None } else { job::existing(&job.output) };
+        if let Some(headers) = existing {
+            let _writing = shared.writing.lock().unwrap_or_else(PoisonError::into_inner);
+            let taken_up = attempt(&job.output, || job::take_up(&headers, &shared.options));
+            let outcome = taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
+            let _ = ended.send(Message::Ended(index, outcome));
+            continue;
+        }
+        let loaded = attempt(&job.input, || job::load(&job.input, &*shared.model, &shared.options));
+        if !pass_on(index, loaded, next, ended) {
+            return;
+        }
+    }
+}
+
+fn denoise_all(
+    shared: &Shared,
+    frames: &Receiver<(usize, Views<Shot>)>,
+    next: &SyncSender<(usize, Views<Denoised>)>,
+    ended: &Sender<Message>,
+) {
+    for (index, loaded) in frames {
+        let input = &shared.jobs[index].input;
+        let denoised = attempt(input, || job::denoise(loaded, &*shared.model, &shared.options));
+        if !pass_on(index, denoised, next, ended) {
+            return;
+        }
+    }
+}
+
+fn store_all(shared: &Shared, frames: &Receiver<(usize, Views<Denoised>)>, ended: &Sender<Message>) {
+    for (index, denoised) in frames {
+        let job = &shared.jobs[index];
+        let stored = {
+            let _writing = shared.writing.lock().unwrap_or_else(PoisonError::into_inner);
+            attempt(&job.input, || job::store(denoised, &job.output, &shared.options))
+        };
+        let outcome = stored.map_or_else(Outcome::Failed, Outcome::Done);
+        let _ = ended.send(Message::Ended(index, outcome));
+    }
+}
+
+/// Hands a frame to the next stage, or its failure to the user; false when there is no next stage.
+fn pass_on<T>(
+    index: usize,
+    result: Result<T>,
+    next: &SyncSender<(usize, T)>,
+    ended: &Sender<Message>,
+) -> bool {
+    match result {
+        Ok(frame) => next.send((index, frame)).is_ok(),
+        Err(error) => {
+            let _ = ended.send(Message::Ended(index, Outcome::Failed(error)));
+            true
+        }
+    }
+}

@@ -1,0 +1,25 @@
+//! The denoise engine: files in, each of them out again with a layer more.
+//!
+//! [`file`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`] and [`store`]
+//! are the steps of which both are made. Nothing is printed: what the user should know is in each frame's [`Report`].
+
+mod batch;
+mod job;
+#[cfg(feature = "preview")]
+pub mod preview;
+
+use std::path::Path;
+
+pub use batch::{Batch, End, Outcome, Stopper, plan};
+pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+
+use crate::{Result, models::Denoiser};
+
+/// Reads a frame, denoises it and writes it, whole, with the result as a new layer. What is at the output's place is replaced.
+///
+/// # Errors
+/// The input is unusable or lacks a pass that the model needs, or the output cannot be written.
+pub fn file(input: &Path, output: &Path, model: &dyn Denoiser, options: &Options) -> Result<Report> {
+    let loaded = load(input, model, options)?;
+    store(denoise(loaded, model, options)?, output, options)
+}

@@ -1,0 +1,156 @@
+//! What a denoiser is given: the passes of a frame, made fit, and what was rendered besides it.
+//!
+//! In: an EXR file, or passes that are in memory already. Out: a [`Shot`]. Here alone the render takes the place of what
+//! Blender made of it, values that are not finite are repaired, and files that belong to a frame are looked for: methods see
+//! what they are given and read no files.
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+use crate::{
+    Error, Result,
+    frame::Frame,
+    passes::{self, Layer, Pass, PassSet},
+    planes::Planes,
+};
+
+/// A frame of one view layer, ready for any method.
+#[derive(Clone, Debug)]
+pub struct Shot {
+    /// Its passes: Combined is the render, and every value finite.
+    pub passes: PassSet,
+    /// Two renders of it with seeds of their own, half the samples each, see [`Shot::read_halves`].
+    pub halves: Option<[PassSet; 2]>,
+    /// Frames of its sequence, by how many frames later they are; those before it have negative numbers.
+    pub neighbours: BTreeMap<i32, PassSet>,
+    /// Whether Blender had denoised Combined, and the render was taken from the pass `Noisy Image`.
+    pub was_denoised: bool,
+    /// How many values of each pass were not finite and are repaired; passes that were clean are not listed.
+    pub repaired: BTreeMap<Pass, usize>,
+    /// The render with values that are not finite, where it had any.
+    unrepaired: Option<Planes>,
+}
+
+/// Reads a frame: the view layer named, or else the one with the most recognised passes. Stereo files give their first view.
+///
+/// # Errors
+/// The file is unusable, or has no such view layer.
+pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot> {
+    passes::load(path, view_layer).map(Shot::new)
+}
+
+/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has.
+///
+/// # Errors
+/// Pixels cannot be decoded.
+pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<Shot> {
+    passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat()).map(Shot::new)
+}
+
+/// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to
+/// `shot_0004spp.0017.exr`, where both exist.
+pub fn half_paths(noisy: &Path) -> Option<[PathBuf; 2]> {
+    let name = noisy.file_name()?.to_str()?;
+    let (head, tail) = name.rsplit_once("spp.")?;
+    let paths = ["a", "b"].map(|half| noisy.with_file_name(format!("{head}spp_{half}.{tail}")));
+    paths.iter().all(|p| p.is_file()).then_some(paths)
+}
+
+impl Shot {
+    /// Passes made fit, and nothing besides them.
+    pub fn new(mut passes: PassSet) -> Self {
+        let was_denoised = passes.use_noisy_image();
+        let is_broken = |render: &&Planes| render.data.iter().any(|v| !v.is_finite());
+        let unrepaired = passes.get(Pass::Combined).filter(is_broken).cloned();
+        let repaired = passes.sanitize();
+        Self { passes, halves: None, neighbours: BTreeMap::new(), was_denoised, repaired, unrepaired }
+    }
+
+    /// The render as it was stored, with values that are not finite where it had any.
+    pub fn as_stored(&self) -> Option<&Planes> {
+        self.unrepaired.as_ref().or_else(|| self.passes.get(Pass::Combined))
+    }
+
+    /// Reads the half buffers that lie beside the frame's file, if there are any.
+    ///
+    /// # Errors
+    /// They are unusable, or not of this frame.
+    pub fn read_halves(&mut self) -> Result<()> {
+        let Some(paths) = half_paths(&self.passes.path) else { return Ok(()) };
+        let [a, b] = paths.each_ref().map(|path| self.read_half(path));
+        self.halves = Some([a?, b?]);
+        Ok(())
+    }
+
+    fn read_half(&self, path: &Path) -> Result<PassSet> {
+        let whole = &self.passes;
+        let frame = Frame::read(path)?;
+        if frame.views().len() > 1 {
+            return Err(Error::invalid(path, "half buffers of stereo frames are not read; move them away"));
+        }
+        let half = Self::new(passes::read(&frame, Some(&whole.view_layer))?).passes;
+        if (half.width, half.height) != (whole.width, whole.height) {
+            return Err(Error::invalid(
+                path,
+                format!("is not of the size of {}; render both alike, or move it away", whole.path.display()),
+            ));
+        }
+        Ok(half)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::{NewChannel, SampleKind};
+
+    fn room() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/s0000_room_0004spp.exr")
+    }
+
+    #[test]
+    fn the_render_takes_the_place_of_what_was_denoised_and_is_repaired() {
+        let planes = |value: f32| Planes::from_vec(3, 3, 1, vec![value; 9]);
+        let mut passes = PassSet::new("x.exr", "ViewLayer", 3, 1);
+        passes.insert(Pass::Combined, planes(1.0));
+        assert_eq!(Shot::new(passes.clone()).as_stored(), Some(&planes(1.0)));
+        let mut render = planes(2.0);
+        render.data[1] = f32::NAN;
+        passes.insert(Pass::NoisyImage, render);
+        let shot = Shot::new(passes);
+        assert!(shot.was_denoised && shot.passes.get(Pass::NoisyImage).is_none());
+        assert_eq!(shot.passes.get(Pass::Combined), Some(&planes(2.0)));
+        assert_eq!(shot.repaired, BTreeMap::from([(Pass::Combined, 1)]));
+        assert!(shot.as_stored().unwrap().data[1].is_nan());
+    }
+
+    #[test]
+    fn half_buffers_lie_beside_their_frame_and_are_of_its_size() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        std::fs::copy(room(), path("shot_0004spp.0017.exr")).unwrap();
+        let mut shot = prepare(path("shot_0004spp.0017.exr"), None).unwrap();
+        shot.read_halves().unwrap();
+        assert!(shot.halves.is_none());
+        // The halves of a render are told apart by their Combined.
+        for (name, value) in [("shot_0004spp_a.0017.exr", 1.0), ("shot_0004spp_b.0017.exr", f32::NAN)] {
+            let mut frame = Frame::read(room()).unwrap();
+            let values = vec![value; 128 * 128];
+            let channel = |component| NewChannel { component, kind: SampleKind::Float, values: &values };
+            let channels = ["R", "G", "B"].map(channel);
+            frame.set_layer(0, "ViewLayer.Noisy Image", None, &channels).unwrap();
+            frame.write(path(name)).unwrap();
+        }
+        shot.read_halves().unwrap();
+        let halves = shot.halves.as_ref().expect("both are there");
+        let values = halves.each_ref().map(|half| half.get(Pass::Combined).unwrap().data[0]);
+        assert_eq!(values, [1.0, 0.0]);
+        // Those of another frame are an error, not a result.
+        let other = room().with_file_name("no_harm/principled_0064spp.exr");
+        std::fs::copy(other, path("shot_0004spp_b.0017.exr")).unwrap();
+        let message = shot.read_halves().unwrap_err().to_string();
+        assert!(message.contains("shot_0004spp_b.0017.exr") && message.contains("size"), "{message}");
+    }
+}

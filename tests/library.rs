@@ -1,0 +1,118 @@
+//! The denoise engine as a library: what it writes, tells and refuses, without a command line.
+
+mod common;
+
+use std::{
+    fs,
+    sync::{Arc, Barrier},
+};
+
+use common::files::{data, read_exr, samples};
+use demc::{
+    Error, Result,
+    denoise::{self, Batch, End, Job, Options, Outcome},
+    models::{self, Denoiser},
+    passes::Pass,
+    planes::Planes,
+    shot::Shot,
+};
+
+const FRAME: &str = "s0000_room_0004spp.exr";
+
+#[test]
+fn a_file_is_written_as_the_command_writes_it() {
+    let out = tempfile::tempdir().unwrap();
+    common::demc()
+        .args(["denoise", "--model", "demc-s", "--out"])
+        .arg(out.path())
+        .arg(data(FRAME))
+        .assert()
+        .success();
+    let model = models::open("demc-s").unwrap();
+    let own = out.path().join("own.exr");
+    let report = denoise::file(&data(FRAME), &own, &*model, &Options::default()).unwrap();
+    assert_eq!((report.width, report.height, report.view_layer.as_str()), (128, 128, "ViewLayer"));
+    assert!(fs::read(own).unwrap() == fs::read(out.path().join(FRAME)).unwrap());
+}
+
+#[test]
+fn a_layer_name_that_would_not_read_back_is_refused() {
+    let out = tempfile::tempdir().unwrap();
+    let model = models::open("noisy").unwrap();
+    for name in ["", "a.b", "Combined", "Denoising Albedo"] {
+        let options = Options { layer: Some(name.into()), ..Options::default() };
+        let error = denoise::file(&data(FRAME), &out.path().join("x.exr"), &*model, &options).err().unwrap();
+        assert!(matches!(&error, Error::Usage(why) if why.contains(&format!("'{name}'"))), "{error}");
+    }
+    assert_eq!(fs::read_dir(out.path()).unwrap().count(), 0);
+}
+
+/// Passes its input on, and waits twice for somebody else on the way.
+struct Waits(Barrier);
+
+impl Denoiser for Waits {
+    fn name(&self) -> &str {
+        "waits"
+    }
+
+    fn passes(&self) -> &[Pass] {
+        &[Pass::Combined]
+    }
+
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        self.0.wait();
+        self.0.wait();
+        Ok(shot.passes.require(Pass::Combined, self.name())?.clone())
+    }
+}
+
+#[test]
+fn a_batch_that_is_stopped_begins_no_other_file() {
+    let out = tempfile::tempdir().unwrap();
+    let job = |name: &str| Job { input: data(FRAME), output: out.path().join(name) };
+    let waits = Arc::new(Waits(Barrier::new(2)));
+    let batch = Batch::new(["a.exr", "b.exr", "c.exr"].map(job).into(), waits.clone(), Options::default());
+    let stopper = batch.stopper();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            // The first frame is being denoised.
+            waits.0.wait();
+            stopper.stop();
+        });
+        assert!(batch.run(|job, _| panic!("{} came to an end", job.input.display())) == End::Stopped);
+    });
+    waits.0.wait();
+    stopper.stop();
+    assert_eq!(fs::read_dir(out.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn each_file_of_a_batch_ends_once() {
+    let out = tempfile::tempdir().unwrap();
+    let broken = out.path().join("broken.exr");
+    fs::write(&broken, "no EXR").unwrap();
+    let jobs = denoise::plan(vec![data(FRAME), broken], &out.path().join("done")).unwrap();
+    let Err(Error::Usage(why)) = denoise::plan(vec![data(FRAME), data(FRAME)], out.path()) else { panic!() };
+    assert!(why.contains("both be written"), "{why}");
+    fs::create_dir(out.path().join("done")).unwrap();
+    let options = Options { layer: Some("Clean".into()), ..Options::default() };
+    let run = |jobs: &[Job]| {
+        let mut told = Vec::new();
+        let batch = Batch::new(jobs.to_vec(), models::open("noisy").unwrap().into(), options.clone());
+        let end = batch.run(|job, outcome| {
+            let outcome = match outcome {
+                Outcome::Done(_) => "done",
+                Outcome::Skipped => "skipped",
+                Outcome::Failed(_) => "failed",
+            };
+            told.push((job.clone(), outcome));
+        });
+        assert!(end == End::Complete);
+        told.sort_by_key(|(_, outcome)| *outcome);
+        told
+    };
+    let [frame, broken] = [jobs[0].clone(), jobs[1].clone()];
+    assert_eq!(run(&jobs), [(frame.clone(), "done"), (broken.clone(), "failed")]);
+    assert_eq!(run(&jobs), [(broken, "failed"), (frame.clone(), "skipped")]);
+    assert!(samples(&read_exr(frame.output), "ViewLayer.Clean.G").is_some());
+}
