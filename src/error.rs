@@ -1,6 +1,7 @@
 //! The error type of the crate: one line that names the file, the pass or the tensor, and the remedy.
 
 use std::{
+    any::Any,
     fmt, io,
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
@@ -45,6 +46,8 @@ pub enum Error {
     Usage(String),
     /// The user asked to stop (Ctrl-C).
     Interrupted,
+    /// The program itself is at fault; what its check said.
+    Internal(String),
 }
 
 impl Error {
@@ -87,6 +90,9 @@ impl fmt::Display for Error {
             }
             Self::Usage(message) => f.write_str(message),
             Self::Interrupted => f.write_str("interrupted"),
+            Self::Internal(what) => {
+                write!(f, "an internal error stopped the program ({what}); please report it with the command")
+            }
         }
     }
 }
@@ -106,7 +112,18 @@ impl std::error::Error for Error {
 /// # Errors
 /// Those of `step`, or it panicked.
 pub fn attempt<T>(input: &Path, step: impl FnOnce() -> Result<T>) -> Result<T> {
-    catch_unwind(AssertUnwindSafe(step)).unwrap_or_else(|_| {
-        Err(Error::invalid(input, "an internal error stopped this frame; please report it with the file"))
+    catch_unwind(AssertUnwindSafe(step)).unwrap_or_else(|panic| {
+        let what = panic_message(&*panic);
+        Err(Error::invalid(
+            input,
+            format!("an internal error stopped this frame ({what}); please report it with the file"),
+        ))
     })
+}
+
+/// What a panic said, in one line.
+pub(crate) fn panic_message(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -309,7 +309,7 @@ fn refuses_what_cannot_be_trained() {
     run(&mut train_with("demc-s", "50", &out, 4)).code(2).stderr(says("multiple of 16"));
     run(train_with("kpcn", "8", &out, 4).args(["--loss", "ssim"])).code(2).stderr(says("11 at least"));
     let prefilter = || train_with("prefilter", "64", &out, 4);
-    run(prefilter().args(["--loss", "ssim"])).code(2).stderr(says("--loss geomean"));
+    run(prefilter().args(["--loss", "ssim"])).code(2).stderr(says("take geomean"));
     run(prefilter().arg("--raw-references")).code(2).stderr(says("--raw-references: prefilter"));
     run(train(&out, 4).args(["--val", &data("s0000_room")]))
         .code(1)
@@ -322,6 +322,48 @@ fn refuses_what_cannot_be_trained() {
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
     run(&mut train(&out, 4)).success();
     run(&mut train(&out, 4)).code(1).stderr(says("--resume"));
+}
+
+#[test]
+fn settings_edited_to_nonsense_are_refused_by_name() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(&mut train(&out, 4)).success();
+    let config = out.join("config.json");
+    let text = fs::read_to_string(&config).expect("a configuration");
+    for (path, value) in [
+        ("every", "0"),
+        ("batch", "0"),
+        ("batch", "1000000000000"),
+        ("patch", "0"),
+        ("patch", "33"),
+        ("patch", "1600000000"),
+        ("steps", "-1"),
+        ("lr", "[0, 0]"),
+        ("average", "2"),
+        ("weight_decay", "-1"),
+        ("loss", "\"best\""),
+        ("train", "[]"),
+        ("only", "[\"no.such\"]"),
+        ("network/widths", "[]"),
+        ("network/widths", "[0, 0, 0, 0]"),
+        ("network/widths", "[4096, 4096, 4096, 4096]"),
+        ("network/prefilter", "[]"),
+    ] {
+        let mut edited: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        edited["steps"] = 8.into();
+        let (place, value) = (format!("/{path}"), serde_json::from_str(value).expect("JSON"));
+        *edited.pointer_mut(&place).expect("a setting") = value;
+        fs::write(&config, serde_json::to_string_pretty(&edited).expect("text")).expect("a file");
+        let refused = run(&mut resume(&out)).code(1);
+        let message = String::from_utf8(refused.get_output().stderr.clone()).expect("text");
+        assert_eq!(message.lines().count(), 1, "{path}: {message}");
+        let key = path.split('/').next().expect("a key");
+        assert!(
+            message.contains("config.json") && message.contains(&format!("\"{key}\"")),
+            "{path}: {message}"
+        );
+    }
 }
 
 #[test]

@@ -5,6 +5,7 @@
 
 mod compare;
 mod denoise;
+mod environment;
 mod eval;
 mod inputs;
 mod inspect;
@@ -15,11 +16,15 @@ mod stability;
 mod stop;
 mod train;
 
-use std::{io::Write, process::ExitCode};
+use std::{
+    io::Write,
+    panic::{catch_unwind, set_hook},
+    process::ExitCode,
+};
 
 use clap::{Parser, Subcommand};
 
-use crate::Error;
+use crate::{Error, Result, error::panic_message};
 
 #[derive(Parser)]
 #[command(
@@ -58,7 +63,21 @@ pub const USAGE: u8 = 2;
 /// Parses the process arguments and runs the subcommand.
 pub fn main() -> ExitCode {
     crate::kernels::heap::keep_freed();
-    let done = match Cli::parse().command {
+    let command = Cli::parse().command;
+    // A defect is told in one line like any other failure, not by a trace of the program.
+    if std::env::var_os("RUST_BACKTRACE").is_none() {
+        set_hook(Box::new(|_| {}));
+    }
+    let done = catch_unwind(|| environment::check().and_then(|()| run(command)))
+        .unwrap_or_else(|panic| Err(Error::Internal(panic_message(&*panic))));
+    done.unwrap_or_else(|error| {
+        warn_line(&format!("demc: {error}"));
+        ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
+    })
+}
+
+fn run(command: Command) -> Result<ExitCode> {
+    match command {
         Command::Denoise(args) => denoise::run(args),
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(args),
@@ -67,11 +86,7 @@ pub fn main() -> ExitCode {
         Command::Models(args) => models::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::PeakMemory(args) => peak_memory::run(&args),
-    };
-    done.unwrap_or_else(|error| {
-        warn_line(&format!("demc: {error}"));
-        ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
-    })
+    }
 }
 
 /// One line on stdout. A reader that has gone away (`demc ... | head`) is no reason to stop.

@@ -4,7 +4,7 @@ use std::{
     collections::HashSet,
     fs,
     io::IsTerminal,
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::ExitCode,
     sync::{
         Arc,
@@ -212,46 +212,6 @@ impl Args {
         if let Some(path) = &self.prefilter {
             network.prefilter = weights_file::prefilter_widths(path)?;
         }
-        models::check(&network).map_err(|reason| usage(format!("--widths: {reason}")))?;
-        let mut built = models::build(&network, 0);
-        if !self.only.is_empty() && !built.batch_norms().is_empty() {
-            let reason = "normalises by what it sees in training, so that all of it changes; leave it out";
-            return Err(usage(format!("--only: {} {reason}", self.model)));
-        }
-        train::train_only(&mut *built, &self.only)?;
-        if !built.makes_radiance() {
-            if self.raw_references {
-                let reason =
-                    "makes no radiance, of which alone references hold what it was before; leave it out";
-                return Err(usage(format!("--raw-references: {} {reason}", self.model)));
-            }
-            if self.loss.needs_radiance() {
-                let reason = "makes no radiance that a display would show; take --loss geomean";
-                return Err(usage(format!("--loss {}: {} {reason}", self.loss, self.model)));
-            }
-        }
-        let multiple = built.multiple();
-        if self.patch == 0 || !self.patch.is_multiple_of(multiple) {
-            return Err(usage(format!("--patch {}: must be a multiple of {multiple}", self.patch)));
-        }
-        let least = self.loss.least_side();
-        if self.patch < least {
-            return Err(usage(format!(
-                "--patch {}: --loss {} takes {least} at least",
-                self.patch, self.loss
-            )));
-        }
-        for (name, value) in [("--steps", self.steps), ("--batch", self.batch), ("--every", self.every)] {
-            if value == 0 {
-                return Err(usage(format!("{name} must be at least 1")));
-            }
-        }
-        if !(0.0..f64::INFINITY).contains(&self.weight_decay) {
-            return Err(usage("--weight-decay must be a number, at least 0"));
-        }
-        if !(0.0..1.0).contains(&self.average) {
-            return Err(usage("--average must be at least 0 and less than 1"));
-        }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
             pairs.into_iter().partition(held_out)
@@ -279,7 +239,7 @@ impl Args {
             ));
             network.architecture = Architecture::KpcnCombined;
         }
-        Ok(Options {
+        let options = Options {
             network,
             train: from_anywhere(training)?,
             validation: from_anywhere(validation)?,
@@ -298,8 +258,29 @@ impl Args {
             init: self.init.clone(),
             only: self.only.clone(),
             prefilter: self.prefilter.clone(),
-        })
+        };
+        options.check().map_err(|refusal| {
+            let argument = match refusal.setting {
+                "network" => "widths".into(),
+                setting => setting.replace('_', "-"),
+            };
+            usage(format!("--{argument}: {}", refusal.reason))
+        })?;
+        Ok(options)
     }
+}
+
+/// The settings of a run that goes on, which its folder holds and people edit.
+fn stored_options(config: &Path) -> Result<Options> {
+    let text = fs::read_to_string(config).map_err(Error::io("read", config))?;
+    let options: Options = serde_json::from_str(&text).map_err(|e| {
+        let line = text.lines().nth(e.line().saturating_sub(1)).unwrap_or_default().trim();
+        Error::invalid(config, format!("not a run's configuration: {e}: {line}"))
+    })?;
+    options.check().map_err(|refusal| {
+        Error::invalid(config, format!("\"{}\": {}; mend it there", refusal.setting, refusal.reason))
+    })?;
+    Ok(options)
 }
 
 /// Runs the subcommand.
@@ -310,9 +291,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     pool.build_global().map_err(|e| usage(format!("--threads: {e}")))?;
     let config = args.out.join("config.json");
     let options = if args.resume {
-        let text = fs::read_to_string(&config).map_err(Error::io("read", &config))?;
-        serde_json::from_str(&text)
-            .map_err(|e| Error::invalid(&config, format!("not a run's configuration ({e})")))?
+        stored_options(&config)?
     } else {
         if config.exists() {
             return Err(Error::invalid(

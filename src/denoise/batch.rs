@@ -141,8 +141,7 @@ pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
             )));
         }
         let output = out.join(name);
-        let same = |a: &Path, b: &Path| matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b);
-        if same(&input, &output) {
+        if is_same_file(&input, &output) {
             return Err(Error::Usage(format!(
                 "{}: the result would overwrite its input; choose another --out",
                 input.display()
@@ -151,6 +150,20 @@ pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
         jobs.push(Job { input, output });
     }
     Ok(jobs)
+}
+
+/// Whether two paths lead to one file: folders may be mounted twice, so that where they are on the disk decides.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let place = |path| fs::metadata(path).map(|file| (file.dev(), file.ino()));
+        matches!((place(a), place(b)), (Ok(a), Ok(b)) if a == b)
+    }
+    #[cfg(not(unix))]
+    {
+        matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b)
+    }
 }
 
 fn spawn(

@@ -185,22 +185,31 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
             ));
         }
         let alpha = shot.passes.remove(Pass::Alpha);
-        let radiance = finite(radiance, &mut report);
+        let radiance = finite(radiance, model.name(), &shot.passes.path, &mut report)?;
         done.push((layer, Denoised { radiance, alpha }));
     }
     Ok(Views { frame, views: done, report })
 }
 
 /// Whatever a model returns, what is written is finite.
-fn finite(radiance: Planes, report: &mut Report) -> Planes {
+///
+/// # Errors
+/// Most values are not: what is around them is no picture.
+fn finite(radiance: Planes, model: &str, input: &Path, report: &mut Report) -> Result<Planes> {
+    let values = radiance.data.len();
     let mut set = PassSet::new(PathBuf::new(), "", radiance.width, radiance.height);
     set.insert(Pass::Combined, radiance);
-    if let Some(count) = set.sanitize().get(&Pass::Combined) {
-        report
+    match set.sanitize().get(&Pass::Combined) {
+        Some(&count) if count > values / 2 => {
+            let why = format!("model {model} returned {count} of {values} values that are NaN or infinite");
+            return Err(Error::invalid(input, format!("{why}; check the frame, or choose another model")));
+        }
+        Some(count) => report
             .notes
-            .push(format!("the model returned {count} non-finite values; they were filled from around them"));
+            .push(format!("the model returned {count} non-finite values; they were filled from around them")),
+        None => {}
     }
-    set.remove(Pass::Combined).expect("inserted above")
+    Ok(set.remove(Pass::Combined).expect("inserted above"))
 }
 
 /// The full name of a layer of a view layer.
@@ -266,8 +275,15 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
 fn preview_path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
     match layer.view.as_deref().filter(|_| views > 1) {
         None => output.with_extension("png"),
-        Some(view) => output.with_extension(format!("{view}.png")),
+        Some(view) => output.with_extension(format!("{}.png", file_name(view))),
     }
+}
+
+/// A name of any kind as a part of a file's: what file systems take for more than a letter is written by its number, as in an URL.
+fn file_name(name: &str) -> String {
+    let safe = |c: char| c.is_alphanumeric() || "-_ +".contains(c);
+    let write = |c: char| if safe(c) { c.into() } else { format!("%{:02X}", u32::from(c)) };
+    name.chars().map(write).collect()
 }
 
 /// The headers of what is at the output's place: an EXR, whole since results are written so.
@@ -304,4 +320,23 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
         write(&path, set.require(Pass::Combined, "--preview")?)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_result_without_numbers_fails_its_frame_and_single_ones_are_filled_in() {
+        let result = |bad: usize| {
+            let values = (0..3 * 16).map(|i| if i < bad { f32::NAN } else { 1.0 }).collect();
+            let mut report = Report::default();
+            let found = finite(Planes::from_vec(3, 4, 4, values), "m", Path::new("a.exr"), &mut report);
+            found.map(|planes| (planes.non_finite(), report.notes.len()))
+        };
+        assert_eq!(result(0).unwrap(), (0, 0));
+        assert_eq!(result(3).unwrap(), (0, 1));
+        let error = result(25).unwrap_err().to_string();
+        assert!(error.starts_with("a.exr: model m returned 25 of 48"), "{error}");
+    }
 }

@@ -1,14 +1,14 @@
 //! Channels of one part as f32, decompressed in parallel; only the channels asked for are kept.
 
 use exr::{
-    block::{BlockIndex, UncompressedBlock},
+    block::{BlockIndex, UncompressedBlock, chunk::CompressedBlock},
     math::Vec2,
     meta::{attribute::SampleType, header::Header},
 };
 use half::{f16, slice::HalfFloatSliceExt};
 use rayon::prelude::*;
 
-use super::{Frame, StoredChunk};
+use super::{Frame, StoredChunk, bounds};
 use crate::{Error, Result};
 
 /// Blocks that each thread decompresses before they are copied out: bounds the memory that decoding adds.
@@ -49,6 +49,18 @@ impl Frame {
 
     /// The uncompressed bytes of one stored chunk.
     pub(super) fn decompress(&self, stored: &StoredChunk) -> Result<UncompressedBlock> {
+        let header = &self.meta.headers[stored.part];
+        let (bytes, place) = match &stored.chunk.compressed_block {
+            CompressedBlock::ScanLine(block) => (&block.compressed_pixels_le, None),
+            CompressedBlock::Tile(block) => (&block.compressed_pixels_le, Some(block.coordinates)),
+            _ => return Err(Self::error(&self.path, exr::error::Error::NotSupported("deep data".into()))),
+        };
+        let place = place.map_or_else(|| header.get_block_data_indices(&stored.chunk.compressed_block), Ok);
+        let at = place.and_then(|place| header.get_absolute_block_pixel_coordinates(place));
+        let size = at.map_err(|e| Self::error(&self.path, e))?.size;
+        bounds::check(header, bytes, size).map_err(|why| {
+            Error::invalid(&self.path, format!("damaged EXR ({why}); render it or copy it again"))
+        })?;
         UncompressedBlock::decompress_chunk(stored.chunk.clone(), &self.meta, false)
             .map_err(|e| Self::error(&self.path, e))
     }

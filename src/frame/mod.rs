@@ -4,6 +4,8 @@
 //! is the same chunks again, bit for bit, whatever its compression.
 //! The only module that knows the `exr` crate. What a channel means is `passes`' business.
 
+mod atomic;
+mod bounds;
 mod decode;
 mod edit;
 mod read;
@@ -24,8 +26,8 @@ use exr::{
     },
 };
 
+pub use atomic::{atomically, remove_leftovers};
 pub use edit::{HALF_MAX, NewChannel, Recoded};
-pub use write::atomically;
 
 use crate::{Error, Result};
 

@@ -1,11 +1,10 @@
-//! A frame to a file: written under a temporary name in the target directory and renamed, so that a
-//! file of the final name is always whole.
+//! A frame to a file, whole or not at all.
 
-use std::{fs, io::BufWriter, path::Path};
+use std::{io::BufWriter, path::Path};
 
 use exr::block::writer::ChunksWriter;
 
-use super::Frame;
+use super::{Frame, atomically};
 use crate::{Error, Result};
 
 impl Frame {
@@ -26,29 +25,4 @@ impl Frame {
             })
         })
     }
-}
-
-/// Lets `write` fill a new file that takes the name `path` only when it is complete.
-///
-/// # Errors
-/// Whatever `write` reports, or that the file cannot be created or renamed.
-pub fn atomically(path: &Path, write: impl FnOnce(&fs::File) -> Result<()>) -> Result<()> {
-    let directory = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".demc-").suffix(".tmp");
-    // Temporary files are private by default; this one becomes a file for the whole farm to read.
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        builder.permissions(fs::Permissions::from_mode(0o666)); // less the umask
-    }
-    let file = builder.tempfile_in(directory).map_err(Error::io("write", path))?;
-    write(file.as_file())?;
-    // The name must not outlive a crash of the machine that its pixels did not.
-    file.as_file().sync_all().map_err(Error::io("write", path))?;
-    file.persist(path).map_err(|e| Error::io("write", path)(e.error))?;
-    Ok(())
 }

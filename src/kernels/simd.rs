@@ -269,13 +269,22 @@ impl Tier {
 /// # Panics
 /// If it names another.
 pub(super) fn choose<T: Copy + fmt::Debug>(variable: &str, wanted: &str, choices: &[T]) -> T {
-    let names: Vec<String> = choices.iter().map(|choice| format!("{choice:?}").to_lowercase()).collect();
-    let place = match names.iter().position(|name| *name == wanted.to_lowercase()) {
-        Some(place) => place,
-        None if wanted.is_empty() => choices.len() - 1,
-        None => panic!("{variable} is \"{wanted}\"; this processor has {}", names.join(", ")),
-    };
-    choices[place]
+    if let Some(names) = unknown_choice(wanted, choices) {
+        panic!("{variable} is \"{wanted}\"; this processor has {names}");
+    }
+    let named = choices.iter().find(|choice| name_of(choice) == wanted.to_lowercase());
+    *named.unwrap_or(&choices[choices.len() - 1])
+}
+
+/// The names of `choices`, where an environment variable names another.
+pub fn unknown_choice<T: fmt::Debug>(wanted: &str, choices: &[T]) -> Option<String> {
+    let names: Vec<String> = choices.iter().map(name_of).collect();
+    let is_known = wanted.is_empty() || names.contains(&wanted.to_lowercase());
+    (!is_known).then(|| names.join(", "))
+}
+
+fn name_of(choice: &impl fmt::Debug) -> String {
+    format!("{choice:?}").to_lowercase()
 }
 
 /// Plain arrays: the oracle of the other tiers.

@@ -215,6 +215,25 @@ pub fn check(config: &Config) -> Result<(), String> {
     Ok(())
 }
 
+/// Fewer parameters than the network of a configuration has, but not by far: a file that holds fewer is not asked for memory to
+/// build it in.
+///
+/// # Panics
+/// If [`check`] finds the configuration wrong.
+pub fn least_parameters(config: &Config) -> usize {
+    let squares = |widths: &[usize]| widths.iter().map(|width| width * width).sum::<usize>();
+    // Weights of convolutions from as many channels to as many: taps times layers of a width.
+    let counted = match config.architecture {
+        Architecture::Demc | Architecture::DemcNofusion => 9 * 4 * squares(&config.widths),
+        Architecture::Semc => 9 * 2 * squares(&config.widths),
+        Architecture::Pyramid | Architecture::Prefilter => 9 * 2 * squares(&config.widths),
+        Architecture::Kpcn => 25 * 14 * squares(&config.widths),
+        Architecture::KpcnCombined => 25 * 7 * squares(&config.widths),
+        Architecture::Lbf => config.widths[0],
+    };
+    counted + 9 * 2 * squares(&config.prefilter)
+}
+
 /// A network with fresh weights drawn from `seed`.
 ///
 /// # Panics
@@ -227,5 +246,25 @@ pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
         Architecture::Pyramid | Architecture::Prefilter => Box::new(pyramid::Pyramid::new(config, seed)),
         Architecture::Kpcn | Architecture::KpcnCombined => Box::new(kpcn::Kpcn::new(config, seed)),
         Architecture::Lbf => Box::new(lbf::Lbf::new(config, seed)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parameters_are_told_before_they_are_built() {
+        let mut configs: Vec<Config> = trainable().into_iter().map(|(_, config)| config).collect();
+        // The least and the most that levels of other widths need between them.
+        configs.push(Config::new(Architecture::Prefilter, &[64, 8, 8, 8]));
+        configs.push(Config::new(Architecture::Prefilter, &[8, 8, 8, 96]));
+        configs.push(Config::new(Architecture::Demc, &[8, 8, 8, 8, 96]));
+        for config in configs {
+            let mut network = build(&config, 1);
+            let held: usize = network.params().iter().map(|param| param.values().len()).sum();
+            let least = least_parameters(&config);
+            assert!((least..=48 * least).contains(&held), "{config}: {least}, {held}");
+        }
     }
 }

@@ -214,6 +214,16 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
     super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
     check_inputs(metadata.inputs.as_deref(), metadata.network.architecture.inputs())
         .map_err(|reason| Error::invalid(path, reason))?;
+    // Before a network is built for them.
+    let held: usize = tensors.iter().map(|tensor| tensor.values.len()).sum();
+    if held < super::least_parameters(&metadata.network) {
+        let why = format!("holds {held} values, too few for {}; the file is damaged", metadata.network);
+        return Err(Error::invalid(path, why));
+    }
+    if let Some(tensor) = tensors.iter().find(|tensor| !tensor.values.iter().all(|v| v.is_finite())) {
+        let why = "holds NaN or infinity: training went wrong; take the weights of an earlier step";
+        return Err(Error::invalid(path, format!("tensor {} {why}", tensor.name)));
+    }
     Ok((metadata, tensors))
 }
 
@@ -309,6 +319,23 @@ mod tests {
         });
         assert_eq!(read(&path).unwrap().1.inputs, None);
         assert!(check_inputs(None, "guides/logarithm/2").is_err(), "of the first kind, which is past");
+    }
+
+    #[test]
+    fn weights_that_claim_much_or_are_no_numbers_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let refused = |change: &dyn Fn(&mut serde_json::Value, &mut Vec<Tensor>)| {
+            let (_, path) = changed(folder.path(), change);
+            read(&path).err().unwrap().to_string()
+        };
+        let error = refused(&|metadata, _| {
+            metadata["network"]["widths"] = serde_json::json!([4096, 4096, 4096, 4096])
+        });
+        assert!(error.contains("too few for Prefilter of widths 4096"), "{error}");
+        for value in [f32::NAN, f32::INFINITY] {
+            let error = refused(&|_, tensors| tensors[3].values[0] = value);
+            assert!(error.contains("holds NaN or infinity"), "{error}");
+        }
     }
 
     #[test]

@@ -1,5 +1,10 @@
 //! Axes of the charts: values to pixels, and round ticks.
 
+/// Pixels beyond which a value off the scale is no further away.
+const FAR: f64 = 1e5;
+/// Ticks of a scale over hundreds of decades.
+const MOST_TICKS: usize = 12;
+
 /// Pixels of a panel's plotting area.
 #[derive(Clone, Copy)]
 pub struct Area {
@@ -24,8 +29,10 @@ pub struct Scale {
 impl Scale {
     /// Covers `values` with a margin; `pixels` are where its ends lie.
     pub fn new(values: impl Iterator<Item = f64>, logarithmic: bool, pixels: (i32, i32)) -> Self {
-        let place = |v: f64| if logarithmic { v.log10() } else { v };
-        let (low, high) = values.map(place).fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
+        let finite = values.filter(|v| v.is_finite());
+        let (low, high) = finite
+            .map(|v| place(v, logarithmic))
+            .fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
         let (low, high) = if low > high { (0.0, 1.0) } else { (low, high) };
         let margin = (0.12 * (high - low)).max(if logarithmic { 0.15 } else { 0.01 });
         Self { low: low - margin, high: high + margin, logarithmic, pixels }
@@ -33,8 +40,7 @@ impl Scale {
 
     /// Covers exactly what lies between two values.
     pub fn exactly((low, high): (f64, f64), logarithmic: bool, pixels: (i32, i32)) -> Self {
-        let place = |v: f64| if logarithmic { v.log10() } else { v };
-        Self { low: place(low), high: place(high), logarithmic, pixels }
+        Self { low: place(low, logarithmic), high: place(high, logarithmic), logarithmic, pixels }
     }
 
     /// How much it covers: in decades where it is logarithmic.
@@ -44,15 +50,19 @@ impl Scale {
 
     /// Where `value` lies.
     pub fn at(&self, value: f64) -> i32 {
-        let value = if self.logarithmic { value.log10() } else { value };
-        let share = (value - self.low) / (self.high - self.low);
-        self.pixels.0 + (share * f64::from(self.pixels.1 - self.pixels.0)).round() as i32
+        let share = (place(value, self.logarithmic) - self.low) / (self.high - self.low);
+        let (from, to) = (f64::from(self.pixels.0), f64::from(self.pixels.1));
+        (from + share * (to - from)).round().clamp(-FAR, FAR) as i32
     }
 
     /// Round values within the scale, some four to nine of them.
     pub fn ticks(&self) -> Vec<f64> {
         let even = |low: f64, high: f64| -> Vec<f64> {
             let step = round_step((high - low) / 6.0);
+            // Numbers so near each other, or to zero, have no round ones between them.
+            if !step.is_normal() {
+                return vec![low, high];
+            }
             ((low / step).ceil() as i64..=(high / step).floor() as i64).map(|i| i as f64 * step).collect()
         };
         if !self.logarithmic {
@@ -66,8 +76,15 @@ impl Scale {
         };
         let choices: [&[f64]; 3] = [&[1.0], &[1.0, 3.0], &[1.0, 2.0, 5.0]];
         let enough = choices.into_iter().map(within).find(|ticks| ticks.len() >= 4);
-        enough.unwrap_or_else(|| even(10f64.powf(self.low), 10f64.powf(self.high)))
+        let ticks = enough.unwrap_or_else(|| even(10f64.powf(self.low), 10f64.powf(self.high)));
+        let every = ticks.len().div_ceil(MOST_TICKS).max(1);
+        ticks.into_iter().step_by(every).collect()
     }
+}
+
+/// Where a value stands on a scale: the smallest there are stand together, since zero has no logarithm.
+fn place(value: f64, logarithmic: bool) -> f64 {
+    if logarithmic { value.max(f64::MIN_POSITIVE).log10() } else { value }
 }
 
 /// 1, 2 or 5 times a power of ten, near `step`.
@@ -78,6 +95,9 @@ fn round_step(step: f64) -> f64 {
 
 /// A tick's value without a tail of zeros or rounding noise.
 pub fn tick_label(value: f64) -> String {
+    if value != 0.0 && !(1e-6..1e15).contains(&value.abs()) {
+        return format!("{value:.0e}");
+    }
     let text = format!("{value:.6}");
     text.trim_end_matches('0').trim_end_matches('.').into()
 }
@@ -95,6 +115,12 @@ mod tests {
             (vec![0.81, 0.83], false),
             (vec![0.1, 0.95], false),
             (vec![7.0], true),
+            (vec![5e-324], true),
+            (vec![5e-324, 1.0], true),
+            (vec![5e-324, f64::MAX], true),
+            (vec![0.0, f64::INFINITY, f64::NAN], true),
+            (vec![f64::INFINITY], false),
+            (vec![-1e300, 1e300], false),
         ] {
             let ticks = Scale::new(values.iter().copied(), logarithmic, (0, 100)).ticks();
             assert!((2..=12).contains(&ticks.len()), "{values:?}: {ticks:?}");
@@ -102,5 +128,14 @@ mod tests {
         }
         assert_eq!(tick_label(0.30000000000000004), "0.3");
         assert_eq!(tick_label(1000.0), "1000");
+        assert_eq!((tick_label(1e-7), tick_label(0.0)), ("1e-7".into(), "0".into()));
+    }
+
+    #[test]
+    fn values_that_are_no_numbers_stand_somewhere() {
+        let scale = Scale::exactly((5e-324 / 2.0, 1e300), true, (100, 0));
+        for value in [0.0, 5e-324, 1.0, f64::INFINITY, f64::NAN, -1.0] {
+            assert!(scale.at(value).abs() <= FAR as i32, "{value}: {}", scale.at(value));
+        }
     }
 }

@@ -108,6 +108,29 @@ impl Row {
         }
     }
 
+    /// The row as it was read, but a number that is none made empty and given as the reason, so that it is measured again.
+    fn checked(mut self) -> Self {
+        let numbers = [
+            &mut self.relmse,
+            &mut self.ssim,
+            &mut self.rmse,
+            &mut self.max_error,
+            &mut self.seconds,
+            &mut self.ms_per_mpx,
+            &mut self.exposure,
+            &mut self.relmse_trimmed,
+            &mut self.smape,
+            &mut self.flip,
+            &mut self.peak_mib,
+        ];
+        for number in numbers {
+            if number.take_if(|value| !value.is_finite()).is_some() && self.reason.is_empty() {
+                self.reason = "the table held a number that is not finite".into();
+            }
+        }
+        self
+    }
+
     /// What identifies it.
     pub fn key(&self) -> Key {
         (self.noisy.clone(), self.reference.clone(), self.model.clone())
@@ -220,9 +243,11 @@ pub fn read_rows(path: &Path) -> Result<Vec<Row>> {
         Err(e) => return Err(Error::io("read", path)(e)),
     };
     text.truncate(text.rfind('\n').map_or(0, |end| end + 1));
-    csv::Reader::from_reader(text.as_bytes()).deserialize().collect::<Result<_, _>>().map_err(|e| {
+    let rows = csv::Reader::from_reader(text.as_bytes()).into_deserialize().collect::<Result<Vec<Row>, _>>();
+    let rows = rows.map_err(|e| {
         Error::invalid(path, format!("is no table of scores: {e}; move it away, or say --overwrite"))
-    })
+    })?;
+    Ok(rows.into_iter().map(Row::checked).collect())
 }
 
 /// The table on disk while a run fills it.
@@ -299,6 +324,20 @@ mod tests {
         let rows = table.finish([full.key(), row("b", "noisy").key(), row("z", "noisy").key()]).unwrap();
         assert_eq!(rows, [full.clone(), row("b", "noisy")]);
         assert_eq!(read_rows(&path).unwrap(), [full, row("b", "noisy"), row("a", "m")]);
+    }
+
+    #[test]
+    fn what_is_no_number_is_an_empty_cell_that_is_measured_again() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scores.csv");
+        for (text, expected) in [("inf", None), ("1e999", None), ("NaN", None), ("5e-324", Some(5e-324))] {
+            let whole = Row { relmse: Some(0.25), ..row("a", "noisy") };
+            Table::create(path.clone(), vec![whole], Vec::new()).unwrap();
+            let table = fs::read_to_string(&path).unwrap().replace("0.25", text);
+            fs::write(&path, table).unwrap();
+            let rows = read_rows(&path).unwrap();
+            assert_eq!((rows[0].relmse, rows[0].reason.is_empty()), (expected, expected.is_some()), "{text}");
+        }
     }
 
     #[test]

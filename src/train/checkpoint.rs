@@ -7,7 +7,10 @@ use serde::{Deserialize, Serialize};
 use super::Optimizer;
 use crate::{
     Error, Result,
-    models::network::Network,
+    models::{
+        self,
+        network::{Config, Network},
+    },
     nn::weights::{self, Precision, Tensor},
 };
 
@@ -53,6 +56,20 @@ pub fn save(
     weights::write(path, &metadata, &tensors, Precision::Full)
 }
 
+/// Refuses a checkpoint too small for a network before memory is set aside for that.
+///
+/// # Errors
+/// It is, or cannot be read.
+pub fn check_size(path: &Path, config: &Config) -> Result<()> {
+    models::check(config).map_err(|reason| Error::Usage(format!("network: {reason}")))?;
+    let bytes = std::fs::metadata(path).map_err(Error::io("read", path))?.len();
+    if bytes / (size_of::<f32>() as u64) < models::least_parameters(config) as u64 {
+        let why = format!("is too small to hold {config}; give \"network\" in config.json its widths again");
+        return Err(Error::invalid(path, why));
+    }
+    Ok(())
+}
+
 /// Restores what [`save`] wrote.
 pub fn load(
     path: &Path,
@@ -88,7 +105,7 @@ pub fn load(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{models, train::Rule};
+    use crate::train::Rule;
 
     #[test]
     fn counters_come_back_to_the_bit() {

@@ -9,10 +9,12 @@ mod dataset;
 mod log;
 mod loss;
 mod optimizer;
+mod options;
 mod run;
 
 pub use dataset::{Dataset, Sample};
 pub use log::Row;
 pub use loss::Loss;
 pub use optimizer::{Optimizer, Rule};
-pub use run::{Event, Options, run, train_only};
+pub use options::{Options, Refusal, train_only};
+pub use run::{Event, run};

@@ -9,74 +9,26 @@ use std::{
 
 use dfdx::tensor_ops::Backward;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::{
-    Dataset, Loss, Optimizer, Rule, Sample,
+    Dataset, Optimizer, Options, Sample,
     checkpoint::{self, Progress},
     log,
+    options::train_only,
 };
 use crate::{
     Error, Result,
     features::Inputs,
-    frame::atomically,
+    frame::{atomically, remove_leftovers},
     metrics,
     models::{
         self, learned,
-        network::{Config, Network, stack},
+        network::{Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Conv, Precision, Rng, Stats},
+    nn::{Conv, Rng, Stats},
     planes::Planes,
-    testset::Pair,
 };
-
-/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were read: a
-/// folder without one is free.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Options {
-    /// The network.
-    pub network: Config,
-    /// Pairs trained on.
-    pub train: Vec<Pair>,
-    /// Pairs validated on, never trained on.
-    pub validation: Vec<Pair>,
-    /// Steps in all.
-    pub steps: usize,
-    /// Crops a step, if they are as large as can be; of smaller ones as many as have no more pixels.
-    pub batch: usize,
-    /// Rows and columns of a crop, unless the frame that is drawn first for its step is smaller.
-    pub patch: usize,
-    /// Largest learning rate, and that of the last step, to which it falls along a line.
-    pub lr: (f64, f64),
-    /// What is minimised.
-    pub loss: Loss,
-    /// Whether squared errors are against references as they were before they were denoised.
-    #[serde(default)]
-    pub raw_references: bool,
-    /// How gradients become updates.
-    #[serde(default)]
-    pub optimizer: Rule,
-    /// Share of the convolutions' weights that a step takes away at a learning rate of 1.
-    #[serde(default)]
-    pub weight_decay: f64,
-    /// What convolutions round their factors to.
-    pub precision: Precision,
-    /// Weight of the past in the running average of the weights, which is what is validated and kept.
-    pub average: f64,
-    /// Steps between rows of the log, each with a validation.
-    pub every: usize,
-    /// Decides initial weights, crops and augmentation.
-    pub seed: u64,
-    /// A weights file to begin with, instead of weights drawn from the seed.
-    pub init: Option<PathBuf>,
-    /// The names of the parameters that are trained, as [`train_only`] reads them; all are if there are none.
-    #[serde(default)]
-    pub only: Vec<String>,
-    /// The weights file whose prefilter the network gets, if not the built-in one or that of `init`.
-    #[serde(default)]
-    pub prefilter: Option<PathBuf>,
-}
 
 /// What the caller hears of.
 #[derive(Clone, Debug)]
@@ -115,7 +67,11 @@ pub fn run(
 ) -> Result<()> {
     log::create_dir(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
+    remove_leftovers(out)?;
     let resume = resume && checkpoint_path.exists();
+    if resume {
+        checkpoint::check_size(&checkpoint_path, &options.network)?;
+    }
     let mut network = match &options.init {
         Some(path) if !resume => weights_file::read_as(path, &options.network, options.seed)?,
         _ => models::build(&options.network, options.seed),
@@ -201,34 +157,6 @@ pub fn run(
         if stopping && !last {
             return Err(Error::Interrupted);
         }
-    }
-    Ok(())
-}
-
-/// Keeps all parameters as they are but those that one of `names` matches, in which `*` stands for any part of a name; with none,
-/// changes nothing.
-///
-/// # Errors
-/// One of `names` is no pattern, or matches nothing that is trained.
-pub fn train_only(network: &mut dyn Network, names: &[String]) -> Result<()> {
-    if names.is_empty() {
-        return Ok(());
-    }
-    let mut trained = network.params();
-    trained.retain(|param| param.trainable);
-    let refuse = |name: &str, reason: String| Error::Usage(format!("--only '{name}': {reason}"));
-    let mut patterns = Vec::with_capacity(names.len());
-    for name in names {
-        let pattern = glob::Pattern::new(name).map_err(|e| refuse(name, e.to_string()))?;
-        if !trained.iter().any(|param| pattern.matches(&param.name)) {
-            let (first, last) = (&trained[0].name, &trained[trained.len() - 1].name);
-            let reason = format!("matches no parameter that is trained; they are {first} to {last}");
-            return Err(refuse(name, reason));
-        }
-        patterns.push(pattern);
-    }
-    for param in trained {
-        param.trainable = patterns.iter().any(|pattern| pattern.matches(&param.name));
     }
     Ok(())
 }

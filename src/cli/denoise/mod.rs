@@ -21,6 +21,7 @@ use super::{
 use crate::{
     Error, Result,
     denoise::{self, Batch, End, Job, Options, Outcome, preview},
+    frame::remove_leftovers,
     models,
 };
 
@@ -119,6 +120,5 @@ pub fn run(args: Args) -> Result<ExitCode> {
 /// Makes the output directory and finds out now, not after an hour, whether files can be made in it.
 fn prepare(out: &Path) -> Result<()> {
     fs::create_dir_all(out).map_err(Error::io("create", out))?;
-    tempfile::Builder::new().prefix(".demc-").tempfile_in(out).map_err(Error::io("write", out))?;
-    Ok(())
+    remove_leftovers(out)
 }

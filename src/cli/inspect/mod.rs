@@ -9,7 +9,7 @@ use std::{path::PathBuf, process::ExitCode};
 use clap::Args as ClapArgs;
 
 use super::{SOME_FAILED, inputs, print_line, warn_line};
-use crate::Result;
+use crate::{Result, error::attempt};
 
 /// Arguments of `demc inspect`.
 #[derive(Debug, ClapArgs)]
@@ -32,7 +32,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut failed = !inputs.unusable.is_empty();
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
     for path in inputs.files {
-        match examine::examine(&path, &methods) {
+        match attempt(&path, || examine::examine(&path, &methods)) {
             Ok(report) if args.json => {
                 print_line(&serde_json::to_string(&report).expect("strings and numbers serialise"));
             }

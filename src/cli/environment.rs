@@ -1,0 +1,46 @@
+//! What the environment sets, looked at before anything is done: a typing error there is told, and not taken for no setting.
+
+use crate::{
+    Error, Result,
+    kernels::{
+        narrow::Engine,
+        simd::{Tier, unknown_choice},
+    },
+};
+
+/// Threads that nobody means: so many cannot be started.
+const MOST_THREADS: usize = 4096;
+
+/// Refuses settings that mean nothing.
+///
+/// # Errors
+/// Names the variable, what it says and what it may say.
+pub fn check() -> Result<()> {
+    for variable in ["RAYON_NUM_THREADS", "RAYON_RS_NUM_CPUS"] {
+        let Some(value) = std::env::var_os(variable) else { continue };
+        let threads = value.to_str().and_then(|text| text.parse::<usize>().ok());
+        if threads.is_none_or(|threads| threads > MOST_THREADS) {
+            return Err(refused(
+                variable,
+                &value.to_string_lossy(),
+                &format!("a number of threads up to {MOST_THREADS}, or 0 for all cores"),
+            ));
+        }
+    }
+    choice("DEMC_TIER", &Tier::available())?;
+    choice("DEMC_ENGINE", &Engine::available())
+}
+
+/// Whether a variable names one of what there is to choose from, or nothing.
+fn choice<T: std::fmt::Debug>(variable: &str, choices: &[T]) -> Result<()> {
+    let value = std::env::var_os(variable).unwrap_or_default();
+    let value = value.to_string_lossy();
+    match unknown_choice(&value, choices) {
+        Some(names) => Err(refused(variable, &value, &format!("one of {names} on this processor"))),
+        None => Ok(()),
+    }
+}
+
+fn refused(variable: &str, value: &str, wanted: &str) -> Error {
+    Error::Usage(format!("{variable}={value}: the environment must say {wanted}; unset it, or mend it"))
+}
