@@ -65,7 +65,7 @@ fn a_block_that_claims_more_memory_than_there_is_fails_its_frame_alone() {
     let run =
         demc().args(["denoise", "--model", "noisy"]).arg(&input).arg("--out").arg(&out).assert().code(1);
     let message = String::from_utf8(run.get_output().stderr.clone()).unwrap();
-    let failed: Vec<&str> = message.lines().collect();
+    let failed: Vec<&str> = message.lines().filter(|line| !line.starts_with("demc: note:")).collect();
     assert_eq!(failed.len(), bad.len(), "{message}");
     for name in &bad {
         assert!(
@@ -171,7 +171,7 @@ fn a_killed_run_leaves_nothing_behind_its_successor() {
         }
         std::thread::yield_now();
     }
-    assert!(command().status().unwrap().success());
+    assert!(command().stdout(std::process::Stdio::null()).status().unwrap().success());
     assert_eq!(temporary(&out), 0);
     assert!(out.join("in.exr").is_file());
 }

@@ -1,7 +1,7 @@
 //! Channels of one part as f32, decompressed in parallel; only the channels asked for are kept.
 
 use exr::{
-    block::{BlockIndex, UncompressedBlock, chunk::CompressedBlock},
+    block::{BlockIndex, UncompressedBlock},
     math::Vec2,
     meta::{attribute::SampleType, header::Header},
 };
@@ -21,8 +21,8 @@ impl Frame {
     /// # Errors
     /// A block cannot be decompressed, or a channel is subsampled or does not exist.
     pub fn decode(&self, part: usize, images: &[&[usize]]) -> Result<Vec<Vec<f32>>> {
-        let header = self.header(part)?;
-        self.refuse_subsampling(part)?;
+        let header = self.layout(part)?;
+        self.refuse_undecodable(part)?;
         let channels = images.concat();
         if let Some(bad) = channels.iter().find(|&&c| c >= header.channels.list.len()) {
             return Err(Error::invalid(&self.path, format!("part {part} has no channel {bad}")));
@@ -35,7 +35,8 @@ impl Frame {
                 batch.par_iter().map(|stored| self.decompress(stored)).collect::<Result<_>>()?;
             // Only now: a damaged size fails before memory is taken for it.
             if decoded.is_empty() {
-                decoded = images.iter().map(|channels| vec![0.0; channels.len() * area]).collect();
+                let image = |channels: &&[usize]| self.zeros(channels.len() * area);
+                decoded = images.iter().map(image).collect::<Result<_>>()?;
             }
             let planes: Vec<&mut [f32]> =
                 decoded.iter_mut().flat_map(|image| image.chunks_mut(area)).collect();
@@ -47,33 +48,46 @@ impl Frame {
         Ok(decoded)
     }
 
-    /// The uncompressed bytes of one stored chunk.
-    pub(super) fn decompress(&self, stored: &StoredChunk) -> Result<UncompressedBlock> {
-        let header = &self.meta.headers[stored.part];
-        let (bytes, place) = match &stored.chunk.compressed_block {
-            CompressedBlock::ScanLine(block) => (&block.compressed_pixels_le, None),
-            CompressedBlock::Tile(block) => (&block.compressed_pixels_le, Some(block.coordinates)),
-            _ => return Err(Self::error(&self.path, exr::error::Error::NotSupported("deep data".into()))),
-        };
-        let place = place.map_or_else(|| header.get_block_data_indices(&stored.chunk.compressed_block), Ok);
-        let at = place.and_then(|place| header.get_absolute_block_pixel_coordinates(place));
-        let size = at.map_err(|e| Self::error(&self.path, e))?.size;
-        bounds::check(header, bytes, size).map_err(|why| {
-            Error::invalid(&self.path, format!("damaged EXR ({why}); render it or copy it again"))
-        })?;
-        UncompressedBlock::decompress_chunk(stored.chunk.clone(), &self.meta, false)
-            .map_err(|e| Self::error(&self.path, e))
+    /// Values of zero; an error, not the end of the program, where there is no room for them.
+    fn zeros(&self, len: usize) -> Result<Vec<f32>> {
+        let mut values = Vec::new();
+        if values.try_reserve_exact(len).is_err() {
+            let gib = (len * size_of::<f32>()) as f64 / f64::from(1 << 30);
+            let why = format!("needs {gib:.1} GiB more memory than there is; render it in regions");
+            return Err(Error::invalid(&self.path, why));
+        }
+        values.resize(len, 0.0);
+        Ok(values)
     }
 
-    /// Subsampled channels have no place in a render; the `exr` crate cannot decode beside them.
-    pub(super) fn refuse_subsampling(&self, part: usize) -> Result<()> {
-        match self.parts[part].channels.iter().find(|c| c.subsampled) {
-            Some(c) => Err(Error::invalid(
-                &self.path,
-                format!("channel '{}' is subsampled; store it again at full resolution as RGB", c.name),
-            )),
-            None => Ok(()),
-        }
+    /// The uncompressed bytes of one stored chunk.
+    pub(super) fn decompress(&self, stored: &StoredChunk) -> Result<UncompressedBlock> {
+        let header = self.layout(stored.part)?;
+        let at = header
+            .get_absolute_block_pixel_coordinates(stored.place)
+            .map_err(|e| Self::error(&self.path, e))?;
+        bounds::check(header, &stored.bytes, at.size).map_err(|why| {
+            Error::invalid(&self.path, format!("damaged EXR ({why}); render it or copy it again"))
+        })?;
+        let bytes = stored.bytes.clone();
+        let data = header.compression.decompress_image_section_from_le(header, bytes, at, false);
+        let index = BlockIndex {
+            layer: stored.part,
+            pixel_position: Vec2(
+                at.position.x().unsigned_abs() as usize,
+                at.position.y().unsigned_abs() as usize,
+            ),
+            pixel_size: at.size,
+            level: stored.place.level_index,
+        };
+        data.map(|data| UncompressedBlock { index, data }).map_err(|e| Self::error(&self.path, e))
+    }
+
+    pub(super) fn refuse_undecodable(&self, part: usize) -> Result<()> {
+        let part = &self.parts[part];
+        let Some(why) = part.undecodable() else { return Ok(()) };
+        let what = part.name.as_ref().map(|name| format!("part '{name}': ")).unwrap_or_default();
+        Err(Error::invalid(&self.path, what + &why))
     }
 }
 

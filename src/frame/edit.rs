@@ -6,20 +6,25 @@
 use std::fmt;
 
 use exr::{
-    block::{BlockIndex, UncompressedBlock},
+    block::{BlockIndex, UncompressedBlock, chunk::TileCoordinates},
     compression::Compression,
     math::Vec2,
     meta::{
-        BlockDescription, MetaData,
-        attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, SampleType, Text},
+        BlockDescription,
+        attribute::{ChannelDescription, ChannelList, LevelMode, LineOrder, SampleType, Text},
         compute_level_size,
-        header::{Header, LayerAttributes},
+        header::Header,
     },
 };
 use half::{f16, vec::HalfFloatVecExt};
 use rayon::prelude::*;
 
-use super::{Frame, SampleKind, StoredChunk, decode::row_bytes, text, zip};
+use super::{
+    Frame, SampleKind, Stored, StoredChunk,
+    decode::row_bytes,
+    header::{Attributes, write_tiles},
+    zip,
+};
 use crate::Result;
 
 /// Largest finite half.
@@ -27,6 +32,10 @@ pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
 /// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is replaced.
 const MARK: &str = "demc";
+/// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
+const OWN: [&str; 5] = [MARK, "name", "preview", "chunkCount", "idManifest"];
+/// How the names of a cryptomatte's attributes begin.
+const CRYPTOMATTE: &[u8] = b"cryptomatte/";
 
 /// A channel to store: values of the whole data window, row-major.
 #[derive(Clone, Copy, Debug)]
@@ -78,9 +87,9 @@ impl Frame {
         view: Option<&str>,
         channels: &[NewChannel<'_>],
     ) -> Result<Option<Recoded>> {
-        let header = self.header(beside)?.clone();
+        let area = self.layout(beside)?.layer_size.area();
         for channel in channels {
-            assert_eq!(channel.values.len(), header.layer_size.area(), "one value for each pixel");
+            assert_eq!(channel.values.len(), area, "one value for each pixel");
         }
         let own_part = self.is_part_per_pass(beside);
         let (part_name, prefix) = match view {
@@ -97,7 +106,7 @@ impl Frame {
         let (part, recoded) = match holder {
             Some(part) => (part, self.set_channels(part, &named)?),
             None if own_part => {
-                self.add_part(&header, &part_name, &named)?;
+                self.add_part(beside, &part_name, &named)?;
                 (self.parts.len() - 1, None)
             }
             None => (beside, self.set_channels(beside, &named)?),
@@ -111,8 +120,7 @@ impl Frame {
         let mut marked = self.marked(part);
         if !marked.iter().any(|layer| layer == name) {
             marked.push(name.into());
-            let list = AttributeValue::Text(text(&marked.join("\n")));
-            self.meta.headers[part].own_attributes.other.insert(text(MARK), list);
+            self.stored[part].attributes.set_text(MARK, &marked.join("\n"));
         }
     }
 
@@ -144,10 +152,8 @@ impl Frame {
 
     /// The layers of a part that demc made.
     fn marked(&self, part: usize) -> Vec<String> {
-        match self.meta.headers[part].own_attributes.other.get(&text(MARK)) {
-            Some(AttributeValue::Text(list)) => super::string(list).lines().map(str::to_owned).collect(),
-            _ => Vec::new(),
-        }
+        let list = self.stored[part].attributes.text(MARK).unwrap_or_default();
+        list.lines().map(str::to_owned).collect()
     }
 
     /// Overwrites existing channels of a part, by index: those of the layer `name`, such as `ViewLayer.Combined`.
@@ -163,7 +169,7 @@ impl Frame {
         name: &str,
         channels: &[(usize, &[f32])],
     ) -> Result<Option<Recoded>> {
-        let header = self.header(part)?;
+        let header = self.layout(part)?;
         let named: Named<'_> = channels
             .iter()
             .map(|&(index, values)| {
@@ -190,78 +196,75 @@ impl Frame {
         self.is_multi_part() || of_its_own(&self.parts[part])
     }
 
-    fn add_part(&mut self, like: &Header, name: &str, channels: &Named<'_>) -> Result<()> {
-        let own = &like.own_attributes;
+    fn add_part(&mut self, beside: usize, name: &str, channels: &Named<'_>) -> Result<()> {
+        let Stored { attributes: old, layout: like } = &self.stored[beside];
         let blocks = match like.blocks {
             BlockDescription::ScanLines => BlockDescription::ScanLines,
             BlockDescription::Tiles(mut tiles) => {
-                tiles.level_mode = exr::meta::attribute::LevelMode::Singular;
+                tiles.level_mode = LevelMode::Singular;
                 BlockDescription::Tiles(tiles)
             }
         };
-        let mut header = like.clone().with_encoding(like.compression, blocks, like.line_order);
-        header.channels = channel_list(channels.iter().map(|(n, c)| describe(n, c.kind)).collect());
-        header.own_attributes = LayerAttributes {
-            layer_name: Some(text(name)),
-            layer_position: own.layer_position,
-            screen_window_center: own.screen_window_center,
-            screen_window_width: own.screen_window_width,
-            view_name: own.view_name.clone(),
-            ..LayerAttributes::default()
-        };
-        let part = self.meta.headers.len();
-        self.meta.headers.push(header);
-        let encoder = Encoder::new(&self.meta, part, None, channels);
-        let header = &self.meta.headers[part];
-        let chunks = header
+        let mut layout = like.clone().with_encoding(like.compression, blocks, like.line_order);
+        layout.channels = channel_list(channels.iter().map(|(n, c)| describe(n, c.kind)).collect());
+        // Another layer of the same picture: its colours, camera and view are those of the part beside.
+        let mut attributes = old.clone();
+        attributes.0.retain(|attribute| {
+            let is_own = OWN.iter().any(|own| own.as_bytes() == attribute.name);
+            !is_own && !attribute.name.starts_with(CRYPTOMATTE)
+        });
+        attributes.set_text("name", name);
+        attributes.set_layout(&layout);
+        if let BlockDescription::Tiles(tiles) = blocks {
+            attributes.set("tiles", "tiledesc", write_tiles(tiles));
+        }
+        let part = self.stored.len();
+        let encoder = Encoder::new(&layout, part, None, channels);
+        let chunks = layout
             .enumerate_ordered_blocks()
             .collect::<Vec<_>>()
             .into_par_iter()
             .map(|(index, tile)| {
-                let at = header.get_absolute_block_pixel_coordinates(tile.location)?;
+                let at = layout.get_absolute_block_pixel_coordinates(tile.location)?;
                 let at = BlockIndex {
                     layer: part,
                     pixel_position: at.position.to_usize("block position")?,
                     pixel_size: at.size,
                     level: tile.location.level_index,
                 };
-                encoder.encode(index, at, None)
+                encoder.encode((index, tile.location), at, None)
             })
             .collect::<exr::error::Result<Vec<_>>>();
-        match chunks {
-            Ok(chunks) => {
-                self.chunks.extend(chunks);
-                self.describe();
-                Ok(())
-            }
-            Err(error) => {
-                self.meta.headers.pop();
-                Err(Self::error(&self.path, error))
-            }
-        }
+        self.chunks.extend(chunks.map_err(|e| Self::error(&self.path, e))?);
+        self.stored.push(Stored { attributes, layout });
+        self.multi_part = true;
+        self.stored.iter_mut().for_each(Stored::complete_for_several);
+        self.describe();
+        Ok(())
     }
 
     /// Adds channels to a part, or replaces those of the same name.
     fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
-        self.refuse_subsampling(part)?;
-        let old = self.header(part)?.clone();
-        let is_new = |name: &Text| new.iter().any(|(n, _)| text(n) == *name);
+        self.refuse_undecodable(part)?;
+        let Stored { attributes: old_attributes, layout: old } = &self.stored[part];
+        let is_new = |name: &Text| new.iter().any(|(n, _)| name.as_slice() == n.as_bytes());
         let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name));
         let loses = kept().any(|c| !survives(old.compression, c.sample_type));
         let compression = if loses { Compression::ZIP16 } else { old.compression };
 
-        let mut meta = self.meta.clone();
         let list = kept().cloned().chain(new.iter().map(|(n, c)| describe(n, c.kind))).collect();
-        let mut header = old.clone().with_encoding(compression, old.blocks, old.line_order);
-        header.channels = channel_list(list);
-        meta.headers[part] = header;
+        let mut layout = old.clone().with_encoding(compression, old.blocks, old.line_order);
+        layout.channels = channel_list(list);
+        let mut attributes: Attributes = old_attributes.clone();
+        attributes.set_layout(&layout);
 
-        let encoder = Encoder::new(&meta, part, Some(&old), new);
+        let recoded = loses.then(|| Recoded { from: super::compression_name(old.compression) });
+        let encoder = Encoder::new(&layout, part, Some(old), new);
         let encoded: Vec<Vec<StoredChunk>> = self
             .chunks
             .par_iter()
             .filter(|stored| stored.part == part)
-            .map(|stored| encoder.recode(stored.index, &self.decompress(stored)?, &self.path))
+            .map(|stored| encoder.recode(stored, &self.decompress(stored)?, &self.path))
             .collect::<Result<_>>()?;
         drop(encoder);
 
@@ -275,9 +278,24 @@ impl Frame {
             }
         }
         self.chunks = chunks;
-        self.meta = meta;
+        self.stored[part] = Stored { attributes, layout };
         self.describe();
-        Ok(loses.then(|| Recoded { from: super::compression_name(old.compression) }))
+        Ok(recoded)
+    }
+}
+
+impl Stored {
+    /// Adds what parts must say of themselves in a file of several.
+    fn complete_for_several(&mut self) {
+        let Self { attributes, layout } = self;
+        let kind = match (layout.blocks, layout.deep) {
+            (BlockDescription::ScanLines, false) => "scanlineimage",
+            (BlockDescription::Tiles(_), false) => "tiledimage",
+            (BlockDescription::ScanLines, true) => "deepscanline",
+            (BlockDescription::Tiles(_), true) => "deeptile",
+        };
+        attributes.set_text("type", kind);
+        attributes.set_chunk_count(layout);
     }
 }
 
@@ -294,7 +312,7 @@ fn describe(name: &str, kind: SampleKind) -> ChannelDescription {
         SampleKind::Uint => SampleType::U32,
     };
     // Not "perceptually linear": radiance, as Blender marks it.
-    ChannelDescription::new(text(name), kind, false)
+    ChannelDescription::new(Text::from_slice_unchecked(name.as_bytes()), kind, false)
 }
 
 fn channel_list(mut channels: Vec<ChannelDescription>) -> ChannelList {
@@ -311,7 +329,7 @@ enum Source<'a> {
 
 /// Builds the blocks of one part from its old blocks and new planes.
 struct Encoder<'a> {
-    meta: &'a MetaData,
+    layout: &'a Header,
     part: usize,
     old: Option<&'a Header>,
     /// One for each channel of the new part.
@@ -319,34 +337,30 @@ struct Encoder<'a> {
 }
 
 impl<'a> Encoder<'a> {
-    fn new(meta: &'a MetaData, part: usize, old: Option<&'a Header>, new: &'a Named<'a>) -> Self {
+    fn new(layout: &'a Header, part: usize, old: Option<&'a Header>, new: &'a Named<'a>) -> Self {
         let source = |channel: &ChannelDescription| {
-            let fresh = new.iter().find(|(n, _)| text(n) == channel.name);
+            let fresh = new.iter().find(|(n, _)| channel.name.as_slice() == n.as_bytes());
             fresh.map(|(_, c)| Source::New(c.values)).unwrap_or_else(|| {
                 let kept = old.and_then(|h| h.channels.find_index_of_channel(&channel.name));
                 Source::Kept(kept.expect("a channel that is not new was there before"))
             })
         };
-        let sources = meta.headers[part].channels.list.iter().map(source).collect();
-        Self { meta, part, old, sources }
-    }
-
-    fn header(&self) -> &Header {
-        &self.meta.headers[self.part]
+        let sources = layout.channels.list.iter().map(source).collect();
+        Self { layout, part, old, sources }
     }
 
     /// The new chunks of one old block: one, or several where ZIP's 16 rows replace longer blocks
     /// (all block heights divide one another, and blocks start at the top of the data window).
     fn recode(
         &self,
-        index: usize,
+        stored: &StoredChunk,
         block: &UncompressedBlock,
         path: &std::path::Path,
     ) -> Result<Vec<StoredChunk>> {
         let whole = block.index;
-        let rows = match self.header().blocks {
+        let rows = match self.layout.blocks {
             BlockDescription::Tiles(_) => whole.pixel_size.height(),
-            BlockDescription::ScanLines => self.header().compression.scan_lines_per_block(),
+            BlockDescription::ScanLines => self.layout.compression.scan_lines_per_block(),
         };
         let (top, height) = (whole.pixel_position.y(), whole.pixel_size.height());
         let mut chunks = (0..height)
@@ -357,15 +371,18 @@ impl<'a> Encoder<'a> {
                     pixel_size: Vec2(whole.pixel_size.width(), rows.min(height - y)),
                     ..whole
                 };
-                let index = match self.header().blocks {
-                    BlockDescription::Tiles(_) => index,
-                    BlockDescription::ScanLines => (top + y) / rows,
+                let place = match self.layout.blocks {
+                    BlockDescription::Tiles(_) => (stored.index, stored.place),
+                    BlockDescription::ScanLines => {
+                        let index = (top + y) / rows;
+                        (index, TileCoordinates { tile_index: Vec2(0, index), ..stored.place })
+                    }
                 };
-                self.encode(index, at, Some((block, y)))
+                self.encode(place, at, Some((block, y)))
             })
             .collect::<exr::error::Result<Vec<_>>>()
             .map_err(|e| Frame::error(path, e))?;
-        if self.header().line_order == LineOrder::Decreasing {
+        if self.layout.line_order == LineOrder::Decreasing {
             chunks.reverse();
         }
         Ok(chunks)
@@ -374,11 +391,11 @@ impl<'a> Encoder<'a> {
     /// One block: kept channels from the old block (from its row `y` on), new ones from their planes.
     fn encode(
         &self,
-        index: usize,
+        (index, place): (usize, TileCoordinates),
         at: BlockIndex,
         old: Option<(&UncompressedBlock, usize)>,
     ) -> exr::error::Result<StoredChunk> {
-        let header = self.header();
+        let header = self.layout;
         let mut data = Vec::with_capacity(at.pixel_size.area() * header.channels.bytes_per_pixel);
         for row in 0..at.pixel_size.height() {
             for (channel, source) in header.channels.list.iter().zip(&self.sources) {
@@ -394,20 +411,19 @@ impl<'a> Encoder<'a> {
                 }
             }
         }
-        let block = UncompressedBlock { index: at, data };
-        let chunk = zip::compress(block, &self.meta.headers)?;
-        Ok(StoredChunk { part: self.part, index, chunk })
+        let bytes = zip::compress(UncompressedBlock { index: at, data }, header)?;
+        Ok(StoredChunk { part: self.part, index, place, bytes })
     }
 
     /// One row of a block of new values; smaller resolution levels take the mean of what they cover.
     fn line(&self, values: &'a [f32], at: BlockIndex, row: usize) -> std::borrow::Cow<'a, [f32]> {
-        let (width, height) = (self.header().layer_size.width(), self.header().layer_size.height());
+        let (width, height) = (self.layout.layer_size.width(), self.layout.layer_size.height());
         let (x0, y) = (at.pixel_position.x(), at.pixel_position.y() + row);
         let count = at.pixel_size.width();
         if at.level == Vec2(0, 0) {
             return values[y * width + x0..][..count].into();
         }
-        let BlockDescription::Tiles(tiles) = self.header().blocks else {
+        let BlockDescription::Tiles(tiles) = self.layout.blocks else {
             unreachable!("only tiled parts have resolution levels")
         };
         let level_width = compute_level_size(tiles.rounding_mode, width, at.level.x());

@@ -8,6 +8,7 @@ mod atomic;
 mod bounds;
 mod decode;
 mod edit;
+mod header;
 mod read;
 mod write;
 mod zip;
@@ -18,33 +19,61 @@ use std::{
 };
 
 use exr::{
-    block::chunk::Chunk,
-    meta::{
-        BlockDescription, MetaData,
-        attribute::{AttributeValue, SampleType, Text},
-        header::Header,
-    },
+    block::chunk::TileCoordinates,
+    compression::Compression,
+    math::Vec2,
+    meta::{BlockDescription, attribute::SampleType, header::Header},
 };
 
 pub use atomic::{atomically, remove_leftovers};
 pub use edit::{HALF_MAX, NewChannel, Recoded};
 
 use crate::{Error, Result};
+use header::{Attributes, string};
+
+/// Leading bytes of every EXR file.
+const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
+
+/// Flags beside the version of the format.
+mod flags {
+    /// A single part of flat tiles.
+    pub const TILED: u32 = 1 << 9;
+    /// Some name has more than [`super::header::SHORT_NAME`] letters.
+    pub const LONG_NAMES: u32 = 1 << 10;
+    /// Some part is deep.
+    pub const DEEP: u32 = 1 << 11;
+    /// The multi-part layout.
+    pub const MULTI_PART: u32 = 1 << 12;
+    /// Those that there are.
+    pub const ALL: u32 = TILED | LONG_NAMES | DEEP | MULTI_PART;
+}
 
 /// An EXR file held in memory as it was stored.
 pub struct Frame {
     path: PathBuf,
     byte_len: u64,
-    meta: MetaData,
+    /// Whether chunks say which part they belong to.
+    multi_part: bool,
+    /// Whether the file said that it has long names.
+    long_names: bool,
+    stored: Vec<Stored>,
     parts: Vec<Part>,
     chunks: Vec<StoredChunk>,
+}
+
+/// A part as it is stored, and how its blocks lie in it.
+struct Stored {
+    attributes: Attributes,
+    layout: Header,
 }
 
 /// A compressed block of one part; `index` counts the part's blocks in increasing y.
 struct StoredChunk {
     part: usize,
     index: usize,
-    chunk: Chunk,
+    place: TileCoordinates,
+    /// What is compressed; of a deep block with its sizes before it.
+    bytes: Vec<u8>,
 }
 
 /// What a part says about itself.
@@ -60,6 +89,8 @@ pub struct Part {
     pub compression: &'static str,
     /// Tile width and height; scan lines otherwise.
     pub tiles: Option<(usize, usize)>,
+    /// Whether each pixel holds any number of samples: such a part is kept, but cannot be decoded.
+    pub deep: bool,
     /// The pixels that are stored.
     pub data_window: Window,
     /// Compressed size in bytes.
@@ -119,37 +150,25 @@ impl Frame {
 
     /// Whether the file has the multi-part layout (Blender 5: one part per pass).
     pub fn is_multi_part(&self) -> bool {
-        self.parts.len() > 1 || self.meta.requirements.is_multilayer()
+        self.multi_part
     }
 
     /// The text of an attribute that OpenEXR does not define, of the first part that has it.
     pub fn text_attribute(&self, name: &str) -> Option<String> {
-        let name = text(name);
-        self.meta.headers.iter().find_map(|header| {
-            let own = header.own_attributes.other.get(&name);
-            match own.or_else(|| header.shared_attributes.other.get(&name))? {
-                AttributeValue::Text(value) => Some(string(value)),
-                _ => None,
-            }
-        })
+        self.stored.iter().find_map(|stored| stored.attributes.text(name))
     }
 
     /// What viewers show, in the coordinates of the data windows.
     pub fn display_window(&self) -> Window {
-        let window = self.meta.headers[0].shared_attributes.display_window;
-        Window {
-            x: window.position.x(),
-            y: window.position.y(),
-            width: window.size.width(),
-            height: window.size.height(),
-        }
+        let first = &self.stored[0].attributes;
+        first.window("displayWindow").unwrap_or(self.parts[0].data_window)
     }
 
     /// Names of the stereo views that the file declares.
     pub fn views(&self) -> Vec<String> {
-        let declared = self.meta.headers.iter().filter_map(|h| h.own_attributes.multi_view_names.as_ref());
+        let declared = self.stored.iter().flat_map(|stored| stored.attributes.texts("multiView"));
         let own = self.parts.iter().filter_map(|p| p.view.clone());
-        let mut views: Vec<String> = declared.flatten().map(string).chain(own).collect();
+        let mut views: Vec<String> = declared.chain(own).collect();
         let mut seen = std::collections::HashSet::new();
         views.retain(|v| seen.insert(v.clone()));
         views
@@ -157,11 +176,11 @@ impl Frame {
 
     /// Rebuilds the public description after headers or chunks changed.
     fn describe(&mut self) {
-        let mut bytes = vec![0; self.meta.headers.len()];
-        for stored in &self.chunks {
-            bytes[stored.part] += chunk_bytes(&stored.chunk);
+        let mut bytes = vec![0; self.stored.len()];
+        for chunk in &self.chunks {
+            bytes[chunk.part] += chunk.bytes.len();
         }
-        self.parts = self.meta.headers.iter().zip(bytes).map(|(h, b)| Part::new(h, b)).collect();
+        self.parts = self.stored.iter().zip(bytes).map(|(stored, bytes)| Part::new(stored, bytes)).collect();
     }
 
     /// A decoding or encoding failure of the `exr` crate as this crate's error.
@@ -169,11 +188,6 @@ impl Frame {
         use exr::error::Error as Exr;
         match error {
             Exr::Io(source) => Error::Io { path: path.into(), action: "read", source },
-            Exr::NotSupported(what) if what.contains("deep") => Error::invalid(
-                path,
-                "holds deep data, which has no single colour per pixel; render without deep output or \
-                 flatten it first",
-            ),
             Exr::NotSupported(what) => Error::invalid(
                 path,
                 format!("EXR feature not supported ({what}); store it again as a plain ZIP-compressed EXR"),
@@ -187,38 +201,61 @@ impl Frame {
     }
 
     /// The part at `index`, or an error naming the file.
-    fn header(&self, part: usize) -> Result<&Header> {
-        self.meta
-            .headers
-            .get(part)
+    fn layout(&self, part: usize) -> Result<&Header> {
+        let stored = self.stored.get(part);
+        stored
+            .map(|stored| &stored.layout)
             .ok_or_else(|| Error::invalid(&self.path, format!("has no part {part}; parts count from 0")))
     }
 }
 
 impl Part {
-    fn new(header: &Header, stored_bytes: usize) -> Self {
-        let channels = header.channels.list.iter().map(|c| Channel {
-            name: string(&c.name),
+    fn new(Stored { attributes, layout }: &Stored, stored_bytes: usize) -> Self {
+        let channels = layout.channels.list.iter().map(|c| Channel {
+            name: string(c.name.as_slice()),
             kind: c.sample_type.into(),
-            subsampled: c.sampling != exr::math::Vec2(1, 1),
+            subsampled: c.sampling != Vec2(1, 1),
         });
-        let position = header.own_attributes.layer_position;
+        let position = layout.own_attributes.layer_position;
         Self {
-            name: header.own_attributes.layer_name.as_ref().map(string),
-            view: header.own_attributes.view_name.as_ref().map(string),
+            name: attributes.text("name"),
+            view: attributes.text("view"),
             channels: channels.collect(),
-            compression: compression_name(header.compression),
-            tiles: match header.blocks {
+            compression: compression_name(layout.compression),
+            tiles: match layout.blocks {
                 BlockDescription::ScanLines => None,
                 BlockDescription::Tiles(t) => Some((t.tile_size.width(), t.tile_size.height())),
             },
+            deep: layout.deep,
             data_window: Window {
                 x: position.x(),
                 y: position.y(),
-                width: header.layer_size.width(),
-                height: header.layer_size.height(),
+                width: layout.layer_size.width(),
+                height: layout.layer_size.height(),
             },
             stored_bytes,
+        }
+    }
+
+    /// Why the part's pixels cannot be decoded, with the remedy; nothing if they can be.
+    pub fn undecodable(&self) -> Option<String> {
+        let subsampled = self.channels.iter().find(|c| c.subsampled);
+        if self.deep {
+            Some("holds deep data, which has no single colour per pixel; flatten it first".into())
+        } else if self.compression.starts_with("htj2k") {
+            Some(format!(
+                "is compressed as {}, which demc does not read; convert it with OpenImageIO: oiiotool IN.exr \
+                 --compression zip -o OUT.exr",
+                self.compression.to_uppercase()
+            ))
+        } else {
+            subsampled.map(|channel| {
+                format!(
+                    "has channel '{}' at less than full resolution, as chroma beside luminance is; convert it to RGB \
+                     with OpenImageIO: oiiotool IN.exr -o OUT.exr",
+                    channel.name
+                )
+            })
         }
     }
 }
@@ -243,8 +280,8 @@ impl fmt::Display for SampleKind {
     }
 }
 
-fn compression_name(compression: exr::compression::Compression) -> &'static str {
-    use exr::compression::Compression as C;
+fn compression_name(compression: Compression) -> &'static str {
+    use Compression as C;
     match compression {
         C::Uncompressed => "none",
         C::RLE => "rle",
@@ -258,24 +295,5 @@ fn compression_name(compression: exr::compression::Compression) -> &'static str 
         C::DWAB(_) => "dwab",
         C::HTJ2K32 => "htj2k32",
         C::HTJ2K256 => "htj2k256",
-    }
-}
-
-/// EXR text is bytes without a declared encoding: Blender writes UTF-8; Latin-1 reads anything else.
-fn string(text: &Text) -> String {
-    std::str::from_utf8(text.as_slice()).map_or_else(|_| text.to_string(), str::to_owned)
-}
-
-fn text(string: &str) -> Text {
-    Text::from_slice_unchecked(string.as_bytes())
-}
-
-fn chunk_bytes(chunk: &Chunk) -> usize {
-    use exr::block::chunk::CompressedBlock as B;
-    match &chunk.compressed_block {
-        B::ScanLine(b) => b.compressed_pixels_le.len(),
-        B::Tile(b) => b.compressed_pixels_le.len(),
-        B::DeepScanLine(b) => b.compressed_sample_data_le.len(),
-        B::DeepTile(b) => b.compressed_sample_data_le.len(),
     }
 }

@@ -1,68 +1,43 @@
 //! From a file to a [`Frame`]: headers, then every chunk still compressed, each checked to be present
 //! exactly once, so that a truncated render is refused here and not half denoised.
 
-use std::{collections::HashMap, fs::File, io::BufReader, path::Path};
-
-use exr::{
-    block::{
-        chunk::TileCoordinates,
-        reader::{ChunksReader, Reader},
-    },
-    meta::{MetaData, attribute::AttributeValue, header::Header},
+use std::{
+    collections::HashMap,
+    fs::File,
+    io::{self, BufReader, ErrorKind, Read},
+    path::Path,
 };
 
-use super::{Frame, StoredChunk, text};
+use exr::{
+    block::chunk::TileCoordinates,
+    math::Vec2,
+    meta::{BlockDescription, header::Header},
+};
+
+use super::{
+    Frame, MAGIC, Stored, StoredChunk, flags,
+    header::{Attribute, Attributes, string},
+};
 use crate::{Error, Result};
 
-/// Leading bytes of every EXR file.
-const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
 /// Offset-table entry of one chunk.
 const OFFSET_BYTES: u64 = 8;
-/// Longest edge believed (Blender renders at most 65536); a damaged header may promise billions.
-const MAX_EDGE: usize = 1 << 18;
-/// Most pixels believed in one part.
-const MAX_PIXELS: usize = 1 << 31;
+/// Longest name of an attribute, a type or a channel.
+const LONGEST_NAME: usize = 255;
+/// The only version of the format since 2.0.
+const VERSION: u32 = 2;
 
 impl Frame {
     /// Reads a file: headers and compressed chunks; nothing is decoded yet.
     ///
     /// # Errors
-    /// The file cannot be read, is no EXR, is truncated or damaged, or holds deep data.
+    /// The file cannot be read, is no EXR, is truncated or damaged, or holds deep data alone.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let (reader, byte_len) = open(path)?;
-
-        // Where each block of each part belongs, in increasing y.
-        let places: Vec<HashMap<TileCoordinates, usize>> = reader
-            .headers()
-            .iter()
-            .map(|h| h.blocks_increasing_y_order().enumerate().map(|(i, t)| (t.location, i)).collect())
-            .collect();
-        // Through the offset tables (sorted): files may hold gaps and any order of chunks.
-        let mut chunks_reader =
-            reader.filter_chunks(false, |_, _, _| true).map_err(|e| Self::error(path, e))?;
-        let mut chunks = Vec::with_capacity(chunks_reader.len());
-        let mut seen: Vec<Vec<bool>> = places.iter().map(|p| vec![false; p.len()]).collect();
-        while let Some(chunk) = chunks_reader.read_next_chunk() {
-            let chunk = chunk.map_err(|e| match e {
-                exr::error::Error::Invalid(_) => truncated(path),
-                other => Self::error(path, other),
-            })?;
-            let part = chunk.layer_index;
-            let place = chunks_reader.headers()[part]
-                .get_block_data_indices(&chunk.compressed_block)
-                .map_err(|e| Self::error(path, e))?;
-            let Some(&index) = places[part].get(&place) else { return Err(truncated(path)) };
-            if std::mem::replace(&mut seen[part][index], true) {
-                return Err(truncated(path));
-            }
-            chunks.push(StoredChunk { part, index, chunk });
-        }
-        if seen.iter().flatten().any(|s| !s) {
-            return Err(truncated(path));
-        }
-
-        Ok(Self::assemble(path, byte_len, chunks_reader.meta_data().clone(), chunks))
+        let (mut source, mut frame) = open(path)?;
+        frame.chunks = source.chunks(&frame.stored, frame.multi_part).map_err(|e| e.of(path))?;
+        frame.describe();
+        Ok(frame)
     }
 
     /// Reads a file's headers alone: what it holds, none of its pixels.
@@ -70,82 +45,263 @@ impl Frame {
     /// # Errors
     /// As [`Frame::read`], but for damaged pixels.
     pub fn read_headers(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        let (reader, byte_len) = open(path)?;
-        Ok(Self::assemble(path, byte_len, reader.meta_data().clone(), Vec::new()))
-    }
-
-    fn assemble(path: &Path, byte_len: u64, mut meta: MetaData, chunks: Vec<StoredChunk>) -> Self {
-        for header in &mut meta.headers {
-            let attributes = &mut header.own_attributes;
-            // exr 1.74 writes six of a key code's seven numbers, and a file that nothing reads: so they go as plain bytes.
-            if let Some(code) = attributes.film_key_code.take() {
-                let numbers = [
-                    code.film_manufacturer_code,
-                    code.film_type,
-                    code.film_roll_prefix,
-                    code.count,
-                    code.perforation_offset,
-                    code.perforations_per_frame,
-                    code.perforations_per_count,
-                ];
-                let bytes = numbers.iter().flat_map(|n| n.to_le_bytes()).collect();
-                let value = AttributeValue::Custom { kind: text("keycode"), bytes };
-                attributes.other.insert(text("keyCode"), value);
-            }
-        }
-        let mut frame = Self { path: path.into(), byte_len, meta, parts: Vec::new(), chunks };
+        let (_, mut frame) = open(path.as_ref())?;
         frame.describe();
-        frame
+        Ok(frame)
     }
 }
 
-/// Reads a file's headers; its length besides.
-fn open(path: &Path) -> Result<(Reader<BufReader<File>>, u64)> {
+/// Reads a file's headers; what comes next in the source are the offset tables.
+fn open(path: &Path) -> Result<(Source, Frame)> {
     let file = File::open(path).map_err(Error::io("read", path))?;
     let info = file.metadata().map_err(Error::io("read", path))?;
     if info.is_dir() {
         return Err(Error::invalid(path, "is a directory; name the EXR files in it"));
     }
-    let mut buffered = BufReader::with_capacity(1 << 18, file);
-    check_magic(&mut buffered, path, info.len())?;
-    let reader = exr::block::read(buffered, false).map_err(|e| Frame::error(path, e))?;
-    check_sizes(reader.headers(), path, info.len())?;
-    Ok((reader, info.len()))
-}
-
-/// Memory is set aside as headers say: believe only what is plausible and what the file has room for.
-fn check_sizes(headers: &[Header], path: &Path, byte_len: u64) -> Result<()> {
-    for header in headers {
-        let (width, height) = (header.layer_size.width(), header.layer_size.height());
-        // Block sizes are 32-bit in the format.
-        let fits = i32::try_from(header.max_block_byte_size()).is_ok();
-        if width.max(height) > MAX_EDGE || width * height > MAX_PIXELS || !fits {
-            return Err(Error::invalid(
-                path,
-                format!(
-                    "claims {width}x{height} pixels: damaged, or too large; copy it again or render it in regions"
-                ),
-            ));
-        }
-    }
-    let chunks: u64 = headers.iter().map(|h| h.chunk_count as u64).sum();
-    if chunks.saturating_mul(OFFSET_BYTES) > byte_len { Err(truncated(path)) } else { Ok(()) }
-}
-
-fn check_magic(file: &mut BufReader<File>, path: &Path, byte_len: u64) -> Result<()> {
-    use std::io::{Read, Seek};
-    if byte_len == 0 {
+    if info.len() == 0 {
         return Err(Error::invalid(path, "is empty; render it or copy it again"));
     }
-    let mut magic = Vec::with_capacity(MAGIC.len());
-    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(Error::io("read", path))?;
-    if magic != MAGIC {
+    let mut source = Source { reader: BufReader::with_capacity(1 << 18, file), at: 0, len: info.len() };
+    if source.bytes(4).map_err(|e| e.of(path))? != MAGIC {
         return Err(Error::invalid(path, "is not an EXR file; render to OpenEXR MultiLayer"));
     }
-    file.rewind().map_err(Error::io("read", path))
+    let mut frame = Frame {
+        path: path.into(),
+        byte_len: info.len(),
+        multi_part: false,
+        long_names: false,
+        stored: Vec::new(),
+        parts: Vec::new(),
+        chunks: Vec::new(),
+    };
+    source.headers(&mut frame).map_err(|e| e.of(path))?;
+    if frame.stored.iter().all(|stored| stored.layout.deep) {
+        return Err(Error::invalid(
+            path,
+            "holds deep data, which has no single colour per pixel; render without deep output or flatten it first",
+        ));
+    }
+    Ok((source, frame))
 }
 
-fn truncated(path: &Path) -> Error {
-    Error::invalid(path, "is truncated or damaged: pixel blocks are missing; render it or copy it again")
+/// Why reading stops.
+enum Failure {
+    Io(io::Error),
+    /// Pixel blocks are missing.
+    Truncated,
+    /// A header makes no sense.
+    Damaged(String),
+}
+
+impl Failure {
+    fn of(self, path: &Path) -> Error {
+        match self {
+            Self::Io(source) => Error::Io { path: path.into(), action: "read", source },
+            Self::Truncated => Error::invalid(
+                path,
+                "is truncated or damaged: pixel blocks are missing; render it or copy it again",
+            ),
+            Self::Damaged(what) => Error::invalid(
+                path,
+                format!("damaged or incomplete EXR ({what}); render it or copy it again"),
+            ),
+        }
+    }
+}
+
+impl From<io::Error> for Failure {
+    fn from(error: io::Error) -> Self {
+        match error.kind() {
+            ErrorKind::UnexpectedEof => Self::Truncated,
+            _ => Self::Io(error),
+        }
+    }
+}
+
+impl From<String> for Failure {
+    fn from(what: String) -> Self {
+        Self::Damaged(what)
+    }
+}
+
+/// A file that is read once from beginning to end. No more memory is taken than it has bytes left.
+struct Source {
+    reader: BufReader<File>,
+    at: u64,
+    len: u64,
+}
+
+impl Source {
+    fn bytes(&mut self, count: u64) -> Result<Vec<u8>, Failure> {
+        if count > self.len.saturating_sub(self.at) {
+            return Err(Failure::Truncated);
+        }
+        let mut bytes = vec![0; usize::try_from(count).map_err(|_| Failure::Truncated)?];
+        self.reader.read_exact(&mut bytes)?;
+        self.at += count;
+        Ok(bytes)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], Failure> {
+        let mut bytes = [0; N];
+        self.reader.read_exact(&mut bytes)?;
+        self.at += N as u64;
+        Ok(bytes)
+    }
+
+    fn int(&mut self) -> Result<i32, Failure> {
+        Ok(i32::from_le_bytes(self.array()?))
+    }
+
+    /// The bytes before the next zero.
+    fn name(&mut self) -> Result<Vec<u8>, Failure> {
+        let mut name = Vec::new();
+        loop {
+            match self.array()? {
+                [0] => return Ok(name),
+                [byte] if name.len() < LONGEST_NAME => name.push(byte),
+                _ => return Err(Failure::Damaged("a name of an attribute has no end".into())),
+            }
+        }
+    }
+
+    fn seek(&mut self, to: u64) -> Result<(), Failure> {
+        if to >= self.len {
+            return Err(Failure::Truncated);
+        }
+        // Keeps what is buffered, where it is near.
+        self.reader.seek_relative(to.cast_signed() - self.at.cast_signed())?;
+        self.at = to;
+        Ok(())
+    }
+
+    /// Version, flags and all headers.
+    fn headers(&mut self, frame: &mut Frame) -> Result<(), Failure> {
+        let version = u32::from_le_bytes(self.array()?);
+        let has = |flag: u32| version & flag != 0;
+        if version & 0xff != VERSION || version & !(0xff | flags::ALL) != 0 {
+            return Err(Failure::Damaged(format!("version and flags {version:#x} are unknown")));
+        }
+        (frame.multi_part, frame.long_names) = (has(flags::MULTI_PART), has(flags::LONG_NAMES));
+        let mut chunks = 0u64;
+        while let Some(attributes) = self.attributes()? {
+            let kind = attributes.text("type").unwrap_or_default();
+            // In a file of one part the flags decide, and `type` only what deep data is like.
+            let (is_tiled, is_deep) = if frame.multi_part {
+                (kind.contains("tile"), kind.starts_with("deep"))
+            } else if has(flags::DEEP) {
+                (kind == "deeptile", true)
+            } else {
+                (has(flags::TILED), false)
+            };
+            let layout = attributes.layout(is_tiled, is_deep)?;
+            // Before memory is set aside for each of them.
+            chunks += layout.chunk_count as u64;
+            if chunks.saturating_mul(OFFSET_BYTES) > self.len {
+                return Err(Failure::Truncated);
+            }
+            frame.stored.push(Stored { attributes, layout });
+            if !frame.multi_part {
+                break;
+            }
+        }
+        if frame.stored.is_empty() { Err(Failure::Damaged("it has no parts".into())) } else { Ok(()) }
+    }
+
+    /// The attributes of the next part, or nothing after the last.
+    fn attributes(&mut self) -> Result<Option<Attributes>, Failure> {
+        let mut attributes = Attributes::default();
+        loop {
+            let name = self.name()?;
+            if name.is_empty() {
+                return Ok((!attributes.0.is_empty()).then_some(attributes));
+            }
+            let kind = self.name()?;
+            let size = self.int()?;
+            let size =
+                u64::try_from(size).map_err(|_| format!("attribute '{}' has no size", string(&name)))?;
+            attributes.0.push(Attribute { name, kind, value: self.bytes(size)? });
+        }
+    }
+
+    /// All chunks in the order of the file.
+    fn chunks(&mut self, parts: &[Stored], multi_part: bool) -> Result<Vec<StoredChunk>, Failure> {
+        // Where each block of each part belongs, in increasing y.
+        let places: Vec<HashMap<TileCoordinates, usize>> = parts
+            .iter()
+            .map(|stored| {
+                stored.layout.blocks_increasing_y_order().enumerate().map(|(i, t)| (t.location, i)).collect()
+            })
+            .collect();
+        // Through the offset tables, sorted: files may hold gaps and any order of chunks.
+        let mut offsets = Vec::new();
+        for (part, stored) in parts.iter().enumerate() {
+            for _ in 0..stored.layout.chunk_count {
+                offsets.push((u64::from_le_bytes(self.array()?), part));
+            }
+        }
+        let tables_end = self.at;
+        offsets.sort_unstable();
+        let mut seen: Vec<Vec<bool>> = places.iter().map(|p| vec![false; p.len()]).collect();
+        let mut chunks = Vec::with_capacity(offsets.len());
+        let mut held = 0;
+        for (offset, part) in offsets {
+            if offset < tables_end {
+                return Err(Failure::Truncated);
+            }
+            self.seek(offset)?;
+            if multi_part && usize::try_from(self.int()?) != Ok(part) {
+                return Err(Failure::Truncated);
+            }
+            let place = self.place(&parts[part].layout)?;
+            let bytes = if parts[part].layout.deep { self.deep_bytes()? } else { self.sized_bytes()? };
+            // Chunks that overlap would take more memory than the file has bytes.
+            held += bytes.len() as u64;
+            let index = place.and_then(|place| Some((place, *places[part].get(&place)?)));
+            let Some((place, index)) = index.filter(|_| held <= self.len) else {
+                return Err(Failure::Truncated);
+            };
+            if std::mem::replace(&mut seen[part][index], true) {
+                return Err(Failure::Truncated);
+            }
+            chunks.push(StoredChunk { part, index, place, bytes });
+        }
+        Ok(chunks)
+    }
+
+    /// Which block of its part a chunk says it is.
+    fn place(&mut self, layout: &Header) -> Result<Option<TileCoordinates>, Failure> {
+        let number = |n: i64| usize::try_from(n).ok();
+        Ok(match layout.blocks {
+            BlockDescription::ScanLines => {
+                let first = i64::from(layout.own_attributes.layer_position.y());
+                let rows = layout.compression.scan_lines_per_block();
+                let y = number(i64::from(self.int()?) - first);
+                y.map(|y| TileCoordinates { tile_index: Vec2(0, y / rows), level_index: Vec2(0, 0) })
+            }
+            BlockDescription::Tiles(_) => {
+                let mut numbers = [None; 4];
+                for slot in &mut numbers {
+                    *slot = number(self.int()?.into());
+                }
+                let [Some(x), Some(y), Some(level_x), Some(level_y)] = numbers else { return Ok(None) };
+                Some(TileCoordinates { tile_index: Vec2(x, y), level_index: Vec2(level_x, level_y) })
+            }
+        })
+    }
+
+    fn sized_bytes(&mut self) -> Result<Vec<u8>, Failure> {
+        let size = u64::try_from(self.int()?).map_err(|_| Failure::Truncated)?;
+        self.bytes(size)
+    }
+
+    /// A deep block from its sizes on: those of its two packed halves, and what the second unpacks to.
+    fn deep_bytes(&mut self) -> Result<Vec<u8>, Failure> {
+        let sizes: [u8; 24] = self.array()?;
+        let [counts, samples, _] =
+            [0, 8, 16].map(|at| u64::from_le_bytes(std::array::from_fn(|i| sizes[at + i])));
+        let mut bytes = sizes.to_vec();
+        bytes.extend(self.bytes(counts.saturating_add(samples))?);
+        Ok(bytes)
+    }
 }

@@ -1,10 +1,13 @@
 //! A frame to a file, whole or not at all.
 
-use std::{io::BufWriter, path::Path};
+use std::{
+    io::{self, BufWriter, Write},
+    path::Path,
+};
 
-use exr::block::writer::ChunksWriter;
+use exr::meta::BlockDescription;
 
-use super::{Frame, atomically};
+use super::{Frame, MAGIC, StoredChunk, atomically, flags};
 use crate::{Error, Result};
 
 impl Frame {
@@ -15,14 +18,75 @@ impl Frame {
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         atomically(path, |file| {
-            let buffered = BufWriter::with_capacity(1 << 20, file);
-            exr::block::write(buffered, self.meta.headers.clone(), false, |_, writer| {
-                self.chunks.iter().try_for_each(|s| writer.write_chunk(s.index, s.chunk.clone()))
-            })
-            .map_err(|e| match e {
-                exr::error::Error::Io(source) => Error::Io { path: path.into(), action: "write", source },
-                other => Self::error(path, other),
-            })
+            let mut buffered = BufWriter::with_capacity(1 << 20, file);
+            self.write_to(&mut buffered).and_then(|()| buffered.flush()).map_err(Error::io("write", path))
         })
+    }
+
+    fn write_to(&self, out: &mut impl Write) -> io::Result<()> {
+        let mut start = MAGIC.to_vec();
+        start.extend_from_slice(&self.version().to_le_bytes());
+        for stored in &self.stored {
+            stored.attributes.write(&mut start)?;
+        }
+        if self.multi_part {
+            start.push(0);
+        }
+        let mut tables: Vec<Vec<u64>> = self.stored.iter().map(|s| vec![0; s.layout.chunk_count]).collect();
+        let mut at = (start.len() + tables.iter().map(|table| 8 * table.len()).sum::<usize>()) as u64;
+        for chunk in &self.chunks {
+            tables[chunk.part][chunk.index] = at;
+            at += (self.prefix(chunk).len() + chunk.bytes.len()) as u64;
+        }
+        out.write_all(&start)?;
+        for offset in tables.iter().flatten() {
+            out.write_all(&offset.to_le_bytes())?;
+        }
+        self.chunks.iter().try_for_each(|chunk| {
+            out.write_all(&self.prefix(chunk))?;
+            out.write_all(&chunk.bytes)
+        })
+    }
+
+    /// The format's version with the flags of what the file holds.
+    fn version(&self) -> u32 {
+        let is_deep = self.stored.iter().any(|stored| stored.layout.deep);
+        let is_tiled = !self.multi_part && !is_deep && self.stored[0].layout.blocks.has_tiles();
+        let is_long = self.long_names || self.stored.iter().any(|s| s.attributes.has_long_names(&s.layout));
+        let of = |is: bool, flag: u32| if is { flag } else { 0 };
+        2 | of(is_tiled, flags::TILED)
+            | of(is_long, flags::LONG_NAMES)
+            | of(is_deep, flags::DEEP)
+            | of(self.multi_part, flags::MULTI_PART)
+    }
+
+    /// What stands before a chunk's bytes: its part, its place, and its size where the bytes do not say it themselves.
+    fn prefix(&self, chunk: &StoredChunk) -> Vec<u8> {
+        let layout = &self.stored[chunk.part].layout;
+        let int =
+            |n: usize| i32::try_from(n).expect("what was read fits, and sizes were checked").to_le_bytes();
+        let mut prefix = Vec::with_capacity(24);
+        if self.multi_part {
+            prefix.extend_from_slice(&int(chunk.part));
+        }
+        let place = chunk.place;
+        match layout.blocks {
+            BlockDescription::ScanLines => {
+                let rows = place.tile_index.y() * layout.compression.scan_lines_per_block();
+                let rows = i32::try_from(rows).expect("the height was checked");
+                prefix.extend_from_slice(&(layout.own_attributes.layer_position.y() + rows).to_le_bytes());
+            }
+            BlockDescription::Tiles(_) => {
+                for number in
+                    [place.tile_index.x(), place.tile_index.y(), place.level_index.x(), place.level_index.y()]
+                {
+                    prefix.extend_from_slice(&int(number));
+                }
+            }
+        }
+        if !layout.deep {
+            prefix.extend_from_slice(&int(chunk.bytes.len()));
+        }
+        prefix
     }
 }

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    frame::{Frame, Window},
+    frame::{Frame, Part, Window},
     planes::Planes,
 };
 
@@ -59,7 +59,9 @@ fn channels_by_pass(frame: &Frame) -> Vec<(LayerKey, BTreeMap<String, Vec<Unassi
     for (p, part) in frame.parts().iter().enumerate() {
         // A single part's name is the name of the file's only image, unless it ends in that of a pass.
         let part_name = part.name.as_deref().filter(|name| frame.is_multi_part() || ends_in_pass(name));
-        for (c, channel) in part.channels.iter().enumerate() {
+        // Deep samples are no image.
+        let flat = if part.deep { &[] } else { part.channels.as_slice() };
+        for (c, channel) in flat.iter().enumerate() {
             let name = ChannelName::parse(&channel.name, part_name, part.view.as_deref(), &views);
             let key = (name.view_layer, name.view);
             let at = found.iter().position(|(k, _)| *k == key).unwrap_or_else(|| {
@@ -169,8 +171,13 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
             .filter(|l| l.passes.contains_key(&Pass::Combined))
             .max_by_key(|l| (l.passes.len(), l.name != COMPOSITE))
             .ok_or_else(|| {
-                let setting = Pass::Combined.blender_setting();
-                let why = format!("no layer has a Combined pass; {}; {setting}", listed(layers));
+                // Luminance and chroma, which are no colour before they are put together.
+                let mut subsampled =
+                    frame.parts().iter().filter(|part| part.channels.iter().any(|c| c.subsampled));
+                let why = subsampled.find_map(Part::undecodable).unwrap_or_else(|| {
+                    let setting = Pass::Combined.blender_setting();
+                    format!("no layer has a Combined pass; {}; {setting}", listed(layers))
+                });
                 Error::invalid(frame.path(), why)
             }),
     }

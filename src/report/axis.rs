@@ -95,7 +95,7 @@ fn round_step(step: f64) -> f64 {
 
 /// A tick's value without a tail of zeros or rounding noise.
 pub fn tick_label(value: f64) -> String {
-    if value != 0.0 && !(1e-6..1e15).contains(&value.abs()) {
+    if value != 0.0 && !(1e-6..1e6).contains(&value.abs()) {
         return format!("{value:.0e}");
     }
     let text = format!("{value:.6}");

@@ -1,6 +1,6 @@
 //! A file's layers, passes, missing passes and oddities, as data that prints and serialises.
 
-use std::path::Path;
+use std::{collections::HashSet, path::Path};
 
 use serde::Serialize;
 
@@ -35,6 +35,8 @@ pub struct PartReport {
     pub height: usize,
     pub compression: &'static str,
     pub tiles: Option<(usize, usize)>,
+    /// Kept as it is, and not decoded.
+    pub deep: bool,
     pub bytes: usize,
     pub channels: usize,
 }
@@ -58,9 +60,9 @@ pub struct PassReport {
     /// `half`, `float` or `uint`.
     pub kind: String,
     pub compression: &'static str,
-    /// Values that are NaN or infinite.
-    pub non_finite: usize,
-    pub all_zero: bool,
+    /// Values that are NaN or infinite; not known where pixels cannot be decoded.
+    pub non_finite: Option<usize>,
+    pub all_zero: Option<bool>,
 }
 
 #[derive(Serialize)]
@@ -100,6 +102,7 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
         height: p.data_window.height,
         compression: p.compression,
         tiles: p.tiles,
+        deep: p.deep,
         bytes: p.stored_bytes,
         channels: p.channels.len(),
     });
@@ -112,6 +115,7 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
         layers: Vec::new(),
         warnings: window_warnings(&frame),
     };
+    report.warnings.extend(undecodable_warnings(&frame));
     if !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
         report
             .warnings
@@ -140,26 +144,51 @@ fn window_warnings(frame: &Frame) -> Vec<String> {
     differing.into_iter().map(warn).collect()
 }
 
+/// What is listed but cannot be denoised, each kind once.
+fn undecodable_warnings(frame: &Frame) -> Vec<String> {
+    let mut told = HashSet::new();
+    let mut warnings = Vec::new();
+    for part in frame.parts() {
+        let Some(why) = part.undecodable().filter(|why| part.deep || told.insert(why.clone())) else {
+            continue;
+        };
+        let what = part.name.as_ref().map_or("the file".into(), |name| format!("part '{name}'"));
+        let why = if part.deep { "is deep: it is kept as it is, and not denoised".into() } else { why };
+        warnings.push(format!("{what} {why}"));
+    }
+    warnings
+}
+
 fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<LayerReport> {
     let mut passes = Vec::new();
     let mut warnings = Vec::new();
-    if !layer.passes.is_empty() {
-        let set = passes::read_layer(frame, layer, &Pass::ALL)?;
+    let part_of = |pass: &Pass| &frame.parts()[layer.passes[pass].part];
+    let (decodable, others): (Vec<Pass>, Vec<Pass>) =
+        layer.passes.keys().partition(|pass| part_of(pass).undecodable().is_none());
+    let describe = |pass: Pass| {
+        let (at, part) = (&layer.passes[&pass], part_of(&pass));
+        PassReport {
+            pass: pass.to_string(),
+            stored_as: at.name.clone(),
+            kind: part.channels[at.channels[0]].kind.to_string(),
+            compression: part.compression,
+            non_finite: None,
+            all_zero: None,
+        }
+    };
+    if !decodable.is_empty() {
+        let set = passes::read_layer(frame, layer, &decodable)?;
         for (pass, planes) in set.iter() {
-            let at = &layer.passes[&pass];
-            let part = &frame.parts()[at.part];
             let report = PassReport {
-                pass: pass.to_string(),
-                stored_as: at.name.clone(),
-                kind: part.channels[at.channels[0]].kind.to_string(),
-                compression: part.compression,
-                non_finite: planes.non_finite(),
-                all_zero: planes.data.iter().all(|v| *v == 0.0),
+                non_finite: Some(planes.non_finite()),
+                all_zero: Some(planes.data.iter().all(|v| *v == 0.0)),
+                ..describe(pass)
             };
             warnings.extend(pass_warnings(pass, &report, planes));
             passes.push(report);
         }
     }
+    passes.extend(others.into_iter().map(describe));
     if layer.passes.contains_key(&Pass::Position) && !layer.position_averaged {
         warnings.push(format!(
             "Position is Cycles' own pass, one sample a pixel: aliased, and wrong under depth of field and \
@@ -196,10 +225,9 @@ fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<Lay
 
 fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String> {
     let mut warnings = Vec::new();
-    if report.non_finite > 0 {
+    if let Some(bad) = report.non_finite.filter(|bad| *bad > 0) {
         warnings.push(format!(
-            "{pass}: {} of {} values are NaN or infinite; `demc denoise` works with values filled in from around them",
-            report.non_finite,
+            "{pass}: {bad} of {} values are NaN or infinite; `demc denoise` works with values filled in from around them",
             planes.data.len()
         ));
     }
@@ -212,7 +240,7 @@ fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String
         Pass::DenoisingAlbedo,
         Pass::NoisyImage,
     ];
-    if report.all_zero && never_zero.contains(&pass) {
+    if report.all_zero == Some(true) && never_zero.contains(&pass) {
         warnings.push(format!("{pass} is zero everywhere: an empty render, or a pass that was not written"));
     }
     let negative = planes.data.iter().filter(|v| **v < 0.0).count();

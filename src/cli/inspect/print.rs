@@ -51,7 +51,7 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
             true => String::new(),
             false => format!("  stored as '{}'", pass.stored_as),
         };
-        let zero = if pass.all_zero { "  all zero" } else { "" };
+        let zero = if pass.all_zero == Some(true) { "  all zero" } else { "" };
         writeln!(out, "    {:<22}{:<7}{}{alias}{zero}", pass.pass, pass.kind, pass.compression)?;
     }
     // By layer, not by channel: `ViewLayer.Mist`, not `ViewLayer.Mist.Z`.

@@ -1,0 +1,213 @@
+//! What a file holds beside pixels comes out as it went in, byte for byte and in its order, and what cannot be denoised is
+//! said to be so.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use common::{
+    demc,
+    files::{data, write_render},
+};
+use exr::prelude::*;
+use predicates::{prelude::*, str::contains};
+
+/// Name, type and value.
+type Stored = (String, String, Vec<u8>);
+
+/// The flag for names of more than 31 letters.
+const LONG_NAMES: u32 = 0x400;
+
+/// The attributes of a file's first part in their order, and where the header ends.
+fn header(bytes: &[u8]) -> (Vec<Stored>, usize) {
+    let mut at = 8;
+    let name = |at: &mut usize| {
+        let end = *at + bytes[*at..].iter().position(|b| *b == 0).unwrap();
+        let name = String::from_utf8(bytes[*at..end].to_vec()).unwrap();
+        *at = end + 1;
+        name
+    };
+    let mut attributes = Vec::new();
+    loop {
+        let called = name(&mut at);
+        if called.is_empty() {
+            return (attributes, at);
+        }
+        let kind = name(&mut at);
+        let size = u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        attributes.push((called, kind, bytes[at + 4..at + 4 + size].to_vec()));
+        at += 4 + size;
+    }
+}
+
+fn version(bytes: &[u8]) -> u32 {
+    u32::from_le_bytes(bytes[4..8].try_into().unwrap())
+}
+
+/// Adds attributes to a file of one part, before those that it has.
+fn with_attributes(path: &Path, added: &[(&str, &str, &[u8])]) {
+    let mut bytes = fs::read(path).unwrap();
+    let mut written = Vec::new();
+    for (name, kind, value) in added {
+        written.extend([name.as_bytes(), &[0], kind.as_bytes(), &[0]].concat());
+        written.extend((value.len() as u32).to_le_bytes());
+        written.extend_from_slice(value);
+    }
+    let end = header(&bytes).1;
+    let first = u64::from_le_bytes(bytes[end..end + 8].try_into().unwrap()) as usize;
+    for offset in bytes[end..first].as_chunks_mut::<8>().0 {
+        *offset = (u64::from_le_bytes(*offset) + written.len() as u64).to_le_bytes();
+    }
+    bytes.splice(8..8, written);
+    fs::write(path, bytes).unwrap();
+}
+
+fn denoise(input: &Path, out: &Path) -> PathBuf {
+    let mut command = demc();
+    command.args(["denoise", "--model", "noisy", "--overwrite"]).arg(input).arg("--out").arg(out);
+    command.assert().success();
+    out.join(input.file_name().unwrap())
+}
+
+/// A render whose attributes are followed by those given.
+fn render(folder: &Path, added: &[(&str, &str, &[u8])]) -> PathBuf {
+    let path = folder.join("render.exr");
+    write_render(&path, 20, 40, |_, i| i as f32);
+    with_attributes(&path, added);
+    path
+}
+
+#[test]
+fn attributes_keep_their_bytes_and_their_order() {
+    let dir = tempfile::tempdir().unwrap();
+    let numbers = |numbers: [i32; 4]| numbers.iter().flat_map(|n| n.to_le_bytes()).collect::<Vec<u8>>();
+    let (inverted, empty) = (numbers([5, 5, 2, 2]), numbers([0, 0, -1, -1]));
+    let mut added: Vec<(&str, &str, &[u8])> = vec![
+        ("zebra", "string", b"first"),
+        ("inverted", "box2i", &inverted),
+        ("empty", "box2i", &empty),
+        ("dwaCompressionLevel", "float", &[0, 0, 52, 66]),
+        ("of a type to come", "hypercube", &[1, 2, 3]),
+        ("keyCode", "keycode", &[7; 28]),
+        ("latin", "string", &[0xe4, 0xf6]),
+    ];
+    let names: Vec<String> = (0..8).map(|i| format!("custom {}", (i * 5) % 8)).collect();
+    added.extend(names.iter().map(|name| (name.as_str(), "int", [1, 0, 0, 0].as_slice())));
+    let input = render(dir.path(), &added);
+    let [first, second] = ["a", "b"].map(|out| fs::read(denoise(&input, &dir.path().join(out))).unwrap());
+    assert!(first == second, "the same input gives the same bytes");
+    let derived = |(name, _, _): &&Stored| name != "channels" && name != "demc";
+    let (before, after) = (header(&fs::read(&input).unwrap()).0, header(&first).0);
+    let [before, after] = [&before, &after].map(|list| list.iter().filter(derived).collect::<Vec<_>>());
+    assert_eq!(before, after);
+}
+
+#[test]
+fn long_names_are_said_to_be_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = render(dir.path(), &[]);
+    assert_eq!(version(&fs::read(&input).unwrap()) & LONG_NAMES, 0);
+    let result = denoise(&input, &dir.path().join("short"));
+    assert_eq!(version(&fs::read(result).unwrap()) & LONG_NAMES, 0);
+    // A layer that is added, and what the file held.
+    let out = dir.path().join("long");
+    let name = "a layer of a name of more letters than that";
+    let mut command = demc();
+    command.args(["denoise", "--model", "noisy", "--layer", name]).arg(&input).arg("--out").arg(&out);
+    command.assert().success();
+    let result = out.join("render.exr");
+    assert_ne!(version(&fs::read(&result).unwrap()) & LONG_NAMES, 0);
+    let again = denoise(&result, &dir.path().join("again"));
+    assert_ne!(version(&fs::read(again).unwrap()) & LONG_NAMES, 0);
+}
+
+#[test]
+fn the_type_of_a_single_part_does_not_matter() {
+    let dir = tempfile::tempdir().unwrap();
+    for kind in ["tiledimage", "scanlineimage", "deepscanline", "no such thing"] {
+        let input = render(dir.path(), &[("type", "string", kind.as_bytes())]);
+        let result = fs::read(denoise(&input, &dir.path().join("out"))).unwrap();
+        assert!(header(&result).0.iter().any(|(name, _, value)| name == "type" && value == kind.as_bytes()));
+    }
+}
+
+#[test]
+fn a_part_that_is_added_says_of_its_colours_what_the_beauty_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    let part = |name: &str, other: &[(&str, &str)]| {
+        let list = ["R", "G", "B"]
+            .map(|c| AnyChannel::new(format!("{name}.{c}").as_str(), FlatSamples::F32(vec![0.5; 12])));
+        let mut own = LayerAttributes::named(name);
+        own.white_luminance = Some(80.0);
+        for (key, value) in other {
+            own.other.insert((*key).into(), AttributeValue::Text((*value).into()));
+        }
+        Layer::new((4, 3), own, Encoding::SMALL_LOSSLESS, AnyChannels::sort(list.into_iter().collect()))
+    };
+    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
+    let beauty = [("colorInteropID", "lin_ap1_scene"), ("cryptomatte/1/name", "x"), ("demc", "V.Other")];
+    let parts = vec![part("V.Depth", &[("colorInteropID", "data")]), part("V.Combined", &beauty)];
+    Image::from_layers(shared, parts).write().to_file(&input).unwrap();
+    let result = denoise(&input, &dir.path().join("out"));
+    let headers = MetaData::read_from_file(result, false).unwrap().headers;
+    let added = headers.last().unwrap().own_attributes.clone();
+    assert!(added.layer_name.unwrap().eq("V.Denoised"));
+    assert_eq!(added.white_luminance, Some(80.0));
+    let mut other: Vec<(String, AttributeValue)> =
+        added.other.into_iter().map(|(k, v)| (k.to_string(), v)).collect();
+    other.sort_by(|a, b| a.0.cmp(&b.0));
+    let text = |text: &str| AttributeValue::Text(text.into());
+    assert_eq!(
+        other,
+        [("colorInteropID".to_string(), text("lin_ap1_scene")), ("demc".to_string(), text("V.Denoised"))]
+    );
+}
+
+#[test]
+fn a_deep_part_is_copied_and_the_flat_one_denoised() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = data("containers/flat_plus_deep.exr");
+    let mut command = demc();
+    command.arg("inspect").arg(&input).assert().success().stdout(
+        contains("part 'deep' is deep: it is kept as it is")
+            .and(contains("view layer 'ViewLayer'"))
+            .and(contains("Denoising Albedo")),
+    );
+    let mut command = demc();
+    command
+        .args(["denoise", "--model", "demc-s"])
+        .arg(&input)
+        .arg("--out")
+        .arg(dir.path())
+        .assert()
+        .success();
+    let (before, after) =
+        (fs::read(&input).unwrap(), fs::read(dir.path().join("flat_plus_deep.exr")).unwrap());
+    // Its blocks are the last in the file, in one piece.
+    let deep = &before[before.len() - 4000..];
+    assert!(after.windows(deep.len()).any(|window| window == deep));
+    let frame = demc::frame::Frame::read(dir.path().join("flat_plus_deep.exr")).unwrap();
+    let parts: Vec<(&str, bool)> =
+        frame.parts().iter().map(|part| (part.name.as_deref().unwrap(), part.deep)).collect();
+    assert_eq!(parts, [("ViewLayer", false), ("deep", true), ("ViewLayer.Denoised", false)]);
+}
+
+#[test]
+fn what_cannot_be_decoded_is_listed_and_told_with_its_remedy() {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, listed, told) in [
+        ("htj2k32.exr", "Combined", "HTJ2K32"),
+        ("luminance_chroma.exr", "without a view layer", "less than full resolution"),
+    ] {
+        let input = data("containers").join(name);
+        demc().arg("inspect").arg(&input).assert().success().stdout(contains(listed).and(contains(told)));
+        demc().args(["inspect", "--json"]).arg(&input).assert().success().stdout(contains(told));
+        let mut command = demc();
+        command.args(["denoise", "--model", "demc-s"]).arg(&input).arg("--out").arg(dir.path());
+        command.assert().code(1).stderr(contains(name).and(contains(told)).and(contains("oiiotool IN.exr")));
+    }
+}
