@@ -8,6 +8,7 @@
 mod common;
 
 use std::{
+    collections::BTreeMap,
     fs,
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
@@ -32,6 +33,8 @@ use exr::prelude::*;
 const MEMORY_KIB: usize = 3 << 20;
 /// What all cases of a test may take.
 const PATIENCE: Duration = Duration::from_secs(300);
+/// What a case says whose result is no frame.
+const BROKEN: &str = "what was written cannot be read again";
 const SIZE: (usize, usize) = (21, 37);
 
 /// A number that the environment gives.
@@ -160,7 +163,7 @@ fn try_frame(path: &Path) -> demc::Result<()> {
     let mut frame = Frame::read(path)?;
     let written = path.with_extension("out");
     frame.write(&written)?;
-    Frame::read(&written).expect("what was read can be written and read again");
+    Frame::read(&written).expect(BROKEN);
     for part in 0..frame.parts().len() {
         let channels: Vec<usize> = (0..frame.parts()[part].channels.len()).collect();
         // One that cannot be decoded does not make the others so.
@@ -175,9 +178,9 @@ fn try_frame(path: &Path) -> demc::Result<()> {
         ["R", "G", "B"].map(|component| NewChannel { component, kind: SampleKind::Half, values: &values });
     frame.set_layer(0, "V.Denoised", None, &layer)?;
     frame.write(&written)?;
-    let again = Frame::read(&written).expect("what was added can be read again");
+    let again = Frame::read(&written).expect(BROKEN);
     let part = again.parts().iter().position(|p| p.channels.iter().any(|c| c.name == "V.Denoised.G"));
-    assert!(part.is_some(), "the layer is there");
+    assert!(part.is_some(), "{BROKEN}");
     Ok(())
 }
 
@@ -210,7 +213,7 @@ fn child() {
     files.sort();
     let corpus: Vec<Vec<u8>> = files.iter().map(|file| fs::read(file).unwrap()).collect();
     let (first, count) = (setting("DEMC_FUZZ_FIRST", 0), setting("DEMC_FUZZ_CASES", 0));
-    let (mut refused, mut panicked) = (0, 0);
+    let (mut refused, mut panics) = (0, BTreeMap::new());
     std::panic::set_hook(Box::new(|_| {}));
     for case in first..first + count {
         fs::write(folder.join("case"), case.to_string()).unwrap();
@@ -225,18 +228,15 @@ fn child() {
             Ok(Err(_)) => refused += 1,
             // One of the codecs': the program tells it in one line, but what this test says of results must hold.
             Err(panic) => {
-                panicked += 1;
-                let text = panic.downcast_ref::<String>().cloned();
-                let text = text
-                    .or_else(|| panic.downcast_ref::<&str>().map(ToString::to_string))
-                    .unwrap_or_default();
-                fs::write(folder.join("panic"), format!("case {case}, {}: {text}\n", files[base].display()))
-                    .unwrap();
-                assert!(!text.contains("again") && !text.contains("is there"), "case {case}: {text}");
+                let text = panic.downcast_ref::<String>().map(String::as_str);
+                let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or_default();
+                assert!(!text.contains(BROKEN), "case {case}: {text}");
+                panics.entry(text.to_owned()).or_insert(case);
             }
         }
     }
-    fs::write(folder.join("done"), format!("{count} cases: {refused} refused, {panicked} panics")).unwrap();
+    let listed: String = panics.iter().map(|(text, case)| format!("\n    case {case}: {text}")).collect();
+    fs::write(folder.join("done"), format!("{count} cases, {refused} refused{listed}")).unwrap();
 }
 
 /// Mutates files of a kind in a child whose memory is limited.
@@ -271,7 +271,7 @@ fn fuzz(name: &str, cases: usize) {
         }
     };
     let said = |file: &str| fs::read_to_string(folder.join(file)).unwrap_or_default();
-    println!("{name}: {} in {:.0} s; {}", said("done"), start.elapsed().as_secs_f64(), said("panic"));
+    println!("{name} in {:.0} s: {}", start.elapsed().as_secs_f64(), said("done"));
     assert!(
         status.is_some_and(|status| status.success()) && !said("done").is_empty(),
         "{name}: case {} ended with {status:?} after {:?}; DEMC_FUZZ_FIRST={} DEMC_FUZZ_CASES=1 shows it again",

@@ -256,6 +256,8 @@ fn read_channels(mut bytes: &[u8]) -> Result<Vec<ChannelDescription>, String> {
         });
         bytes = rest;
     }
+    // Pixels lie in the order of names, whatever the list's, and so OpenEXR reads them.
+    channels.sort_by(|a, b| a.name.as_slice().cmp(b.name.as_slice()));
     if channels.is_empty() { Err("it has no channels".into()) } else { Ok(channels) }
 }
 

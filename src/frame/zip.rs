@@ -79,8 +79,7 @@ mod tests {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 24) as u8
         };
-        for (compression, rows) in [(Compression::ZIP1, 1), (Compression::ZIP16, 16)]
-        {
+        for (compression, rows) in [(Compression::ZIP1, 1), (Compression::ZIP16, 16)] {
             let header = header(compression);
             let len = 37 * rows * 6;
             let smooth = (0..len).map(|i| (i / 40) as u8).collect();
