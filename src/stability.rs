@@ -12,6 +12,7 @@ use crate::{
     Error, Result,
     augment::Augment,
     error::attempt,
+    frame::prepare_folder,
     metrics::{self, error::relmse},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -247,7 +248,7 @@ pub fn run(
     out: &Path,
     on: &mut dyn FnMut(&Row),
 ) -> Result<Vec<Row>> {
-    std::fs::create_dir_all(out).map_err(Error::io("create", out))?;
+    prepare_folder(out)?;
     let table = out.join("stability.csv");
     write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
     let mut rows = Vec::new();

@@ -32,11 +32,13 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
     Ok(())
 }
 
-/// Removes the temporary files of processes that were killed from a folder in which files are to be written.
+/// Makes a folder for results and finds out now, not after an hour, whether files can be made in it. Temporary files that killed
+/// processes left there are removed.
 ///
 /// # Errors
-/// No file can be made in it.
-pub fn remove_leftovers(folder: &Path) -> Result<()> {
+/// It cannot be made, or no file in it.
+pub fn prepare_folder(folder: &Path) -> Result<()> {
+    fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let refused = |error| Error::io("write", folder)(error);
     temporary(folder).map_err(refused)?;
     for entry in fs::read_dir(folder).map_err(refused)?.flatten() {
@@ -97,7 +99,7 @@ mod tests {
             fs::write(folder.path().join(name), "x").unwrap();
         }
         atomically(&path, |mut file| {
-            remove_leftovers(folder.path())?;
+            prepare_folder(folder.path())?;
             assert_eq!(names(folder.path()).len(), 3, "{:?}", names(folder.path()));
             file.write_all(b"whole").map_err(Error::io("write", &path))
         })
@@ -115,7 +117,7 @@ mod tests {
                 scope.spawn(move || {
                     for i in 0..50 {
                         let path = folder.join(format!("{thread}_{i}"));
-                        remove_leftovers(folder).unwrap();
+                        prepare_folder(folder).unwrap();
                         atomically(&path, |mut f| f.write_all(b"1").map_err(Error::io("write", &path)))
                             .unwrap();
                     }

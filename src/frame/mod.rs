@@ -25,7 +25,7 @@ use exr::{
     meta::{BlockDescription, attribute::SampleType, header::Header},
 };
 
-pub use atomic::{atomically, remove_leftovers};
+pub use atomic::{atomically, prepare_folder};
 pub use edit::{HALF_MAX, NewChannel, Recoded};
 
 use crate::{Error, Result};
@@ -244,8 +244,8 @@ impl Part {
             Some("holds deep data, which has no single colour per pixel; flatten it first".into())
         } else if self.compression.starts_with("htj2k") {
             Some(format!(
-                "is compressed as {}, which demc does not read; convert it with OpenImageIO: oiiotool IN.exr \
-                 --compression zip -o OUT.exr",
+                "is compressed as {}, which demc does not read; convert it with OpenImageIO on OpenEXR 3.4 or \
+                 newer: oiiotool IN.exr --compression zip -o OUT.exr",
                 self.compression.to_uppercase()
             ))
         } else {

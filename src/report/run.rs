@@ -5,7 +5,6 @@
 
 use std::{
     collections::{HashMap, HashSet},
-    fs,
     path::PathBuf,
 };
 
@@ -22,8 +21,9 @@ use super::{
     summary,
 };
 use crate::{
-    Error, Result,
+    Result,
     error::attempt,
+    frame::prepare_folder,
     metrics::{self, pairing},
     models::{Denoiser, Run},
     passes::{self, Pass},
@@ -63,8 +63,10 @@ pub fn evaluate(
 ) -> Result<Vec<Row>> {
     let out = &options.out;
     let sheets = out.join("sheets");
-    let folder = if options.sheets { &sheets } else { out };
-    fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    prepare_folder(out)?;
+    if options.sheets {
+        prepare_folder(&sheets)?;
+    }
     let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
     let provenance = Provenance::now();
     let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
@@ -366,7 +368,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
-    use crate::{models::Noisy, report::Method};
+    use crate::{Error, models::Noisy, report::Method};
 
     /// Fails as no method should.
     struct Panics;

@@ -1,6 +1,6 @@
 //! `log.csv`: one row an interval of steps.
 
-use std::{fs, path::Path};
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
@@ -46,9 +46,4 @@ pub fn write(path: &Path, rows: &[Row]) -> Result<()> {
         }
         writer.flush().map_err(Error::io("write", path))
     })
-}
-
-/// Creates the run's folder.
-pub fn create_dir(path: &Path) -> Result<()> {
-    fs::create_dir_all(path).map_err(Error::io("create", path))
 }

@@ -19,7 +19,7 @@ use super::{
 use crate::{
     Error, Result,
     features::Inputs,
-    frame::{atomically, remove_leftovers},
+    frame::{atomically, prepare_folder},
     metrics,
     models::{
         self, learned,
@@ -65,9 +65,8 @@ pub fn run(
     stop: &AtomicBool,
     on: &mut dyn FnMut(Event),
 ) -> Result<()> {
-    log::create_dir(out)?;
+    prepare_folder(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
-    remove_leftovers(out)?;
     let resume = resume && checkpoint_path.exists();
     if resume {
         checkpoint::check_size(&checkpoint_path, &options.network)?;

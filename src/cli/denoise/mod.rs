@@ -5,11 +5,7 @@
 
 mod progress;
 
-use std::{
-    fs,
-    path::{Path, PathBuf},
-    process::ExitCode,
-};
+use std::{path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
 
@@ -21,7 +17,7 @@ use super::{
 use crate::{
     Error, Result,
     denoise::{self, Batch, End, Job, Options, Outcome, preview},
-    frame::remove_leftovers,
+    frame::prepare_folder,
     models,
 };
 
@@ -92,7 +88,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
     let model = models::open(&args.model)?;
-    prepare(&args.out)?;
+    prepare_folder(&args.out)?;
 
     let options = Options {
         view_layer: args.view_layer,
@@ -115,10 +111,4 @@ pub fn run(args: Args) -> Result<ExitCode> {
         End::Complete if failed > 0 => ExitCode::from(SOME_FAILED),
         End::Complete => ExitCode::SUCCESS,
     })
-}
-
-/// Makes the output directory and finds out now, not after an hour, whether files can be made in it.
-fn prepare(out: &Path) -> Result<()> {
-    fs::create_dir_all(out).map_err(Error::io("create", out))?;
-    remove_leftovers(out)
 }

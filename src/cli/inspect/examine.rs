@@ -116,7 +116,8 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
         warnings: window_warnings(&frame),
     };
     report.warnings.extend(undecodable_warnings(&frame));
-    if !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
+    let is_hidden = frame.parts().iter().any(|part| !part.deep && part.undecodable().is_some());
+    if !is_hidden && !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
         report
             .warnings
             .push(format!("nothing to denoise: no Combined pass; {}", Pass::Combined.blender_setting()));
@@ -203,7 +204,7 @@ fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<Lay
                 .into(),
         );
     }
-    let has_beauty = layer.passes.contains_key(&Pass::Combined);
+    let has_beauty = decodable.contains(&Pass::Combined);
     let models = methods.iter().filter(|_| has_beauty).map(|m| ModelReport {
         model: m.name.clone(),
         missing: m
