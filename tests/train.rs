@@ -242,7 +242,7 @@ fn parameters_alone_are_trained_that_were_asked_for() {
     for (names, reason) in [("heads.*", "no parameter that is trained"), ("head.***", "wildcards")] {
         let refused = run(train(&third, 1).args(["--only", names, "--init"]).arg(&begin)).code(2);
         refused.stderr(
-            predicate::str::contains(format!("--only '{names}'")).and(predicate::str::contains(reason)),
+            predicate::str::contains(format!("--only: '{names}'")).and(predicate::str::contains(reason)),
         );
     }
 }

@@ -280,6 +280,10 @@ fn stored_options(config: &Path) -> Result<Options> {
     options.check().map_err(|refusal| {
         Error::invalid(config, format!("\"{}\": {}; mend it there", refusal.setting, refusal.reason))
     })?;
+    let checkpoint = config.with_file_name(train::CHECKPOINT);
+    if checkpoint.exists() {
+        train::check_size(&checkpoint, &options.network)?;
+    }
     Ok(options)
 }
 

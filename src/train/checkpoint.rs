@@ -14,6 +14,9 @@ use crate::{
     nn::weights::{self, Precision, Tensor},
 };
 
+/// The file of a run folder that holds the state.
+pub const CHECKPOINT: &str = "checkpoint.safetensors";
+
 /// The counters of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {

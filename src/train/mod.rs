@@ -12,6 +12,7 @@ mod optimizer;
 mod options;
 mod run;
 
+pub use checkpoint::{CHECKPOINT, check_size};
 pub use dataset::{Dataset, Sample};
 pub use log::Row;
 pub use loss::Loss;

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::{
     Dataset, Optimizer, Options, Sample,
-    checkpoint::{self, Progress},
+    checkpoint::{self, CHECKPOINT, Progress},
     log,
     options::train_only,
 };
@@ -66,7 +66,7 @@ pub fn run(
     on: &mut dyn FnMut(Event),
 ) -> Result<()> {
     prepare_folder(out)?;
-    let (log_path, checkpoint_path) = (out.join("log.csv"), out.join("checkpoint.safetensors"));
+    let (log_path, checkpoint_path) = (out.join("log.csv"), out.join(CHECKPOINT));
     let resume = resume && checkpoint_path.exists();
     if resume {
         checkpoint::check_size(&checkpoint_path, &options.network)?;
