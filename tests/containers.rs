@@ -1,5 +1,5 @@
-//! What a file holds beside pixels comes out as it went in, byte for byte and in its order, and what cannot be denoised is
-//! said to be so.
+//! What a file holds beside pixels comes out as it went in, byte for byte and in its order, and what cannot
+//! be denoised is said to be so.
 
 mod common;
 

@@ -1,5 +1,5 @@
-//! What the program is built of may be given away with it, and comes from crates.io: `deny.toml`, of which `cargo deny` checks
-//! the rest, such as known flaws.
+//! What the program is built of may be given away with it, and comes from crates.io: `deny.toml`, of which
+//! `cargo deny` checks the rest, such as known flaws.
 
 use std::{collections::HashSet, path::Path, process::Command};
 

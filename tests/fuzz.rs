@@ -1,6 +1,6 @@
-//! Damaged files of every kind that is read: a small one for each compression, tiling and layout, mutated a few thousand times
-//! in a process of its own, whose memory is limited. Every case must end in a result or in an error; what is written must be
-//! readable again. `eval/fuzz/run.sh` does the same for hours.
+//! Damaged files of every kind that is read: a small one for each compression, tiling and layout, mutated a
+//! few thousand times in a process of its own, whose memory is limited. Every case must end in a result or in
+//! an error; what is written must be readable again. `eval/fuzz/run.sh` does the same for hours.
 //!
 //! `DEMC_FUZZ_CASES` and `DEMC_FUZZ_FIRST` say how many cases and from which on, to see one again.
 #![cfg(unix)]
@@ -116,7 +116,7 @@ fn make_weights(folder: &Path) {
 fn make_manifests(folder: &Path) {
     fs::write(
         folder.join("manifest.csv"),
-        "scene,noisy,reference,spp\nroom,room_0004spp.exr,room_ref.exr,4\n\"a, b\",x.0001.exr,y.0001.exr,16\n",
+        "scene,noisy,reference,spp\nroom,room_0004spp.exr,room_ref.exr,4\n\"a, b\",x.exr,y.exr,16\n",
     )
     .unwrap();
     fs::write(folder.join("room_0004spp.exr"), "").unwrap();
@@ -158,7 +158,8 @@ fn mutate(bytes: &mut Vec<u8>, others: &[Vec<u8>], rng: &mut Rng) {
     }
 }
 
-/// Everything that becomes of a frame: all is decoded, a layer is added, and the result is written and read again.
+/// Everything that becomes of a frame: all is decoded, a layer is added, and the result is written and read
+/// again.
 fn try_frame(path: &Path) -> demc::Result<()> {
     let mut frame = Frame::read(path)?;
     let written = path.with_extension("out");
@@ -226,7 +227,8 @@ fn child() {
         match catch_unwind(AssertUnwindSafe(|| (kind.read)(&path))) {
             Ok(Ok(())) => {}
             Ok(Err(_)) => refused += 1,
-            // One of the codecs': the program tells it in one line, but what this test says of results must hold.
+            // One of the codecs': the program tells it in one line, but what this test says of results must
+            // hold.
             Err(panic) => {
                 let text = panic.downcast_ref::<String>().map(String::as_str);
                 let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or_default();

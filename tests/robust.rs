@@ -1,4 +1,5 @@
-//! What must not bring a batch down: damaged files, odd names, settings that mean nothing, leftovers of killed runs.
+//! What must not bring a batch down: damaged files, odd names, settings that mean nothing, leftovers of
+//! killed runs.
 
 mod common;
 
@@ -26,7 +27,8 @@ fn write_dwaa(path: &Path) {
     Image::from_layer(layer).write().to_file(path).unwrap();
 }
 
-/// Where the first block's counters begin: what the first entry of the offset table points to, behind row and size.
+/// Where the first block's counters begin: what the first entry of the offset table points to, behind row and
+/// size.
 fn first_counter(bytes: &[u8]) -> usize {
     let chunks = 2;
     let reader = exr::block::read(std::io::Cursor::new(bytes), false).unwrap();

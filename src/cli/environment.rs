@@ -1,4 +1,5 @@
-//! What the environment sets, looked at before anything is done: a typing error there is told, and not taken for no setting.
+//! What the environment sets, looked at before anything is done: a typing error there is told, and not taken
+//! for no setting.
 
 use crate::{
     Error, Result,

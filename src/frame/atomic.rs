@@ -1,7 +1,8 @@
 //! Files that are whole or not there: written under a temporary name in the target's folder, then renamed.
 //!
-//! A process that is killed leaves its temporary file behind. It holds a lock on it as long as it lives, so that the next one
-//! in that folder tells leftovers, which it removes, from what others are writing there at the same time.
+//! A process that is killed leaves its temporary file behind. It holds a lock on it as long as it lives, so
+//! that the next one in that folder tells leftovers, which it removes, from what others are writing there at
+//! the same time.
 
 use std::{
     fs::{self, File},
@@ -32,8 +33,8 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
     Ok(())
 }
 
-/// Makes a folder for results and finds out now, not after an hour, whether files can be made in it. Temporary files that killed
-/// processes left there are removed.
+/// Makes a folder for results and finds out now, not after an hour, whether files can be made in it.
+/// Temporary files that killed processes left there are removed.
 ///
 /// # Errors
 /// It cannot be made, or no file in it.

@@ -1,5 +1,6 @@
-//! Whether a stored block may be handed to its decoder. Decoders set memory aside for what a block says it unpacks to: that
-//! must be no more than so few bytes can hold, or a damaged counter takes all the memory there is and ends the process.
+//! Whether a stored block may be handed to its decoder. Decoders set memory aside for what a block says it
+//! unpacks to: that must be no more than so few bytes can hold, or a damaged counter takes all the memory
+//! there is and ends the process.
 //!
 //! In: a block's bytes and the size of its pixels. Out: why it is not to be decoded, if it is not.
 
@@ -7,7 +8,8 @@ use exr::{compression::Compression, math::Vec2, meta::header::Header};
 
 /// The most that deflate packs into a byte: 258 bytes take two bits.
 const DEFLATE: usize = 1032;
-/// More than any kind but DWA packs into a byte: deflate, of which PXR24 leaves out every fourth; PIZ's runs make 453.
+/// More than any kind but DWA packs into a byte: deflate, of which PXR24 leaves out every fourth; PIZ's runs
+/// make 453.
 const MOST_PACKED: usize = 2 * DEFLATE;
 /// Bytes that DWA's longest run makes of two.
 const LONGEST_RUN: usize = 128;
@@ -34,8 +36,8 @@ pub fn check(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), St
     }
 }
 
-/// The counters at the start of a DWA block (`DataSizesSingle` in OpenEXR's internal_dwa_compressor.h) against each other, and
-/// against the pixels of the block.
+/// The counters at the start of a DWA block (`DataSizesSingle` in OpenEXR's internal_dwa_compressor.h)
+/// against each other, and against the pixels of the block.
 fn check_dwa(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), String> {
     const COUNTERS: usize = 11;
     let read = |bytes: &[u8; 8]| usize::try_from(u64::from_le_bytes(*bytes)).unwrap_or(usize::MAX);

@@ -15,8 +15,8 @@ use crate::{Error, Result};
 const BLOCKS_PER_THREAD: usize = 8;
 
 impl Frame {
-    /// Images of a part, each of the full-resolution values of some of its channels in the order asked, (C, H, W) of its data
-    /// window. Unsigned integers are rounded to the nearest f32.
+    /// Images of a part, each of the full-resolution values of some of its channels in the order asked, (C,
+    /// H, W) of its data window. Unsigned integers are rounded to the nearest f32.
     ///
     /// # Errors
     /// A block cannot be decompressed, or a channel is subsampled or does not exist.

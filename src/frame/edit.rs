@@ -30,7 +30,8 @@ use crate::Result;
 /// Largest finite half.
 pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
-/// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is replaced.
+/// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is
+/// replaced.
 const MARK: &str = "demc";
 /// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
 const OWN: [&str; 5] = [MARK, "name", "preview", "chunkCount", "idManifest"];
@@ -124,7 +125,8 @@ impl Frame {
         }
     }
 
-    /// Whether demc made the layer of that name: [`Frame::set_layer`] added it, or [`Frame::replace`] overwrote it.
+    /// Whether demc made the layer of that name: [`Frame::set_layer`] added it, or [`Frame::replace`]
+    /// overwrote it.
     pub fn is_own_layer(&self, name: &str) -> bool {
         (0..self.parts.len()).any(|part| self.marked(part).iter().any(|layer| layer == name))
     }
@@ -156,7 +158,8 @@ impl Frame {
         list.lines().map(str::to_owned).collect()
     }
 
-    /// Overwrites existing channels of a part, by index: those of the layer `name`, such as `ViewLayer.Combined`.
+    /// Overwrites existing channels of a part, by index: those of the layer `name`, such as
+    /// `ViewLayer.Combined`.
     ///
     /// # Errors
     /// The part cannot be decoded or encoded.
@@ -455,7 +458,8 @@ fn push_values(data: &mut Vec<u8>, values: &[f32], kind: SampleType) {
     }
 }
 
-/// Appends values of `N` bytes; into memory that is there, or each byte would ask whether there is room for it.
+/// Appends values of `N` bytes; into memory that is there, or each byte would ask whether there is room for
+/// it.
 fn push_bytes<const N: usize>(data: &mut Vec<u8>, values: impl ExactSizeIterator<Item = [u8; N]>) {
     let start = data.len();
     data.resize(start + N * values.len(), 0);

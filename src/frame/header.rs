@@ -1,5 +1,5 @@
-//! A part's header as it is stored: attributes in the file's order, each the bytes that were read. What this program does not
-//! know is written again as it was, and the same input gives the same bytes.
+//! A part's header as it is stored: attributes in the file's order, each the bytes that were read. What this
+//! program does not know is written again as it was, and the same input gives the same bytes.
 //!
 //! From it comes the layout of the part's blocks, as the `exr` crate's codecs want it.
 
@@ -123,7 +123,8 @@ impl Attributes {
         out.write_all(&[0])
     }
 
-    /// How blocks lie in the part. Whether they are tiles is known from elsewhere: `type` counts in some files only.
+    /// How blocks lie in the part. Whether they are tiles is known from elsewhere: `type` counts in some
+    /// files only.
     ///
     /// # Errors
     /// Says which attribute is missing or makes no sense.
@@ -222,7 +223,8 @@ pub fn string(bytes: &[u8]) -> String {
     std::str::from_utf8(bytes).map_or_else(|_| bytes.iter().map(|b| char::from(*b)).collect(), str::to_owned)
 }
 
-/// A list of channels: name, type, whether it is perceptually linear, three bytes of nothing, and the distance of its samples.
+/// A list of channels: name, type, whether it is perceptually linear, three bytes of nothing, and the
+/// distance of its samples.
 fn read_channels(mut bytes: &[u8]) -> Result<Vec<ChannelDescription>, String> {
     let mut channels = Vec::new();
     let mut names = HashSet::new();
@@ -282,7 +284,8 @@ fn write_channels(channels: &ChannelList) -> Vec<u8> {
     bytes
 }
 
-/// Width and height of tiles, and a byte for levels: their kind, and from the fifth bit on how halves are rounded.
+/// Width and height of tiles, and a byte for levels: their kind, and from the fifth bit on how halves are
+/// rounded.
 fn read_tiles(bytes: &[u8]) -> Result<TileDescription, String> {
     let invalid = "missing or invalid tiles attribute";
     let [w0, w1, w2, w3, h0, h1, h2, h3, mode] = *bytes else { return Err(invalid.into()) };

@@ -244,15 +244,15 @@ impl Part {
             Some("holds deep data, which has no single colour per pixel; flatten it first".into())
         } else if self.compression.starts_with("htj2k") {
             Some(format!(
-                "is compressed as {}, which demc does not read; convert it with OpenImageIO on OpenEXR 3.4 or \
-                 newer: oiiotool IN.exr --compression zip -o OUT.exr",
+                "is compressed as {}, which demc does not read; convert it with OpenImageIO on \
+                 OpenEXR 3.4 or newer: oiiotool IN.exr --compression zip -o OUT.exr",
                 self.compression.to_uppercase()
             ))
         } else {
             subsampled.map(|channel| {
                 format!(
-                    "has channel '{}' at less than full resolution, as chroma beside luminance is; convert it to RGB \
-                     with OpenImageIO: oiiotool IN.exr -o OUT.exr",
+                    "has channel '{}' at less than full resolution, as chroma beside luminance is; \
+                     convert it to RGB with OpenImageIO: oiiotool IN.exr -o OUT.exr",
                     channel.name
                 )
             })

@@ -78,7 +78,8 @@ fn open(path: &Path) -> Result<(Source, Frame)> {
     if frame.stored.iter().all(|stored| stored.layout.deep) {
         return Err(Error::invalid(
             path,
-            "holds deep data, which has no single colour per pixel; render without deep output or flatten it first",
+            "holds deep data, which has no single colour per pixel; render without deep output or \
+             flatten it first",
         ));
     }
     Ok((source, frame))

@@ -60,7 +60,8 @@ impl Frame {
             | of(self.multi_part, flags::MULTI_PART)
     }
 
-    /// What stands before a chunk's bytes: its part, its place, and its size where the bytes do not say it themselves.
+    /// What stands before a chunk's bytes: its part, its place, and its size where the bytes do not say it
+    /// themselves.
     fn prefix(&self, chunk: &StoredChunk) -> Vec<u8> {
         let layout = &self.stored[chunk.part].layout;
         let int =

@@ -1,8 +1,8 @@
 //! ZIP blocks, compressed at twice the speed of the `exr` crate to the same size: writing must not take
 //! the processor from the model while a batch runs.
 //!
-//! In: a block of raw pixels. Out: its bytes as they are stored, as OpenEXR's ImfZip lays them out: even bytes before odd
-//! ones, differences of neighbours, deflate. Other compressions go to the `exr` crate.
+//! In: a block of raw pixels. Out: its bytes as they are stored, as OpenEXR's ImfZip lays them out: even
+//! bytes before odd ones, differences of neighbours, deflate. Other compressions go to the `exr` crate.
 
 use exr::{
     block::UncompressedBlock,

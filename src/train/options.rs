@@ -15,8 +15,8 @@ use crate::{
     testset::Pair,
 };
 
-/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were read: a
-/// folder without one is free.
+/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were
+/// read: a folder without one is free.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// The network.
@@ -71,7 +71,8 @@ pub struct Refusal {
     pub reason: String,
 }
 
-/// Most crops a step, and most rows and columns of one: what is beyond is a typing error that would take all memory.
+/// Most crops a step, and most rows and columns of one: what is beyond is a typing error that would take all
+/// memory.
 const MOST: usize = 4096;
 
 impl Options {
@@ -139,8 +140,8 @@ impl Options {
     }
 }
 
-/// Keeps all parameters as they are but those that one of `names` matches, in which `*` stands for any part of a name; with none,
-/// changes nothing.
+/// Keeps all parameters as they are but those that one of `names` matches, in which `*` stands for any part
+/// of a name; with none, changes nothing.
 ///
 /// # Errors
 /// One of `names` is no pattern, or matches nothing that is trained.
