@@ -193,7 +193,7 @@ fn frames_come_in_lists_and_steps_and_keep_to_the_scenes_step() {
     assert_eq!(numbers, [1, 3, 5]);
     assert!(said.contains("note: Main renders every 2. frame; --frames A-B:1 renders all"), "{said}");
     assert_eq!(frames("--frames scene").0, [1, 3, 5]);
-    let (numbers, said) = frames("--frames 1-9:4,2,3-4:1");
+    let (numbers, said) = frames("--frames 1-9x4,2,3-4:1");
     assert_eq!(numbers, [1, 2, 3, 4, 5, 9]);
     assert!(!said.contains("note:"), "{said}");
     for (frames, expected) in [

@@ -154,13 +154,13 @@ def side_or_size(text):
 
 
 def frame_spans(text):
-    """Parses `7`, `1-9`, `1-9:4` and lists of them into (first, last, step) each, the step None where none is
-    given; `scene` into None. Negative frames are written `--frames=-5--1`."""
+    """Parses `7`, `1-9`, `1-9:4` (or `1-9x4`) and lists of them into (first, last, step) each, the step None
+    where none is given; `scene` into None. Negative frames are written `--frames=-5--1`."""
     return None if text == "scene" else [_span(part) for part in text.split(",")]
 
 
 def _span(text):
-    frames, colon, step = text.partition(":")
+    frames, colon, step = text.replace("x", ":").partition(":")
     cut = frames.find("-", 1)
     try:
         first = int(frames if cut < 0 else frames[:cut])
