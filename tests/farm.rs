@@ -129,13 +129,14 @@ impl Slurm {
         command
     }
 
-    /// Splits frames 1 to 12 by fours over `script`, which is given the task's frames.
-    fn submit(&self, folder: &Path, script: &str) {
+    /// Splits frames 1 to 12 by fours over `script`, which is given the task's frames; returns the job's number.
+    fn submit(&self, folder: &Path, script: &str) -> String {
         fs::write(folder.join("task.sh"), script).unwrap();
         let mut submit = self.command(farm("slurm.sh"));
         submit.current_dir(folder).args(["--frames", "1-10,11,12", "--chunk", "4", "--logs", "logs", "--"]);
         let said = run(submit.args(["bash", "task.sh", "{frames}", "{task}", "{first}:{after}"]));
         assert!(said.contains("12 frames in 3 tasks; logs in logs"), "{said}");
+        said.strip_prefix("job ").unwrap().split_once(':').unwrap().0.to_owned()
     }
 
     /// Whether the queue holds nothing more; tasks that wait to be run again are let go at once.
@@ -196,6 +197,25 @@ fn a_slurm_array_finishes_all_frames_though_a_task_is_killed_half_way() {
     report.current_dir(folder.path()).arg("report");
     report.args(["logs/0000.out", "logs/0001.out", "logs/0002.out", "--of", "renders"]);
     assert!(run(&mut report).starts_with("12 denoised in "));
+}
+
+#[test]
+fn a_task_near_its_time_limit_is_stopped_and_goes_on_later() {
+    let Some(slurm) = Slurm::start() else { return };
+    let folder = sequence(1);
+    let script = "trap 'echo stopping; exit 130' TERM\n\
+                  if [ ! -e begun_$2 ]; then touch begun_$2; sleep 100 & wait; fi\n\
+                  echo finished\n";
+    let job = slurm.submit(folder.path(), script);
+    let begun = |task: &str| folder.path().join(format!("begun_{task}")).exists();
+    wait_until("all tasks begin", || ["0000", "0001", "0002"].iter().all(|task| begun(task)));
+    // What Slurm does a minute before the limit.
+    run(slurm.command("scancel").args(["--signal=USR1", "--batch", &job]));
+    wait_until("all tasks end", || slurm.is_done());
+    for task in ["0000", "0001", "0002"] {
+        let said = fs::read_to_string(folder.path().join(format!("logs/{task}.out"))).unwrap();
+        assert_eq!(said, "stopping\nfinished\n", "{task}");
+    }
 }
 
 #[test]
