@@ -278,8 +278,8 @@ fn the_open_job_description_runs_in_chunks_and_reports() {
     assert_eq!(results(&folder.path().join("clean/logs")).len(), 3, "a log a chunk");
     assert!(folder.path().join("clean/shot_0004spp.0001.png").exists(), "further arguments count");
 
-    assert!(job("1-9:4,2", "some").status.success());
-    expected.retain(|name, _| ["0001", "0002", "0005", "0009"].iter().any(|frame| name.contains(frame)));
+    assert!(job("1-5:2,9", "some").status.success());
+    expected.retain(|name, _| ["0001", "0003", "0005", "0009"].iter().any(|frame| name.contains(frame)));
     let mut made = results(&folder.path().join("some"));
     made.retain(|name, _| name.ends_with(".exr"));
     assert_eq!(made, expected);
