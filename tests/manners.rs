@@ -107,6 +107,7 @@ fn shells_complete_and_manuals_tell_every_command_and_option() {
     bash.env("SCRIPT", script).assert().success().stdout("denoise\n");
 
     demc().arg("man").arg("--out").arg(folder.path()).assert().success();
+    assert!(!folder.path().join("demc-peak-memory.1").exists());
     for command in COMMANDS {
         let page = fs::read_to_string(folder.path().join(format!("demc-{command}.1"))).unwrap();
         assert!(page.contains(".TH") && page.contains(".SH OPTIONS"), "{command}");

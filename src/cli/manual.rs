@@ -27,9 +27,9 @@ pub struct CompletionsArgs {
 ///
 /// # Errors
 /// None.
-pub fn completions(args: &CompletionsArgs, mut command: Command) -> Result<ExitCode> {
+pub fn completions(args: &CompletionsArgs, command: &Command) -> Result<ExitCode> {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut command, "demc", &mut script);
+    clap_complete::generate(args.shell, &mut for_users(command), "demc", &mut script);
     print_line(String::from_utf8_lossy(&script).trim_end());
     Ok(ExitCode::SUCCESS)
 }
@@ -49,10 +49,17 @@ pub struct ManArgs {
 ///
 /// # Errors
 /// The folder cannot be made or written.
-pub fn man(args: &ManArgs, command: Command) -> Result<ExitCode> {
+pub fn man(args: &ManArgs, command: &Command) -> Result<ExitCode> {
     let out = &args.out;
     std::fs::create_dir_all(out).map_err(Error::io("create", out))?;
-    clap_mangen::generate_to(command, out).map_err(Error::io("write", out))?;
+    clap_mangen::generate_to(for_users(command), out).map_err(Error::io("write", out))?;
     print_line(&out.join("demc.1").display().to_string());
     Ok(ExitCode::SUCCESS)
+}
+
+/// The command line without the subcommands that the program keeps for itself.
+fn for_users(command: &Command) -> Command {
+    let bare = Command::new("demc").version(env!("CARGO_PKG_VERSION"));
+    let bare = command.get_about().cloned().into_iter().fold(bare, Command::about);
+    bare.subcommands(command.get_subcommands().filter(|sub| !sub.is_hide_set()).cloned())
 }

@@ -75,8 +75,8 @@ pub fn main() -> ExitCode {
         Command::Models(args) => models::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Report(args) => report::run(&args),
-        Command::Completions(args) => manual::completions(&args, Cli::command()),
-        Command::Man(args) => manual::man(&args, Cli::command()),
+        Command::Completions(args) => manual::completions(&args, &Cli::command()),
+        Command::Man(args) => manual::man(&args, &Cli::command()),
         Command::PeakMemory(args) => peak_memory::run(&args),
     };
     done.unwrap_or_else(|error| {
