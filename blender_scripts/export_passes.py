@@ -5,10 +5,12 @@
     (run from Blender's text editor, it renders the open scene into `demc` beside the .blend)
 
 Writes <scene>_<spp>spp.exr and <scene>_ref.exr, with the frame before the extension where --frames
-is given. The scene is never saved, and an open scene is left as it was found.
+is given. Each file's header tells what it was made with, so that a rerun makes what is missing and
+names what was made otherwise. The scene is never saved, and an open scene is left as it was found.
 """
 
 import argparse
+import json
 import os
 import sys
 import time
@@ -19,9 +21,11 @@ import bpy
 sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 
 from demc_blender import command_line as cl
-from demc_blender import names, rendering
+from demc_blender import exr, names, picking, rendering
 from demc_blender.edits import Edits
 from demc_blender.position import store_position, write_position
+
+_STAMP = "demcExport"  # header attribute: what a file was made with
 
 
 def parse(arguments):
@@ -33,7 +37,8 @@ def parse(arguments):
         epilog="Half buffers: --half-buffers renders, beside each noisy frame, two independent "
         "images of half its samples, <scene>_<spp>spp_a.exr and <scene>_<spp>spp_b.exr (for "
         "_0004spp: 2 samples each), as two-buffer denoisers and noise estimates want them. "
-        "A finished file is skipped unless --overwrite is given.",
+        "A finished file is skipped, and one that was made with other settings is named as failed, "
+        "unless --overwrite is given; a damaged one is made again.",
     )
     parser.add_argument("scene", nargs="?" if inside else None, metavar="SCENE.blend",
                         help="the scene; inside Blender it may be left out for the open one")
@@ -49,46 +54,35 @@ def parse(arguments):
     parser.add_argument("--seed", type=int, default=1, help="seed of all renders (default 1)")
     parser.add_argument("--resolution", type=cl.size, metavar="WxH",
                         help="frame size in pixels (default: the scene's)")
-    parser.add_argument("--frames", type=cl.frame_range, metavar="A-B",
-                        help="frames to render, --frames=-5--1 where they are negative (default: the current one, named without a number)")
+    parser.add_argument("--frames", type=cl.frame_spans, default=[], metavar="A-B[:S],...",
+                        help="frames to render: 7, 1-9, 1-9:4, 1,3,7-9, or scene for the scene's own range; A-B "
+                        "without a step keeps to the scene's. --frames=-5--1 where they are negative (default: "
+                        "the current one, named without a number)")
+    parser.add_argument("--scene", metavar="NAME", dest="scene_name",
+                        help="the scene to render, where the file has several (default: the active one)")
+    parser.add_argument("--views", type=cl.names, metavar="NAME[,NAME]",
+                        help="stereo views to render into each file (default: those that the scene renders)")
     parser.add_argument("--view-layer", metavar="NAME",
                         help="render this view layer alone (default: all that are on)")
     parser.add_argument("--region", type=cl.region, metavar="X,Y,W,H",
-                        help="render this part alone, in pixels from the top left")
+                        help="render this part alone, in pixels from the top left (default: the scene's render "
+                        "border where it is on)")
     parser.add_argument("--half-buffers", action="store_true", help="see below")
-    parser.add_argument("--vector", action="store_true",
-                        help="store motion vectors too (Cycles has none while motion blur is on)")
+    parser.add_argument("--vector", action=argparse.BooleanOptionalAction,
+                        help="store motion vectors, which denoising over time wants (default: where --frames is "
+                        "given). Cycles has none while motion blur is on")
+    parser.add_argument("--no-motion-blur", action="store_true", help="render without motion blur")
+    parser.add_argument("--ref-guides", action="store_true",
+                        help="references keep albedo and normal (default: Combined alone)")
     parser.add_argument("--float", action="store_true", dest="full_float",
                         help="store every pass as 32-bit float (default: half, data passes float)")
-    parser.add_argument("--name", help="scene name in the files (default: the .blend's)")
+    parser.add_argument("--name", type=cl.file_stem, help="scene name in the files (default: the .blend's)")
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--overwrite", action="store_true", help="render finished files again")
     options = parser.parse_args(arguments)
     if options.ref_spp < 0:
         parser.error("--ref-spp must not be negative")
     return options
-
-
-def open_scene(path):
-    """Opens a .blend without its interface; raises RuntimeError in one line where it cannot."""
-    if not os.path.isfile(path):
-        raise RuntimeError(f"{path}: no such file")
-    bpy.ops.wm.open_mainfile(filepath=os.path.abspath(path), load_ui=False)
-
-
-def chosen_layers(edits, scene, name):
-    """The view layers to render; a named one has the others switched off."""
-    if name is None:
-        layers = [layer for layer in scene.view_layers if layer.use]
-        if not layers:
-            raise RuntimeError(f"no view layer of {scene.name} is on; choose one with --view-layer")
-        return layers
-    if name not in scene.view_layers:
-        known = ", ".join(layer.name for layer in scene.view_layers)
-        raise RuntimeError(f"no view layer {name!r} in {scene.name}; it has {known}")
-    for layer in scene.view_layers:
-        edits.set(layer, "use", layer.name == name)
-    return [scene.view_layers[name]]
 
 
 class Job:
@@ -119,74 +113,149 @@ def jobs_of_frame(options, scene_name, frame, numbered):
                   "reference", True)
 
 
-def render_job(options, scene, layers, job):
+def common_settings(options, scene, layers, views, vector):
+    """What every file of a run is made with, by the names that a user knows it by."""
+    render = scene.render
+    border = [round(getattr(render, f"border_{side}"), 6) for side in ("min_x", "max_x", "min_y", "max_y")]
+    return {
+        "scene": scene.name,
+        "view layers": [layer.name for layer in layers],
+        "views": views,
+        "resolution": "{}x{}".format(*rendering.frame_size(scene)),
+        "pixel aspect": round(render.pixel_aspect_x / render.pixel_aspect_y, 6),
+        "region": border + [render.use_crop_to_border] if render.use_border else None,
+        "motion blur": render.use_motion_blur,
+        "vector": vector,
+        "float": options.full_float,
+        "seed": options.seed,
+    }
+
+
+def settings_of(options, common, job):
+    """What one file is made with."""
+    own = {"samples": job.spp}
+    if job.is_reference:
+        own |= {"noise threshold": options.ref_noise, "guides": options.ref_guides, "vector": False}
+    return common | own
+
+
+def difference(path, settings):
+    """How a finished file's settings differ from those wanted, in words; empty where they do not, or where
+    the file tells none: it was made by an older script."""
+    told = exr.text_attribute(path, _STAMP)
+    if told is None:
+        return ""
+    made = json.loads(told)
+    changed = [name for name in settings if made.get(name) != settings[name]]
+    return ", ".join(f"{name} {made.get(name)} instead of {settings[name]}" for name in changed)
+
+
+def render_job(options, scene, layers, job, settings):
     """Renders one image and takes its settings back."""
     with Edits() as edits:
         if job.is_reference:
             rendering.combined_only(edits, layers)
+            if options.ref_guides:
+                rendering.store_guides(edits, layers)
         else:
             store_position(edits, layers)
         threshold = options.ref_noise if job.is_reference else 0.0
         rendering.set_sampling(edits, scene, job.spp, job.seed, threshold)
-        rendering.render_to(scene, job.path)
+        rendering.render_to(scene, job.path, attributes={_STAMP: json.dumps(settings)})
 
 
-def render_frame(options, scene, layers, scene_name, frame, numbered):
-    """Renders what is missing of a frame and prints its line. Returns whether all went well."""
-    done, errors = [], []
-    placed = scene.frame_current == frame
-    for job in jobs_of_frame(options, scene_name, frame, numbered):
-        if os.path.exists(job.path) and not options.overwrite:
-            done.append(f"{job.label} is there")
-            continue
+class Export:
+    """A scene that is set up, and what every file of it is made with."""
+
+    def __init__(self, options, scene, name, layers, common):
+        self.options, self.scene, self.name, self.layers = options, scene, name, layers
+        self.common = common
+
+    def frame(self, frame, numbered):
+        """Renders what is missing of a frame and prints its line. Returns whether all went well."""
+        done, errors = [], []
+        self.placed = self.scene.frame_current == frame
+        for job in jobs_of_frame(self.options, self.name, frame, numbered):
+            try:
+                done.append(f"{job.label} {self._image(job, frame)}")
+            except (RuntimeError, OSError, ValueError) as error:
+                errors.append(f"{job.label} failed: {cl.reason(error)}")
+        print(f"{self.name} frame {frame}: {', '.join(done + errors)}")
+        return not errors
+
+    def _image(self, job, frame):
+        """Renders an image where it is missing; returns what its line says of it."""
+        settings, damaged = settings_of(self.options, self.common, job), False
+        if os.path.exists(job.path) and not self.options.overwrite:
+            damaged = not exr.is_whole(job.path)
+            other = "" if damaged else difference(job.path, settings)
+            if other:
+                raise RuntimeError(f"{job.path} was made with {other}; --overwrite renders it again, or choose "
+                                   "another --out or --name")
+            if not damaged:
+                return "is there"
         start = time.perf_counter()
-        try:
-            if not placed:
-                scene.frame_set(frame)
-                placed = True
-            render_job(options, scene, layers, job)
-            done.append(f"{job.label} {time.perf_counter() - start:.1f} s")
-        except (RuntimeError, OSError) as error:
-            errors.append(f"{job.label} failed: {cl.reason(error)}")
-    print(f"{scene_name} frame {frame}: {', '.join(done + errors)}")
-    return not errors
+        if not self.placed:
+            self.scene.frame_set(frame)
+            self.placed = True
+        render_job(self.options, self.scene, self.layers, job, settings)
+        return f"{time.perf_counter() - start:.1f} s" + (" (was damaged)" if damaged else "")
 
 
 def export(options):
     """Renders everything asked for; returns the number of frames that failed."""
     if options.scene:
-        open_scene(options.scene)
-    scene = bpy.context.scene
+        picking.open_scene(options.scene)
     blend = bpy.data.filepath
     name = options.name or os.path.splitext(os.path.basename(blend))[0] or "untitled"
+    scene = picking.chosen_scene(options.scene_name, os.path.basename(blend) or name)
     options.out = os.path.abspath(options.out or os.path.join(os.path.dirname(blend), "demc"))
-    os.makedirs(options.out, exist_ok=True)
+    cl.make_folder(options.out)
     if scene.camera is None:
-        raise RuntimeError(f"{name} has no camera")
-    first, last = options.frames or (scene.frame_current, scene.frame_current)
+        raise RuntimeError(f"{name} has no camera in the scene {scene.name}")
+    picking.warn_of_missing_files()
+    numbered = options.frames != []
+    frames = picking.chosen_frames(scene, options.frames) if numbered else [scene.frame_current]
     start, part = scene.frame_current, scene.frame_subframe
     with Edits() as edits:
         edits.on_undo(lambda: scene.frame_set(start, subframe=part))
-        rendering.prepare_scene(edits, scene)
+        rendering.prepare_scene(edits, scene, as_framed=True)
         rendering.set_output(edits, scene, options.full_float)
         if options.resolution:
             rendering.set_resolution(edits, scene, options.resolution)
         if options.region:
             rendering.set_region(edits, scene, options.region)
+        elif scene.render.use_border:
+            size = "{},{}".format(*rendering.frame_size(scene))
+            print(f"note: {scene.name} has a render border: only that part is rendered (--region 0,0,{size} for all)")
         if options.threads:
             edits.set(scene.render, "threads_mode", "FIXED")
             edits.set(scene.render, "threads", options.threads)
-        layers = chosen_layers(edits, scene, options.view_layer)
-        rendering.enable_passes(edits, layers, options.vector)
-        if options.vector and scene.render.use_motion_blur:
-            print(f"warning: {name} has motion blur on, so Cycles stores no motion vectors")
+        if options.no_motion_blur:
+            edits.set(scene.render, "use_motion_blur", False)
+        views = picking.choose_views(edits, scene, options.views)
+        layers = picking.chosen_layers(edits, scene, options.view_layer)
+        vector = choose_vector(edits, options, scene, layers, numbered)
         refused = write_position(edits, layers)
         if refused:
             print(f"warning: no averaged position for {len(refused)} materials that cannot be "
                   f"edited (linked from a library?): {', '.join(refused[:4])}")
-        numbered = options.frames is not None
-        return sum(not render_frame(options, scene, layers, name, frame, numbered)
-                   for frame in range(first, last + 1))
+        common = common_settings(options, scene, layers, views, vector)
+        run = Export(options, scene, name, layers, common)
+        return sum(not run.frame(frame, numbered) for frame in frames)
+
+
+def choose_vector(edits, options, scene, layers, numbered):
+    """Turns on the passes; returns whether motion vectors are among them."""
+    wanted = numbered if options.vector is None else options.vector
+    rendering.enable_passes(edits, layers, wanted)
+    if not scene.render.use_motion_blur:
+        return any(layer.use_pass_vector for layer in layers)
+    if options.vector:
+        print(f"warning: {scene.name} has motion blur on, with which Cycles stores no motion vectors: Vector is "
+              "left out; --no-motion-blur renders it")
+    rendering.leave_out_vectors(edits, layers)
+    return False
 
 
 def main():

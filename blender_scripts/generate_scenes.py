@@ -341,8 +341,7 @@ def render_crop(options, ledger, scene, region, crop, facts):
             )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
-            for layer in layers:
-                passes.set(layer.cycles, "denoising_store_passes", True)
+            rendering.store_guides(passes, layers)
             seed = rendering.mixed_seed(crop.seed, crop.name, "reference")
             spp = options.clean_spp if crop.clean else options.ref_spp
             if crop.clean:

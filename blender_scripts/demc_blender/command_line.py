@@ -1,13 +1,19 @@
 """Arguments and printing that work alike under `python SCRIPT` and `blender -P SCRIPT --`."""
 
 import argparse
+import atexit
+import ctypes
 import os
 import signal
 import socket
 import sys
+import tempfile
 import threading
 
 import bpy
+
+_chatter = None  # the file that takes what Blender prints, once quiet_stdout was called
+_TROUBLE = ("error", "exception", "cannot", "failed", "unable")
 
 
 def inside_blender():
@@ -23,18 +29,45 @@ def script_arguments():
 
 
 def quiet_stdout():
-    """Sends Blender's own chatter to nowhere and keeps `print` for this script's lines.
+    """Keeps `print` for this script's lines and puts Blender's own chatter aside, see `trouble_heard`.
 
     Blender writes progress from C straight to file descriptor 1, so the descriptor itself moves.
     """
+    global _chatter
     if not bpy.app.background:
         return
     sys.stdout.flush()
     ours = os.dup(1)
-    sink = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 1)
-    os.close(sink)
+    _chatter = tempfile.TemporaryFile()
+    os.dup2(_chatter.fileno(), 1)
     sys.stdout = os.fdopen(ours, "w", buffering=1, encoding="utf-8", errors="replace")
+
+
+def forget_chatter():
+    """Empties what was put aside: what is heard from here on belongs to what comes now."""
+    if _chatter:
+        _flush_c()
+        os.ftruncate(_chatter.fileno(), 0)
+        os.lseek(_chatter.fileno(), 0, os.SEEK_SET)
+
+
+def trouble_heard():
+    """What Blender has printed of trouble since `forget_chatter`, on one line; empty for none."""
+    if not _chatter:
+        return ""
+    _flush_c()
+    size = os.fstat(_chatter.fileno()).st_size
+    lines = os.pread(_chatter.fileno(), size, 0).decode(errors="replace").splitlines()
+    told = [" ".join(line.split()) for line in lines if any(word in line.lower() for word in _TROUBLE)]
+    return "; ".join(dict.fromkeys(told[-3:]))
+
+
+def _flush_c():
+    # C's own buffer of stdout is no business of Python's; where it cannot be reached, less is heard.
+    try:
+        ctypes.CDLL(None).fflush(None)
+    except (OSError, TypeError, AttributeError):
+        pass
 
 
 def end_at_once(tidy):
@@ -49,20 +82,33 @@ def end_at_once(tidy):
     writer.setblocking(False)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
-    signal.set_wakeup_fd(writer.detach())
+    signal.set_wakeup_fd(writer.fileno())
 
     def wait():
-        number = reader.recv(1)[0]
-        tidy()
-        os._exit(128 + number)
+        received = reader.recv(1)
+        if received:
+            tidy()
+            os._exit(128 + received[0])
 
-    threading.Thread(target=wait, daemon=True).start()
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+
+    def stop_waiting():
+        signal.set_wakeup_fd(-1)
+        writer.close()
+        thread.join()
+
+    # bpy 4.5 waits for ever at its own end where a thread still runs.
+    atexit.register(stop_waiting)
 
 
 def make_folder(path):
     """Makes the folder of --out, or ends the script with a line that says why not."""
     try:
         os.makedirs(path, exist_ok=True)
+    except FileExistsError:
+        print(f"error: {path} is a file, not a folder (--out)", file=sys.stderr)
+        sys.exit(1)
     except OSError as error:
         print(f"error: {path}: {error.strerror} (--out)", file=sys.stderr)
         sys.exit(1)
@@ -107,14 +153,41 @@ def side_or_size(text):
     return size(text) if "x" in text.lower() else (positive(text),) * 2
 
 
-def frame_range(text):
-    """Parses `A-B` or a single `A` into (first, last); negative frames are written `--frames=-5--1`."""
-    cut = text.find("-", 1)
-    first = _integer(text if cut < 0 else text[:cut])
-    last = first if cut < 0 else _integer(text[cut + 1:])
+def frame_spans(text):
+    """Parses `7`, `1-9`, `1-9:4` (or `1-9x4`) and lists of them into (first, last, step) each, the step None
+    where none is given; `scene` into None. Negative frames are written `--frames=-5--1`."""
+    return None if text == "scene" else [_span(part) for part in text.split(",")]
+
+
+def _span(text):
+    frames, colon, step = text.replace("x", ":").partition(":")
+    cut = frames.find("-", 1)
+    try:
+        first = int(frames if cut < 0 else frames[:cut])
+        last = first if cut < 0 else int(frames[cut + 1:])
+        step = int(step) if colon else None
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no list of frames; write 7, 1-9, 1-9:4 or 1,3,7-9, or scene for the scene's own"
+        ) from None
     if last < first:
         raise argparse.ArgumentTypeError(f"{text}: the last frame comes before the first")
-    return first, last
+    if step is not None and step < 1:
+        raise argparse.ArgumentTypeError(f"{text}: the step is not a number of at least 1")
+    return first, last, step
+
+
+def file_stem(text):
+    """A name that a file can have; anything with a folder in it is none."""
+    if not text or text.startswith(".") or any(c in "/\\" or ord(c) < 32 for c in text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no file name: leave out folders (they go to --out) and "
+                                         "leading dots")
+    return text
+
+
+def names(text):
+    """Parses `left,right` into names, in order, without repeats."""
+    return list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
 def seed_range(text):

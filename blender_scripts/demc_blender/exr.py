@@ -5,6 +5,7 @@ the passes of a render. Training crops are read back here, judged, and stored as
 Scan lines with no, ZIPS or ZIP compression are understood: what these scripts make Blender write.
 """
 
+import mmap
 import os
 import struct
 import zlib
@@ -21,21 +22,57 @@ def read(path):
     """Channel name -> (height, width) array, over all parts."""
     with open(path, "rb") as file:
         data = file.read()
-    magic, flags = struct.unpack_from("<II", data)
-    if magic != _MAGIC or flags & 0x200:
-        raise ValueError(f"{path}: not a scan-line EXR")
-    multipart = bool(flags & 0x1000)
-    at, headers = 8, []
-    while True:
-        header, at = _header(data, at)
-        if header:
-            headers.append(header)
-        if not header or not multipart:
-            break
+    headers, at, multipart = _headers(path, data)
     channels = {}
     for header in headers:
         at = _read_part(data, at, header, multipart, channels)
     return channels
+
+
+def is_whole(path):
+    """Whether a file holds all the scan lines that its headers tell of: one that was cut off does not. Files
+    that are compressed as these scripts never do are taken for whole."""
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            headers, at, multipart = _headers(path, data)
+            for header in headers:
+                if header["compression"][0] not in _LINES:
+                    return True
+                for offset in _offsets(data, at, header):
+                    offset += 4 if multipart else 0
+                    _, size = struct.unpack_from("<ii", data, offset)
+                    if offset < at or offset + 8 + size > len(data):
+                        return False
+                at += 8 * _chunks(header)
+    except (ValueError, IndexError, KeyError, struct.error):
+        return False
+    return True
+
+
+def text_attribute(path, name):
+    """A text in the first header, or None where there is none of that name."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        headers, _, _ = _headers(path, data)
+        raw = headers[0].get(name)
+    return None if raw is None else raw.decode(errors="replace")
+
+
+def add_text_attribute(path, name, text):
+    """Adds a text to the first header of a whole file. All else moves down by its length: the tables of
+    offsets are the only places that tell where."""
+    with open(path, "rb") as file:
+        data = file.read()
+    headers, tables, _ = _headers(path, data)
+    raw = text.encode()
+    added = name.encode() + b"\0string\0" + struct.pack("<i", len(raw)) + raw
+    count = sum(_chunks(header) for header in headers)
+    offsets = struct.unpack_from(f"<{count}Q", data, tables)
+    moved = struct.pack(f"<{count}Q", *(offset + len(added) for offset in offsets))
+    partial = f"{path}.tmp"
+    with open(partial, "wb") as file:
+        for piece in (data[:8], added, data[8:tables], moved, data[tables + len(moved):]):
+            file.write(piece)
+    os.replace(partial, path)
 
 
 def write_half(path, channels):
@@ -83,8 +120,35 @@ def _write(path, channels, kind):
 
 
 def _text(data, at):
-    end = data.index(b"\0", at)
+    end = data.find(b"\0", at)
+    if end < 0:
+        raise ValueError("the file ends within its header")
     return data[at:end].decode(), end + 1
+
+
+def _headers(path, data):
+    """The headers of a file's parts, where their tables of offsets begin, and whether it is multi-part."""
+    magic, flags = struct.unpack_from("<II", data)
+    if magic != _MAGIC or flags & 0x200:
+        raise ValueError(f"{path}: not a scan-line EXR")
+    multipart = bool(flags & 0x1000)
+    at, headers = 8, []
+    while True:
+        header, at = _header(data, at)
+        if header:
+            headers.append(header)
+        if not header or not multipart:
+            return headers, at, multipart
+
+
+def _chunks(header):
+    """How many blocks of scan lines a part has."""
+    _, top, _, bottom = struct.unpack("<iiii", header["dataWindow"])
+    return -(-(bottom - top + 1) // _LINES[header["compression"][0]])
+
+
+def _offsets(data, table, header):
+    return struct.unpack_from(f"<{_chunks(header)}Q", data, table)
 
 
 def _header(data, at):
@@ -118,10 +182,9 @@ def _read_part(data, table, header, multipart, channels):
     if compression not in _LINES:
         raise ValueError("only uncompressed and ZIP scan lines are read here")
     lines = _LINES[compression]
-    count = -(-height // lines)
     out = {name: np.empty((height, width), kind) for name, kind in listed}
     row_bytes = sum(kind.itemsize for _, kind in listed) * width
-    for offset in struct.unpack_from(f"<{count}Q", data, table):
+    for offset in _offsets(data, table, header):
         offset += 4 if multipart else 0
         y, size = struct.unpack_from("<ii", data, offset)
         y -= top
@@ -138,7 +201,7 @@ def _read_part(data, table, header, multipart, channels):
     for name, plane in out.items():
         # Blender's parts repeat the part name in the channel names; other writers' may not.
         channels[name if "." in name or not part else f"{part}.{name}"] = plane
-    return table + 8 * count
+    return table + 8 * _chunks(header)
 
 
 def _decompress(block):

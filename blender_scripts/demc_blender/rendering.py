@@ -5,6 +5,8 @@ import tempfile
 
 import bpy
 
+from . import command_line, exr
+
 # The passes demc reads besides Combined and the position AOV; depth lets others reuse the files.
 DATA_PASSES = (
     "use_pass_z",
@@ -21,17 +23,20 @@ DEFAULT_SAMPLES = 4096
 DEFAULT_NOISE = 0.01
 
 
-def prepare_scene(edits, scene):
+def prepare_scene(edits, scene, as_framed=False):
     """What holds for every render: Cycles, no denoising, no post-processing, nothing kept between
-    renders (persistent data gave materials wrong textures on the second render of a process)."""
+    renders (persistent data gave materials wrong textures on the second render of a process).
+    `as_framed` keeps the scene's stereo views and render border."""
     if scene.render.engine != "CYCLES":
         print(f"warning: {scene.name} is set to {scene.render.engine}; rendering it with Cycles")
     render, cycles = scene.render, scene.cycles
     edits.set(render, "engine", "CYCLES")
-    for name in ("use_persistent_data", "use_compositing", "use_sequencer", "use_multiview",
-                 "use_single_layer", "use_freestyle", "use_border", "use_crop_to_border",
-                 "use_file_extension", "use_stamp"):
+    for name in ("use_persistent_data", "use_compositing", "use_sequencer", "use_single_layer",
+                 "use_freestyle", "use_file_extension", "use_stamp"):
         edits.set(render, name, False)
+    if not as_framed:
+        for name in ("use_multiview", "use_border", "use_crop_to_border"):
+            edits.set(render, name, False)
     edits.set(render, "use_overwrite", True)
     for name in ("use_denoising", "use_animated_seed", "use_sample_subset"):
         edits.set(cycles, name, False)
@@ -50,6 +55,12 @@ def enable_passes(edits, layers, vector=False):
         edits.set(layer.cycles, "denoising_store_passes", True)
 
 
+def leave_out_vectors(edits, layers):
+    """Cycles fills the Vector pass with zeros while motion blur is on: no motion is worse than none stored."""
+    for layer in layers:
+        edits.set(layer, "use_pass_vector", False)
+
+
 def combined_only(edits, layers):
     """Turns every pass off but Combined (the user's own AOVs stay)."""
     for layer in layers:
@@ -58,6 +69,12 @@ def combined_only(edits, layers):
                 if prop.identifier.startswith("use_pass_"):
                     edits.set(owner, prop.identifier, prop.identifier == "use_pass_combined")
         edits.set(layer.cycles, "denoising_store_passes", False)
+
+
+def store_guides(edits, layers):
+    """Denoising Albedo, Normal and Depth beside Combined."""
+    for layer in layers:
+        edits.set(layer.cycles, "denoising_store_passes", True)
 
 
 def stop_at_guides(edits, scene):
@@ -90,6 +107,11 @@ def set_output(edits, scene, full_float=False):
     edits.set(settings, "color_depth", "32" if full_float else "16")
     edits.set(settings, "exr_codec", "ZIP")
     edits.set(settings, "use_preview", False)
+    edits.set(settings, "views_format", "MULTIVIEW")  # both eyes in one file, where there are two
+    render = scene.render
+    if render.pixel_aspect_x != render.pixel_aspect_y:
+        # Blender 5 fails to write its one part a pass where pixels are not square.
+        edits.set(settings, "use_exr_interleave", True)
 
 
 def set_resolution(edits, scene, resolution):
@@ -134,8 +156,9 @@ def set_sampling(edits, scene, spp, seed, noise_threshold=0.0, least=0):
         edits.set(cycles, "adaptive_min_samples", least)
 
 
-def render_to(scene, path, layer=None):
+def render_to(scene, path, layer=None, attributes=None):
     """Renders into `path`: to a temporary name first, so that a killed run leaves no half file.
+    `attributes` are texts by name for the file's header.
 
     Raises RuntimeError where Blender fails or writes nothing."""
     folder = os.path.dirname(os.path.abspath(path))
@@ -144,10 +167,16 @@ def render_to(scene, path, layer=None):
     os.remove(temporary)
     old = scene.render.filepath
     scene.render.filepath = temporary
+    command_line.forget_chatter()
     try:
-        bpy.ops.render.render(write_still=True, scene=scene.name, **({"layer": layer} if layer else {}))
-        if not os.path.exists(temporary) or os.path.getsize(temporary) == 0:
-            raise RuntimeError("Blender wrote no image")
+        try:
+            bpy.ops.render.render(write_still=True, scene=scene.name, **({"layer": layer} if layer else {}))
+        except RuntimeError as error:  # it tells where, and of the reason "see console"
+            raise RuntimeError(f"{str(error).strip()}; {command_line.trouble_heard()}") from error
+        if not os.path.exists(temporary) or not exr.is_whole(temporary):
+            raise RuntimeError(f"Blender wrote no image; {command_line.trouble_heard()}")
+        for name, text in (attributes or {}).items():
+            exr.add_text_attribute(temporary, name, text)
         os.replace(temporary, path)
     finally:
         scene.render.filepath = old

@@ -18,6 +18,10 @@ const DENOISED: &str = "Denoised";
 
 /// Arguments of `demc compare`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = "\
+Examples:
+  demc compare clean/shot_0004spp.exr pairs/shot_ref.exr
+  demc compare --layer Combined pairs/shot_0004spp.exr pairs/shot_ref.exr --json")]
 pub struct Args {
     /// The image to judge
     #[arg(value_name = "A")]

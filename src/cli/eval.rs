@@ -13,6 +13,9 @@ use crate::{
 
 /// Arguments of `demc eval`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = "\
+Examples:
+  demc eval --test-set pairs --models demc-s,demc-m --out scores")]
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,

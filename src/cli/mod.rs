@@ -9,9 +9,11 @@ mod environment;
 mod eval;
 mod inputs;
 mod inspect;
+mod manual;
 mod methods;
 mod models;
 mod peak_memory;
+mod report;
 mod stability;
 mod stop;
 mod train;
@@ -22,7 +24,7 @@ use std::{
     process::ExitCode,
 };
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::{Error, Result, error::panic_message};
 
@@ -51,6 +53,12 @@ enum Command {
     Models(models::Args),
     /// How much results change when inputs go wrong: fireflies, NaN, missing guides, other exposure ...
     Stability(stability::Args),
+    /// What the JSON lines of many `denoise --json` come to: totals, and which frames failed
+    Report(report::Args),
+    /// Print a completion script for a shell
+    Completions(manual::CompletionsArgs),
+    /// Write manual pages
+    Man(manual::ManArgs),
     #[command(name = peak_memory::COMMAND, hide = true)]
     PeakMemory(peak_memory::Args),
 }
@@ -85,6 +93,9 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Compare(args) => compare::run(&args),
         Command::Models(args) => models::run(&args),
         Command::Stability(args) => stability::run(&args),
+        Command::Report(args) => report::run(&args),
+        Command::Completions(args) => manual::completions(&args, &Cli::command()),
+        Command::Man(args) => manual::man(&args, &Cli::command()),
         Command::PeakMemory(args) => peak_memory::run(&args),
     }
 }

@@ -27,7 +27,8 @@ fn trials() -> String {
     let lines = Trial::ALL.map(|trial| format!("  {:<16}{}\n", trial.name(), trial.meaning()));
     format!(
         "Trials:\n{}\nratio: RelMSE over that of the frame as rendered. deviation: RelMSE between the two results.\n\
-         Half buffers beside a frame are not used: nfor works on the frame alone.",
+         Half buffers beside a frame are not used: nfor works on the frame alone.\n\n\
+         Examples:\n  demc stability --test-set pairs --models demc-s --out stability",
         lines.concat()
     )
 }

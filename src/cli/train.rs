@@ -28,6 +28,10 @@ use crate::{
 
 /// Train a network on pairs of noisy and reference frames
 #[derive(clap::Args)]
+#[command(after_help = "\
+Examples:
+  demc train --data pairs --out run --model demc-s --steps 20000
+  demc train --resume --out run")]
 pub struct Args {
     /// Directory, CSV manifest or quoted glob of <scene>_<spp>spp.exr and <scene>_ref.exr
     #[arg(long, required_unless_present = "resume")]

@@ -3,11 +3,14 @@
 //! In: the command line. Out: files in `--out`, a line (or JSON object) for each, the exit status.
 //! The work itself is [`crate::denoise`]'s.
 
+mod frames;
 mod progress;
 
 use std::{path::PathBuf, process::ExitCode};
 
 use clap::Args as ClapArgs;
+use frames::Frames;
+use progress::{Progress, Style};
 
 use super::{
     SOME_FAILED,
@@ -23,6 +26,10 @@ use crate::{
 
 /// Arguments of `demc denoise`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = "\
+Examples:
+  demc denoise renders --out clean
+  demc denoise 'renders/shot_0004spp.*.exr' --out clean --frames 1-9:4,12 --model demc-s --preview")]
 pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "INPUT")]
@@ -61,6 +68,10 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(16..))]
     tile: Option<u32>,
 
+    /// Only the inputs whose names end in one of these numbers: 7, 1-9, 1-9:4 (every fourth), 1,3,7-9
+    #[arg(long, value_name = "A-B[:S],...", allow_hyphen_values = true)]
+    frames: Option<Frames>,
+
     /// Write a PNG beside each result, exposed for display
     #[arg(long)]
     preview: bool,
@@ -68,6 +79,10 @@ pub struct Args {
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
+
+    /// Print failures alone
+    #[arg(long, short)]
+    quiet: bool,
 }
 
 /// Runs the batch.
@@ -79,6 +94,10 @@ pub fn run(args: Args) -> Result<ExitCode> {
     denoise::check_layer_name(&args.layer)
         .map_err(|why| Error::Usage(format!("--layer '{}': {why}", args.layer)))?;
     let Inputs { files, unusable } = inputs::expand(&args.inputs)?;
+    let files = match &args.frames {
+        Some(frames) => frames.pick(files)?,
+        None => files,
+    };
     let jobs = denoise::plan(files, &args.out)?;
     // Before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
@@ -97,7 +116,12 @@ pub fn run(args: Args) -> Result<ExitCode> {
         preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
     };
-    let mut progress = progress::Progress::new(jobs.len() + unusable.len(), args.json);
+    let style = match (args.json, args.quiet) {
+        (true, _) => Style::Json,
+        (_, true) => Style::Quiet,
+        _ => Style::Plain,
+    };
+    let mut progress = Progress::new(jobs.len() + unusable.len(), style);
     for (input, error) in unusable {
         progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
     }

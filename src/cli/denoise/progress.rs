@@ -1,7 +1,9 @@
 //! What the user sees of a batch: a bar on a terminal, plain lines otherwise, or JSON lines.
 //! Results go to stdout; notes and failures to stderr, each naming its file.
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::time::{Duration, Instant};
+
+use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::{
@@ -9,10 +11,22 @@ use crate::{
     denoise::{Job, Outcome},
 };
 
+/// What is printed of files that did not fail.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Style {
+    /// A line each, and the totals.
+    Plain,
+    /// An object each, of those that failed too.
+    Json,
+    /// Nothing.
+    Quiet,
+}
+
 /// Counts and prints outcomes.
 pub struct Progress {
     bar: ProgressBar,
-    json: bool,
+    style: Style,
+    start: Instant,
     total: usize,
     done: usize,
     skipped: usize,
@@ -44,14 +58,18 @@ struct Details<'a> {
 }
 
 impl Progress {
-    /// For a batch of `total` files.
-    pub fn new(total: usize, json: bool) -> Self {
-        let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stderr());
+    /// For a batch of `total` files. The bar shows on a terminal alone.
+    pub fn new(total: usize, style: Style) -> Self {
+        let target = match style {
+            Style::Quiet => ProgressDrawTarget::hidden(),
+            _ => ProgressDrawTarget::stderr(),
+        };
+        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
         bar.set_style(
-            ProgressStyle::with_template("{bar:30} {pos}/{len}  {elapsed} elapsed, {eta} left  {msg}")
+            ProgressStyle::with_template("{bar:30} {pos}/{len}  {elapsed} elapsed{prefix}  {msg}")
                 .expect("the template is valid"),
         );
-        Self { bar, json, total, done: 0, skipped: 0, failed: 0 }
+        Self { bar, style, start: Instant::now(), total, done: 0, skipped: 0, failed: 0 }
     }
 
     /// Prints what became of a file.
@@ -64,22 +82,32 @@ impl Progress {
         let count = self.done + self.skipped + self.failed;
         self.bar.set_message(job.input.file_name().unwrap_or_default().to_string_lossy().into_owned());
         self.bar.set_position(count as u64);
-        let (json, total) = (self.json, self.total);
+        if let Some(speed) = self.speed() {
+            let left = Duration::from_secs_f64((self.total - count) as f64 / speed);
+            self.bar.set_prefix(format!(", {speed:.2} frames/s, {} left", HumanDuration(left)));
+        }
+        let (style, total) = (self.style, self.total);
         // Above the bar, where there is one.
-        self.bar.suspend(|| match json {
-            true => print_line(&json_line(job, outcome)),
-            false => print_plain(job, outcome, count, total),
+        self.bar.suspend(|| match style {
+            Style::Json => print_line(&json_line(job, outcome)),
+            Style::Plain => print_plain(job, outcome, count, total),
+            Style::Quiet => {}
         });
         if let Outcome::Failed(error) = outcome {
             self.bar.suspend(|| warn_line(&format!("demc: {error}")));
         }
     }
 
+    /// Frames a second so far, of those that were denoised: those there already take no time.
+    fn speed(&self) -> Option<f64> {
+        (self.done > 0).then(|| self.done as f64 / self.start.elapsed().as_secs_f64().max(1e-3))
+    }
+
     /// Prints the totals; returns how many files failed.
     pub fn finish(self, stopped: bool) -> usize {
         self.bar.finish_and_clear();
         let left = self.total - self.done - self.skipped - self.failed;
-        if !self.json && (self.total > 1 || stopped) {
+        if self.style == Style::Plain && (self.total > 1 || stopped) {
             let mut summary = format!("{} denoised", self.done);
             for (count, what) in [
                 (self.skipped, "already there (--overwrite does them again)"),
@@ -89,6 +117,9 @@ impl Progress {
                 if count > 0 {
                     summary += &format!(", {count} {what}");
                 }
+            }
+            if let Some(speed) = self.speed() {
+                summary += &format!(" ({speed:.2} frames/s)");
             }
             print_line(&summary);
         }

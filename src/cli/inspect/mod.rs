@@ -13,6 +13,9 @@ use crate::{Result, error::attempt};
 
 /// Arguments of `demc inspect`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = "\
+Examples:
+  demc inspect renders/shot_0004spp.0001.exr")]
 pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "FILE")]

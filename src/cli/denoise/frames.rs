@@ -1,0 +1,141 @@
+//! `--frames`: which of the inputs are worked on, by the number that ends their names.
+//!
+//! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the files whose names end in one of
+//! these numbers, as Blender writes them: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
+
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
+
+use crate::{Error, Result, cli::warn_line};
+
+/// Frames as the user lists them.
+#[derive(Clone, Debug)]
+pub struct Frames(Vec<Span>);
+
+/// Every `step`th frame from the first to the last.
+#[derive(Clone, Copy, Debug)]
+struct Span {
+    first: i64,
+    last: i64,
+    step: i64,
+}
+
+impl Span {
+    fn contains(self, frame: i64) -> bool {
+        (self.first..=self.last).contains(&frame) && (frame - self.first) % self.step == 0
+    }
+}
+
+impl FromStr for Frames {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        text.split(',').map(span).collect::<Result<_, _>>().map(Self)
+    }
+}
+
+fn span(text: &str) -> Result<Span, String> {
+    let wrong = || format!("'{text}' is no list of frames; write 7, 1-9, 1-9:4 or 1,3,7-9");
+    let number = |text: &str| text.parse::<i64>().map_err(|_| wrong());
+    let (frames, step) = match text.split_once([':', 'x']) {
+        Some((frames, step)) => (frames, number(step)?),
+        None => (text, 1),
+    };
+    // A minus in front is the number's own.
+    let (first, last) = match frames.get(1..).and_then(|rest| rest.find('-')) {
+        Some(at) => (number(&frames[..=at])?, number(&frames[at + 2..])?),
+        None => (number(frames)?, number(frames)?),
+    };
+    if last < first {
+        return Err(format!("'{text}': the last frame comes before the first"));
+    }
+    if step < 1 {
+        return Err(format!("'{text}': the step is not a number of at least 1"));
+    }
+    Ok(Span { first, last, step })
+}
+
+impl Frames {
+    fn contains(&self, frame: i64) -> bool {
+        self.0.iter().any(|span| span.contains(frame))
+    }
+
+    /// The files of these frames. Single frames asked for that no file is of are told.
+    ///
+    /// # Errors
+    /// There is no such file.
+    pub fn pick(&self, files: Vec<PathBuf>) -> Result<Vec<PathBuf>> {
+        let picked: Vec<PathBuf> =
+            files.into_iter().filter(|file| number(file).is_some_and(|n| self.contains(n))).collect();
+        if picked.is_empty() {
+            return Err(Error::Usage(
+                "--frames: none of the inputs has a name that ends in one of these numbers, as in shot.0017.exr"
+                    .into(),
+            ));
+        }
+        for single in self.0.iter().filter(|span| span.first == span.last) {
+            if !picked.iter().any(|file| number(file) == Some(single.first)) {
+                warn_line(&format!("demc: note: --frames {}: no input is of this frame", single.first));
+            }
+        }
+        Ok(picked)
+    }
+}
+
+/// The frame that a file's name ends in.
+fn number(file: &Path) -> Option<i64> {
+    let stem = file.file_stem()?.to_str()?;
+    let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    let frame: i64 = stem[head.len()..].parse().ok()?;
+    // A minus is the number's where it stands for nothing else: at the beginning or after a dot.
+    let negative = head.strip_suffix('-').is_some_and(|rest| rest.is_empty() || rest.ends_with('.'));
+    Some(if negative { -frame } else { frame })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picked(frames: &str) -> Vec<i64> {
+        let frames: Frames = frames.parse().unwrap();
+        (-6..=12).filter(|n| frames.contains(*n)).collect()
+    }
+
+    #[test]
+    fn lists_steps_and_negative_frames() {
+        assert_eq!(picked("7"), [7]);
+        assert_eq!(picked("1-3"), [1, 2, 3]);
+        assert_eq!(picked("1-9:4,2"), [1, 2, 5, 9]);
+        assert_eq!(picked("1-9x4"), [1, 5, 9]);
+        assert_eq!(picked("-5--3,-1-1"), [-5, -4, -3, -1, 0, 1]);
+        for (wrong, why) in [
+            ("", "is no list of frames"),
+            ("1-", "is no list of frames"),
+            ("a", "is no list of frames"),
+            ("1,,2", "is no list of frames"),
+            ("ä-3", "is no list of frames"),
+            ("9-1", "comes before the first"),
+            ("1-9:0", "at least 1"),
+        ] {
+            let error = wrong.parse::<Frames>().unwrap_err();
+            assert!(error.contains(why), "{wrong}: {error}");
+        }
+    }
+
+    #[test]
+    fn numbers_end_names() {
+        for (name, expected) in [
+            ("shot_0004spp.0017.exr", Some(17)),
+            ("shot0017.exr", Some(17)),
+            ("a-3/shot-0017.exr", Some(17)),
+            ("shot.-0003.exr", Some(-3)),
+            ("0001.exr", Some(1)),
+            ("shot_0004spp.exr", None),
+            ("shot.exr", None),
+        ] {
+            assert_eq!(number(Path::new(name)), expected, "{name}");
+        }
+    }
+}

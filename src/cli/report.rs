@@ -1,0 +1,136 @@
+//! `demc report`: what the JSON lines of many `demc denoise --json` come to, on a farm one file a task.
+//!
+//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit status.
+
+use std::{
+    collections::BTreeMap,
+    fs::{self, File},
+    io::{BufRead, BufReader},
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+use clap::Args as ClapArgs;
+use serde::Deserialize;
+
+use super::{SOME_FAILED, inputs, print_line, warn_line};
+use crate::{Error, Result};
+
+/// Arguments of `demc report`.
+#[derive(Debug, ClapArgs)]
+#[command(after_help = "\
+Examples:
+  demc report logs/*.jsonl
+  demc report logs/*.jsonl --of renders")]
+pub struct Args {
+    /// Files of what `demc denoise --json` printed, one or several tasks in each
+    #[arg(required = true, value_name = "LOG")]
+    logs: Vec<PathBuf>,
+
+    /// Also name those of these inputs (files, directories, quoted globs) that no task tells of, as one that was
+    /// killed does not
+    #[arg(long, value_name = "INPUT", num_args = 1..)]
+    of: Vec<PathBuf>,
+}
+
+/// What the report reads of a line.
+#[derive(Deserialize)]
+struct Line {
+    input: PathBuf,
+    status: Status,
+    error: Option<String>,
+    seconds: Option<f64>,
+}
+
+#[derive(Clone, Copy, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "lowercase")]
+enum Status {
+    Done,
+    Skipped,
+    Failed,
+}
+
+/// What became of a frame in the end.
+struct Frame {
+    status: Status,
+    error: String,
+}
+
+/// Prints the report.
+///
+/// # Errors
+/// A log cannot be read, or the inputs of `--of` name no file.
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let mut frames: BTreeMap<PathBuf, Frame> = BTreeMap::new();
+    let mut seconds = 0.0;
+    for log in &args.logs {
+        let mut unreadable = 0;
+        for text in BufReader::new(File::open(log).map_err(Error::io("read", log))?).split(b'\n') {
+            let text = text.map_err(Error::io("read", log))?;
+            match serde_json::from_slice::<Line>(&text) {
+                Ok(line) => {
+                    seconds += line.seconds.unwrap_or_default();
+                    add(&mut frames, line);
+                }
+                Err(_) if text.trim_ascii().is_empty() => {}
+                Err(_) => unreadable += 1,
+            }
+        }
+        if unreadable > 0 {
+            let log = log.display();
+            warn_line(&format!("demc: note: {log}: {unreadable} lines are none of `demc denoise --json`"));
+        }
+    }
+    let missing = missing(&args.of, &frames)?;
+    let count = |status| frames.values().filter(|frame| frame.status == status).count();
+    for (input, frame) in frames.iter().filter(|(_, frame)| frame.status == Status::Failed) {
+        // Errors name their file already.
+        let error = &frame.error;
+        let named = error.contains(&*input.to_string_lossy());
+        print_line(&if named {
+            format!("failed: {error}")
+        } else {
+            format!("failed: {}: {error}", input.display())
+        });
+    }
+    for input in &missing {
+        print_line(&format!("missing: {}: no task tells of it", input.display()));
+    }
+    let failed = count(Status::Failed);
+    let mut totals = format!("{} denoised in {seconds:.1} s of model time", count(Status::Done));
+    for (count, what) in
+        [(count(Status::Skipped), "already there"), (failed, "failed"), (missing.len(), "missing")]
+    {
+        if count > 0 {
+            totals += &format!(", {count} {what}");
+        }
+    }
+    print_line(&totals);
+    Ok(if failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
+}
+
+/// A frame that any try denoised is denoised: tasks are run again, and meet.
+fn add(frames: &mut BTreeMap<PathBuf, Frame>, line: Line) {
+    let rank = |status| match status {
+        Status::Failed => 0,
+        Status::Skipped => 1,
+        Status::Done => 2,
+    };
+    let known = frames.get(&line.input).map(|frame| rank(frame.status));
+    if known.is_none_or(|known| known <= rank(line.status)) {
+        let error = line.error.unwrap_or_default();
+        frames.insert(line.input, Frame { status: line.status, error });
+    }
+}
+
+fn missing(of: &[PathBuf], frames: &BTreeMap<PathBuf, Frame>) -> Result<Vec<PathBuf>> {
+    if of.is_empty() {
+        return Ok(Vec::new());
+    }
+    // Tasks may have come to the folder by other ways.
+    let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let told: Vec<PathBuf> = frames.keys().map(|input| place(input)).collect();
+    let mut files = inputs::expand(of)?.files;
+    files.retain(|file| !told.contains(&place(file)));
+    Ok(files)
+}

@@ -1,0 +1,61 @@
+"""Writes a .blend with what an export must not pass over in silence, to the path given.
+
+Two scenes, `Main` (active) and `Other`, 64x36 pixels each: a cube that moves, seen by a camera. What is
+hard about them comes by name, as further arguments: stereo, border, step, aspect, blur, texture, library.
+"""
+
+import os
+import sys
+
+import bpy
+
+path, wanted = sys.argv[1], set(sys.argv[2:])
+bpy.ops.wm.read_factory_settings(use_empty=True)
+main = bpy.context.scene
+main.name = "Main"
+scenes = [main] + ([bpy.data.scenes.new("Other")] if "two" in wanted else [])
+cube = bpy.data.meshes.new("cube")
+cube.from_pydata([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [], [(0, 1, 2, 3)])
+for scene in scenes:
+    card = bpy.data.objects.new("card", cube)
+    card.keyframe_insert("location", frame=1)
+    card.location.x = 2
+    card.keyframe_insert("location", frame=9)
+    lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location.z = 6
+    for thing in (card, lamp, camera):
+        scene.collection.objects.link(thing)
+    scene.camera = camera
+    render = scene.render
+    render.engine = "CYCLES"
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 64, 36, 100
+    scene.frame_start, scene.frame_end = 1, 5
+    render.use_multiview = "stereo" in wanted
+    render.use_motion_blur = "blur" in wanted
+    scene.frame_step = 2 if "step" in wanted else 1
+    if "aspect" in wanted:
+        render.pixel_aspect_y = 2.0
+    if "border" in wanted:
+        render.use_border = render.use_crop_to_border = True
+        render.border_min_x, render.border_max_x = 0.25, 0.75
+        render.border_min_y, render.border_max_y = 0.5, 1.0
+scenes[-1].render.resolution_x = 64 if len(scenes) == 1 else 32
+if "texture" in wanted:
+    material = bpy.data.materials.new("painted")
+    if material.node_tree is None:
+        material.use_nodes = True
+    image = bpy.data.images.new("paint", 4, 4)
+    image.source, image.filepath = "FILE", os.path.join(os.path.dirname(path), "lost_paint.png")
+    material.node_tree.nodes.new("ShaderNodeTexImage").image = image
+    cube.materials.append(material)
+if "library" in wanted:
+    library = os.path.join(os.path.dirname(path), "lost_library.blend")
+    prop = bpy.data.meshes.new("prop")
+    bpy.data.libraries.write(library, {prop})
+    bpy.data.meshes.remove(prop)
+    with bpy.data.libraries.load(library, link=True) as (there, here):
+        here.meshes = ["prop"]
+    main.collection.objects.link(bpy.data.objects.new("prop", here.meshes[0]))
+    os.remove(library)
+bpy.ops.wm.save_as_mainfile(filepath=path)
