@@ -33,7 +33,7 @@ pub struct Tolerances {
 
 /// Those of the built-in way.
 pub const TOLERANCES: Tolerances =
-    Tolerances { pixels: 20.0, light: 5e-5, noise: (1.5, 3.0), normal: 0.02, albedo: 0.012, depth: 0.012 };
+    Tolerances { pixels: 20.0, light: 5e-5, noise: (1.5, 3.0), normal: 0.015, albedo: 0.009, depth: 0.009 };
 
 /// Rows and columns of a square.
 const SQUARE: usize = 2;
