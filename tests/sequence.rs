@@ -49,7 +49,9 @@ const SHOT: Shot =
 
 /// A number from 0 to 1 that depends on all of `parts`.
 fn random(parts: [u32; 3]) -> f32 {
-    let mix = |hash: u32, part: u32| (hash ^ part).wrapping_mul(0x85eb_ca6b).rotate_left(13).wrapping_mul(0xc2b2_ae35);
+    let mix = |hash: u32, part: u32| {
+        (hash ^ part).wrapping_mul(0x85eb_ca6b).rotate_left(13).wrapping_mul(0xc2b2_ae35)
+    };
     let hash = parts.into_iter().fold(0x9e37_79b9, mix);
     ((hash ^ (hash >> 15)) >> 8) as f32 / (1 << 24) as f32
 }
@@ -174,7 +176,7 @@ fn neighbours_take_noise_away_along_the_motion() {
         for reach in ["1", "2", "3"] {
             demc(&with).arg(dir.path()).args(["--overwrite", "--temporal", reach]).assert().success();
             let error = shot.error(&result(&with, 3), "ViewLayer.Denoised", 3);
-            assert!(error < 0.8 * before, "{reach} each side: {error} after {before}");
+            assert!(error < 0.9 * before, "{reach} each side: {error} after {before}");
             before = error;
         }
         // Two on each side without a number.
@@ -239,11 +241,11 @@ fn ends_gaps_and_frames_that_do_not_fit_are_told() {
         text.lines().filter(|line| line.contains(&name)).collect()
     };
     for (n, parts) in [
-        (9, vec!["frame 8 is not there", "other side"]),
-        (11, vec!["frame 12 is of another size", "other side"]),
+        (9, vec!["frame 8 is not there", "with those that are left"]),
+        (11, vec!["frame 12 is of another size", "with those that are left"]),
         (12, vec!["frame 11 is of another size", "frame 13 is of another size", "alone"]),
         (13, vec!["frame 12 is of another size", "frame 14 shows another picture: a cut", "alone"]),
-        (14, vec!["frame 13 shows another picture: a cut", "other side"]),
+        (14, vec!["frame 13 shows another picture: a cut", "with those that are left"]),
         (15, vec!["frame 16 is not there"]),
         (19, vec!["frame 18 is not there", "frame 20 is not there", "alone"]),
     ] {
@@ -264,7 +266,10 @@ fn ends_gaps_and_frames_that_do_not_fit_are_told() {
 #[test]
 fn frames_without_vectors_are_done_alone_and_blender_is_told_how() {
     for (shot, said) in [
-        (Shot { vectors: false, ..SHOT }, "no pass Vector; turn on View Layer Properties > Passes > Data > Vector"),
+        (
+            Shot { vectors: false, ..SHOT },
+            "no pass Vector; turn on View Layer Properties > Passes > Data > Vector",
+        ),
         (Shot { vector_scale: 0.0, speed: 9.0, ..SHOT }, "turn off Render Properties > Motion Blur"),
     ] {
         let dir = sequence(shot, 1..=3);
@@ -294,7 +299,8 @@ fn view_layers_and_stereo_views_follow_their_own_vectors() {
     let [left, right] = [SHOT, Shot { speed: -3.0, seed: 5, ..SHOT }];
     let dir = tempfile::tempdir().unwrap();
     for n in 1..=5 {
-        let stereo = [left.channels("ViewLayer", "left.", n), right.channels("ViewLayer", "right.", n)].concat();
+        let stereo =
+            [left.channels("ViewLayer", "left.", n), right.channels("ViewLayer", "right.", n)].concat();
         write_channels(&dir.path().join(format!("stereo.{n:04}.exr")), SIZE, stereo, &["left", "right"]);
         let layers = [left.channels("Front", "", n), right.channels("Back", "", n)].concat();
         write_channels(&dir.path().join(format!("layers.{n:04}.exr")), SIZE, layers, &[]);
@@ -341,8 +347,8 @@ fn flicker_is_what_numpy_says() {
         Planes::from_vec(channels, w, h, (0..channels * w * h).map(value).collect())
     };
     let references = [3, 2].map(|frame| plane(1, 3, &|c, i, _| SHOT.truth(c, i, frame)));
-    let images =
-        [3, 2].map(|frame| plane(frame as u32, 3, &|c, i, noise| SHOT.truth(c, i, frame) * (0.7 + 0.6 * noise)));
+    let images = [3, 2]
+        .map(|frame| plane(frame as u32, 3, &|c, i, noise| SHOT.truth(c, i, frame) * (0.7 + 0.6 * noise)));
     // Not quite the motion, and between pixels: some of the picture changes along it.
     let vectors = plane(7, 4, &|c, _, noise| if c == 0 { -2.6 + noise } else { 0.8 * noise });
     let pair = Pair {

@@ -198,7 +198,10 @@ impl<T> Views<T> {
     ///
     /// # Errors
     /// It becomes nothing of one.
-    pub(super) fn each<U>(self, mut change: impl FnMut(&Layer, T, &mut Report) -> Result<U>) -> Result<Views<U>> {
+    pub(super) fn each<U>(
+        self,
+        mut change: impl FnMut(&Layer, T, &mut Report) -> Result<U>,
+    ) -> Result<Views<U>> {
         let Self { frame, views, mut report } = self;
         let mut done = Vec::with_capacity(views.len());
         for (layer, view) in views {

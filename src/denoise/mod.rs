@@ -15,6 +15,7 @@ use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper, plan};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+pub use sequence::follows;
 
 use crate::{Result, models::Denoiser};
 

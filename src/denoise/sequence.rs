@@ -61,6 +61,12 @@ impl Place {
     }
 }
 
+/// Whether a file is the frame after another, by their names.
+pub fn follows(file: &Path, before: &Path) -> bool {
+    let [Some(place), Some(before)] = [file, before].map(Place::of) else { return false };
+    place.key == before.key && place.number - before.number == 1
+}
+
 /// Jobs of a sequence, by number, or a job alone.
 pub struct Sequence {
     /// What lies on disk, the jobs' own files at their numbers.
@@ -125,7 +131,8 @@ mod tests {
     #[test]
     fn jobs_are_sequences_with_all_that_lies_beside_them() {
         let dir = tempfile::tempdir().unwrap();
-        for name in ["a.0009.exr", "a.0010.exr", "a.0012.exr", "a.11.exr", "a.012.exr", "b.0010.exr", "c.exr"] {
+        for name in ["a.0009.exr", "a.0010.exr", "a.0012.exr", "a.11.exr", "a.012.exr", "b.0010.exr", "c.exr"]
+        {
             fs::write(dir.path().join(name), "").unwrap();
         }
         let job = |name: &str| Job { input: dir.path().join(name), output: PathBuf::new() };

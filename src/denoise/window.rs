@@ -90,7 +90,13 @@ impl Window {
     }
 
     /// Takes in what was read of a frame, or why it cannot be; `is_written` if it is to be denoised too.
-    pub fn enter(&mut self, number: i64, loaded: Result<Views<Shot>>, is_written: bool, model: &dyn Denoiser) {
+    pub fn enter(
+        &mut self,
+        number: i64,
+        loaded: Result<Views<Shot>>,
+        is_written: bool,
+        model: &dyn Denoiser,
+    ) {
         let mut moments = BTreeMap::new();
         let rest = loaded.and_then(|loaded| {
             loaded.each(|layer, shot, _| {
@@ -284,7 +290,7 @@ impl Window {
             return;
         }
         let is_alone = moment.links.values().all(Result::is_err);
-        let end = if is_alone { "denoised alone" } else { "denoised with the frames on its other side" };
+        let end = if is_alone { "denoised alone" } else { "denoised with those that are left" };
         let note = format!("{}; {end}", gaps.join("; "));
         if !report.notes.contains(&note) {
             report.notes.push(note);
@@ -315,7 +321,9 @@ impl Moment {
             depth: either(Pass::DenoisingDepth, Pass::Depth),
         });
         // From here on, the model's passes and the motion are all that is needed.
-        let keeps = |pass: &Pass| *pass == Pass::Vector || [model.passes(), model.optional_passes()].concat().contains(pass);
+        let keeps = |pass: &Pass| {
+            *pass == Pass::Vector || [model.passes(), model.optional_passes()].concat().contains(pass)
+        };
         PASSES.iter().filter(|pass| !keeps(pass)).for_each(|pass| drop(shot.passes.remove(*pass)));
         Self { shot, look, links: BTreeMap::new(), result: None }
     }

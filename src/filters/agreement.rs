@@ -93,7 +93,9 @@ impl Look {
                 for y in row * SQUARE..((row + 1) * SQUARE).min(height) {
                     let mut add = |line: usize, values: &[f32]| {
                         let line = &mut lines[line * columns..][..columns];
-                        line.iter_mut().zip(values.chunks(SQUARE)).for_each(|(sum, v)| *sum += v.iter().sum::<f32>());
+                        line.iter_mut()
+                            .zip(values.chunks(SQUARE))
+                            .for_each(|(sum, v)| *sum += v.iter().sum::<f32>());
                     };
                     let row_of = |planes: &'_ Planes, c: usize| y * width + c * planes.pixels();
                     for c in 0..3 {
@@ -109,7 +111,10 @@ impl Look {
                                 });
                             }
                             None => {
-                                roots.iter_mut().zip(light).for_each(|(root, v)| *root = v.max(0.0).sqrt().sqrt());
+                                roots
+                                    .iter_mut()
+                                    .zip(light)
+                                    .for_each(|(root, v)| *root = v.max(0.0).sqrt().sqrt());
                             }
                         }
                         squares.iter_mut().zip(&*roots).for_each(|(square, root)| *square = root * root);
@@ -143,7 +148,9 @@ impl Look {
         });
         let pixels = squares.pixels();
         let (means, rest) = squares.data.split_at_mut(VARIANCE * pixels);
-        rest.par_iter_mut().zip(means).for_each(|(square, mean)| *square = (*square - *mean * *mean).max(0.0));
+        rest.par_iter_mut()
+            .zip(means)
+            .for_each(|(square, mean)| *square = (*square - *mean * *mean).max(0.0));
         Self { size: (width, height), squares }
     }
 

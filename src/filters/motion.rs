@@ -45,7 +45,11 @@ impl Flow {
     /// If the vectors are of another size.
     pub fn step(&mut self, vectors: &Planes, direction: Direction) {
         let (width, height) = (self.width, self.height);
-        assert_eq!((vectors.channels, vectors.width, vectors.height), (4, width, height), "a pass of the frame");
+        assert_eq!(
+            (vectors.channels, vectors.width, vectors.height),
+            (4, width, height),
+            "a pass of the frame"
+        );
         let (right, up, sign) = match direction {
             Direction::Back => (0, 1, 1.0),
             Direction::Forth => (2, 3, -1.0),

@@ -204,7 +204,10 @@ mod tests {
     /// A link along a motion of whole pixels to the right, trusted everywhere inside.
     fn link(right: f32, weight: f32) -> Link {
         let mut flow = Flow::still(SIZE.0, SIZE.1);
-        flow.step(&Planes::from_rows(4, SIZE, |c, _, out| out.fill(if c == 2 { -right } else { 0.0 })), Direction::Forth);
+        flow.step(
+            &Planes::from_rows(4, SIZE, |c, _, out| out.fill(if c == 2 { -right } else { 0.0 })),
+            Direction::Forth,
+        );
         let weights = Planes::from_rows(1, SIZE, |_, y, out| {
             let columns = flow.row(y).0;
             out.iter_mut().zip(columns).for_each(|(out, x)| *out = if x.is_nan() { 0.0 } else { weight });
