@@ -1,8 +1,8 @@
 //! The frames around the one that is denoised, as far as it needs them, and what it makes of them.
 //!
 //! With N frames on each side, what becomes of a frame depends on the inputs of those 2N + 1 alone:
-//! - its render and guides are averaged with those of frames up to M = N/2 (rounded up) away, and the model denoises that;
-//! - so are frames up to N - M away, and these results are averaged with its own.
+//! - its render and guides are averaged with those of the frames next to it, and the model denoises that;
+//! - so are frames up to N - 1 away, and these results are averaged with its own.
 //!
 //! No result is made of an earlier one, so any frame can be done anywhere, in any order, to the same bits; in a stream, each
 //! is read and denoised once. Both averages follow the Vector pass, and leave out what does not agree: see
@@ -37,6 +37,10 @@ pub const PASSES: [Pass; 6] = [
     Pass::DenoisingDepth,
     Pass::Depth,
 ];
+
+/// How many frames away the renders are, at most, that are averaged: of those further away, what no comparison finds costs
+/// more than they bring (docs/decisions.md).
+const RENDERS: usize = 1;
 
 /// Two frames of which less than this share agrees, of all that both show, are of two shots.
 const CUT: f32 = 0.05;
@@ -85,7 +89,7 @@ pub struct Window {
 impl Window {
     /// An empty window of so many frames before and after one.
     pub fn new(reach: usize) -> Self {
-        let renders = reach.div_ceil(2);
+        let renders = reach.min(RENDERS);
         Self { reaches: [renders, reach - renders].map(|n| n as i32), held: BTreeMap::new() }
     }
 
