@@ -195,7 +195,7 @@ mod tests {
 
     const SIZE: (usize, usize) = (40, 30);
 
-    fn grey(value: impl Fn(usize, usize) -> f32) -> Planes {
+    fn grey(value: impl Fn(usize, usize) -> f32 + Sync) -> Planes {
         Planes::from_rows(3, SIZE, |_, y, out| {
             out.iter_mut().enumerate().for_each(|(x, out)| *out = value(x, y));
         })
