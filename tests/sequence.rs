@@ -173,10 +173,11 @@ fn neighbours_take_noise_away_along_the_motion() {
         let (alone, with) = (dir.path().join("alone"), dir.path().join("with"));
         demc(&alone).arg(dir.path()).assert().success();
         let mut before = shot.error(&result(&alone, 3), "ViewLayer.Denoised", 3);
-        for reach in ["1", "2", "3"] {
+        // Further away, frames add their results alone, not their renders.
+        for (reach, share) in [("1", 0.9), ("2", 0.9), ("3", 0.95)] {
             demc(&with).arg(dir.path()).args(["--overwrite", "--temporal", reach]).assert().success();
             let error = shot.error(&result(&with, 3), "ViewLayer.Denoised", 3);
-            assert!(error < 0.9 * before, "{reach} each side: {error} after {before}");
+            assert!(error < share * before, "{reach} each side: {error} after {before}");
             before = error;
         }
         // Two on each side without a number.
