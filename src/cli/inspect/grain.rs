@@ -50,15 +50,17 @@ impl Grain {
                 })
             })
         };
-        let mut values = vec![f32::NAN; width * height];
-        for y in 1..height - 1 {
-            for at in y * width + 1..(y + 1) * width - 1 {
-                let mean = around(at).map(light).iter().sum::<f32>() / 4.0;
-                if mean > 0.0 && mean.is_finite() && is_flat(at) {
-                    values[at] = (light(at) / mean - 1.0).clamp(-LARGEST, LARGEST);
-                }
+        let is_inside =
+            |at: usize| (1..width - 1).contains(&(at % width)) && (1..height - 1).contains(&(at / width));
+        let value = |at: usize| {
+            if !is_inside(at) || !is_flat(at) {
+                return f32::NAN;
             }
-        }
+            let mean = around(at).map(light).iter().sum::<f32>() / 4.0;
+            // Beside black, and where values are not finite, it is no number.
+            if mean > 0.0 { (light(at) / mean - 1.0).clamp(-LARGEST, LARGEST) } else { f32::NAN }
+        };
+        let values = (0..width * height).map(value).collect();
         Some(Self { width, values })
     }
 
