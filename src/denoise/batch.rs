@@ -1,5 +1,5 @@
 //! The batch: reading the next frame, denoising this one and writing the last overlap, so that a batch
-//! takes about as long as the model does. At most three frames are in memory.
+//! takes about as long as the model does. At most three frames are in memory, and of a sequence its window besides.
 //!
 //! The threads report to the caller's thread, which alone talks to the user.
 
@@ -18,6 +18,8 @@ use std::{
 use super::{
     Job, Options, Report, Views,
     job::{self, Denoised},
+    sequence::{self, Sequence},
+    window::Window,
 };
 use crate::{Error, Result, error::attempt, models::Denoiser, shot::Shot};
 
@@ -179,33 +181,122 @@ fn spawn(
         .expect("the system has room for three threads");
 }
 
-fn load_all(shared: &Shared, next: &SyncSender<(usize, Views<Shot>)>, ended: &Sender<Message>) {
+/// What the reading stage has for the one that denoises.
+enum Loaded {
+    /// What was read of a frame that is denoised by itself.
+    Frame(usize, Result<Views<Shot>>),
+    /// A sequence begins: forget the one before.
+    Begin,
+    /// What was read of a frame of the sequence, by its number, and whether it is to be denoised.
+    Neighbour { number: i64, loaded: Result<Views<Shot>>, is_written: bool },
+    /// All that lies around a frame has been read.
+    Complete { index: usize, number: i64 },
+}
+
+fn load_all(shared: &Shared, next: &SyncSender<Loaded>, ended: &Sender<Message>) {
+    if let Some(reach) = shared.options.temporal {
+        for sequence in sequence::group(&shared.jobs) {
+            if load_sequence(shared, &sequence, reach, next, ended).is_none() {
+                return;
+            }
+        }
+        return;
+    }
     for (index, job) in shared.jobs.iter().enumerate() {
-        let existing = if shared.options.overwrite { None } else { job::existing(&job.output) };
-        if let Some(headers) = existing {
-            let _writing = shared.writing.lock().unwrap_or_else(PoisonError::into_inner);
-            let taken_up = attempt(&job.output, || job::take_up(&headers, &shared.options));
-            let outcome = taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
-            let _ = ended.send(Message::Ended(index, outcome));
+        if take_up_existing(shared, index, ended) {
             continue;
         }
-        let loaded = attempt(&job.input, || job::load(&job.input, &*shared.model, &shared.options));
-        if !pass_on(index, loaded, next, ended) {
+        if next.send(Loaded::Frame(index, read(shared, &job.input))).is_err() {
             return;
         }
     }
 }
 
+/// Reads the frames of a sequence that are to be denoised, and those around them, each once; none when there is no next
+/// stage.
+fn load_sequence(
+    shared: &Shared,
+    sequence: &Sequence,
+    reach: usize,
+    next: &SyncSender<Loaded>,
+    ended: &Sender<Message>,
+) -> Option<()> {
+    let open: Vec<(usize, i64)> =
+        sequence.jobs.iter().copied().filter(|(index, _)| !take_up_existing(shared, *index, ended)).collect();
+    if !sequence.is_numbered {
+        for (index, _) in open {
+            let mut frame = read(shared, &shared.jobs[index].input);
+            if let Ok(frame) = &mut frame {
+                frame.say("its name ends in no frame number; denoised alone");
+            }
+            next.send(Loaded::Frame(index, frame)).ok()?;
+        }
+        return Some(());
+    }
+    next.send(Loaded::Begin).ok()?;
+    let mut unread = i64::MIN;
+    for &(index, number) in &open {
+        let (first, last) = (number.saturating_sub(reach as i64), number.saturating_add(reach as i64));
+        for (&number, file) in sequence.files.range(first.max(unread)..=last) {
+            let is_written = open.iter().any(|(_, written)| *written == number);
+            next.send(Loaded::Neighbour { number, loaded: read(shared, file), is_written }).ok()?;
+        }
+        unread = last.saturating_add(1);
+        next.send(Loaded::Complete { index, number }).ok()?;
+    }
+    Some(())
+}
+
+fn read(shared: &Shared, input: &Path) -> Result<Views<Shot>> {
+    attempt(input, || job::load(input, &*shared.model, &shared.options))
+}
+
+/// Whether the result of a job was there already; what became of that is reported.
+fn take_up_existing(shared: &Shared, index: usize, ended: &Sender<Message>) -> bool {
+    let output = &shared.jobs[index].output;
+    let existing = if shared.options.overwrite { None } else { job::existing(output) };
+    let Some(headers) = existing else { return false };
+    let _writing = shared.writing.lock().unwrap_or_else(PoisonError::into_inner);
+    let taken_up = attempt(output, || job::take_up(&headers, &shared.options));
+    let outcome = taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
+    let _ = ended.send(Message::Ended(index, outcome));
+    true
+}
+
 fn denoise_all(
     shared: &Shared,
-    frames: &Receiver<(usize, Views<Shot>)>,
+    frames: &Receiver<Loaded>,
     next: &SyncSender<(usize, Views<Denoised>)>,
     ended: &Sender<Message>,
 ) {
-    for (index, loaded) in frames {
-        let input = &shared.jobs[index].input;
-        let denoised = attempt(input, || job::denoise(loaded, &*shared.model, &shared.options));
-        if !pass_on(index, denoised, next, ended) {
+    let (model, options) = (&*shared.model, &shared.options);
+    let reach = options.temporal.unwrap_or_default();
+    let mut window = Window::new(reach);
+    for loaded in frames {
+        let (index, denoised) = match loaded {
+            Loaded::Frame(index, frame) => {
+                let input = &shared.jobs[index].input;
+                (index, frame.and_then(|frame| attempt(input, || job::denoise(frame, model, options))))
+            }
+            Loaded::Begin => {
+                window = Window::new(reach);
+                continue;
+            }
+            Loaded::Neighbour { number, loaded, is_written } => {
+                window.leave(number.saturating_sub(2 * reach as i64));
+                window.enter(number, loaded, is_written, model);
+                continue;
+            }
+            Loaded::Complete { index, number } => {
+                let input = &shared.jobs[index].input;
+                (index, attempt(input, || window.denoise(number, model, options)))
+            }
+        };
+        let is_last = match denoised {
+            Ok(frame) => next.send((index, frame)).is_err(),
+            Err(error) => ended.send(Message::Ended(index, Outcome::Failed(error))).is_err(),
+        };
+        if is_last {
             return;
         }
     }
@@ -220,21 +311,5 @@ fn store_all(shared: &Shared, frames: &Receiver<(usize, Views<Denoised>)>, ended
         };
         let outcome = stored.map_or_else(Outcome::Failed, Outcome::Done);
         let _ = ended.send(Message::Ended(index, outcome));
-    }
-}
-
-/// Hands a frame to the next stage, or its failure to the user; false when there is no next stage.
-fn pass_on<T>(
-    index: usize,
-    result: Result<T>,
-    next: &SyncSender<(usize, T)>,
-    ended: &Sender<Message>,
-) -> bool {
-    match result {
-        Ok(frame) => next.send((index, frame)).is_ok(),
-        Err(error) => {
-            let _ = ended.send(Message::Ended(index, Outcome::Failed(error)));
-            true
-        }
     }
 }

@@ -15,6 +15,8 @@ use crate::{
     shot::{self, Shot},
 };
 
+use super::window;
+
 /// One file to do.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Job {
@@ -40,12 +42,21 @@ pub struct Options {
     pub preview: Option<WritePicture>,
     /// Whether a [`super::Batch`] denoises again what is finished.
     pub overwrite: bool,
+    /// Frames before and after one that a [`super::Batch`] makes it better and steadier with; none for frame by frame.
+    pub temporal: Option<usize>,
 }
 
 impl Default for Options {
     /// Adds the layer `Denoised` to the view layer with the most passes.
     fn default() -> Self {
-        Self { view_layer: None, layer: Some("Denoised".into()), tile: None, preview: None, overwrite: false }
+        Self {
+            view_layer: None,
+            layer: Some("Denoised".into()),
+            tile: None,
+            preview: None,
+            overwrite: false,
+            temporal: None,
+        }
     }
 }
 
@@ -112,7 +123,8 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
-    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha]].concat();
+    let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion].concat();
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -170,25 +182,72 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 }
 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
-    let Views { frame, views, mut report } = loaded;
-    let mut done = Vec::with_capacity(views.len());
-    for (layer, mut shot) in views {
-        report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
-        let start = Instant::now();
-        let radiance = model.denoise_tiled(&shot, options.tile)?;
-        report.seconds += start.elapsed().as_secs_f64();
-        let size = (shot.passes.width, shot.passes.height);
-        if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
-            return Err(Error::invalid(
-                &shot.passes.path,
-                format!("model {} returned an image of the wrong size; choose another model", model.name()),
-            ));
-        }
-        let alpha = shot.passes.remove(Pass::Alpha);
-        let radiance = finite(radiance, model.name(), &shot.passes.path, &mut report)?;
-        done.push((layer, Denoised { radiance, alpha }));
+    loaded.each(|_, shot, report| {
+        let radiance = run(&shot, model, options, report)?;
+        finish(&shot, radiance, model, report)
+    })
+}
+
+impl<T> Views<T> {
+    /// Adds to what the user should know.
+    pub(super) fn say(&mut self, note: &str) {
+        self.report.notes.push(note.into());
     }
-    Ok(Views { frame, views: done, report })
+
+    /// What becomes of every view.
+    ///
+    /// # Errors
+    /// It becomes nothing of one.
+    pub(super) fn each<U>(
+        self,
+        mut change: impl FnMut(&Layer, T, &mut Report) -> Result<U>,
+    ) -> Result<Views<U>> {
+        let Self { frame, views, mut report } = self;
+        let mut done = Vec::with_capacity(views.len());
+        for (layer, view) in views {
+            let view = change(&layer, view, &mut report)?;
+            done.push((layer, view));
+        }
+        Ok(Views { frame, views: done, report })
+    }
+}
+
+/// Runs the model over a view.
+///
+/// # Errors
+/// The model cannot denoise it.
+pub(super) fn run(
+    shot: &Shot,
+    model: &dyn Denoiser,
+    options: &Options,
+    report: &mut Report,
+) -> Result<Planes> {
+    report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
+    let start = Instant::now();
+    let radiance = model.denoise_tiled(shot, options.tile)?;
+    report.seconds += start.elapsed().as_secs_f64();
+    let size = (shot.passes.width, shot.passes.height);
+    if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
+        return Err(Error::invalid(
+            &shot.passes.path,
+            format!("model {} returned an image of the wrong size; choose another model", model.name()),
+        ));
+    }
+    Ok(radiance)
+}
+
+/// What is stored of a view, whose alpha goes with it.
+///
+/// # Errors
+/// What the model made is of no use.
+pub(super) fn finish(
+    shot: &Shot,
+    radiance: Planes,
+    model: &dyn Denoiser,
+    report: &mut Report,
+) -> Result<Denoised> {
+    let radiance = finite(radiance, model.name(), &shot.passes.path, report)?;
+    Ok(Denoised { radiance, alpha: shot.passes.get(Pass::Alpha).cloned() })
 }
 
 /// Whatever a model returns, what is written is finite.

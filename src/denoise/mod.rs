@@ -1,17 +1,21 @@
 //! The denoise engine: files in, each of them out again with a layer more.
 //!
 //! [`file`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`] and [`store`]
-//! are the steps of which both are made. Nothing is printed: what the user should know is in each frame's [`Report`].
+//! are the steps of which both are made. With [`Options::temporal`], a batch does
+//! frames of a sequence with their neighbours. Nothing is printed: what the user should know is in each frame's [`Report`].
 
 mod batch;
 mod job;
 #[cfg(feature = "preview")]
 pub mod preview;
+mod sequence;
+mod window;
 
 use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper, plan};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+pub use sequence::follows;
 
 use crate::{Result, models::Denoiser};
 

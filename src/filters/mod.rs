@@ -5,8 +5,13 @@
 //! [`variance`] what is known about the noise, and [`shrinkage`] takes back what was changed beyond that. Work is cut into tiles of the frame, one a thread; inner
 //! loops run over consecutive pixels so that the compiler can vectorise them. Results do not depend on
 //! the number of threads.
+//!
+//! For sequences, [`motion`] follows what moves from frame to frame, [`agreement`] tells where two frames show the same, and
+//! [`temporal`] averages them there.
 
+pub mod agreement;
 pub mod blocks;
+pub mod motion;
 pub mod nl_means;
 mod padded;
 pub mod refit;
@@ -14,4 +19,5 @@ pub mod regression;
 pub mod shrinkage;
 pub mod solve;
 pub mod squares;
+pub mod temporal;
 pub mod variance;

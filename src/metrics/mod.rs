@@ -3,8 +3,8 @@
 //! One file a family, each with its formula, constants and source: [`error`] (RelMSE, RMSE, maximum
 //! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices; and [`pairing`], which
 //! tells whether the two belong together.
-//! [`score`] computes them all. Sums run in f64 row by row in a fixed order: the number of threads
-//! does not change a digit.
+//! [`score`] computes all of these. [`flicker`] is of a sequence: two frames and the motion between them.
+//! Sums run in f64 row by row in a fixed order: the number of threads does not change a digit.
 
 use std::fmt;
 
@@ -15,6 +15,7 @@ use crate::planes::Planes;
 
 pub mod display;
 pub mod error;
+pub mod flicker;
 pub mod flip;
 pub mod pairing;
 pub mod ssim;

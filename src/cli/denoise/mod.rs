@@ -72,6 +72,12 @@ pub struct Args {
     #[arg(long, value_name = "A-B[:S],...", allow_hyphen_values = true)]
     frames: Option<Frames>,
 
+    /// Take frames of a sequence (names that end in a number) together with N before and N after each, found beside them
+    /// and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without a number]
+    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
+          value_parser = clap::value_parser!(u8).range(1..=8))]
+    temporal: Option<u8>,
+
     /// Write a PNG beside each result, exposed for display
     #[arg(long)]
     preview: bool,
@@ -115,6 +121,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         tile: args.tile.map(|t| t as usize),
         preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
+        temporal: args.temporal.map(usize::from),
     };
     let style = match (args.json, args.quiet) {
         (true, _) => Style::Json,

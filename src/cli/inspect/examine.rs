@@ -4,6 +4,7 @@ use std::{collections::HashSet, path::Path};
 
 use serde::Serialize;
 
+use super::grain::Grain;
 use crate::{
     Result,
     frame::{Frame, Window},
@@ -26,6 +27,9 @@ pub struct FileReport {
     pub parts: Vec<PartReport>,
     pub layers: Vec<LayerReport>,
     pub warnings: Vec<String>,
+    /// The noise of the first view layer that shows any.
+    #[serde(skip)]
+    pub grain: Option<Grain>,
 }
 
 #[derive(Serialize)]
@@ -114,6 +118,7 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
         parts: parts.collect(),
         layers: Vec::new(),
         warnings: window_warnings(&frame),
+        grain: None,
     };
     report.warnings.extend(undecodable_warnings(&frame));
     let is_hidden = frame.parts().iter().any(|part| !part.deep && part.undecodable().is_some());
@@ -123,7 +128,9 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
             .push(format!("nothing to denoise: no Combined pass; {}", Pass::Combined.blender_setting()));
     }
     for layer in &layers {
-        report.layers.push(examine_layer(&frame, layer, methods)?);
+        let (layer, grain) = examine_layer(&frame, layer, methods)?;
+        report.layers.push(layer);
+        report.grain = report.grain.or(grain);
     }
     Ok(report)
 }
@@ -160,7 +167,8 @@ fn undecodable_warnings(frame: &Frame) -> Vec<String> {
     warnings
 }
 
-fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<LayerReport> {
+fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<(LayerReport, Option<Grain>)> {
+    let mut grain = None;
     let mut passes = Vec::new();
     let mut warnings = Vec::new();
     let part_of = |pass: &Pass| &frame.parts()[layer.passes[pass].part];
@@ -179,6 +187,7 @@ fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<Lay
     };
     if !decodable.is_empty() {
         let set = passes::read_layer(frame, layer, &decodable)?;
+        grain = Grain::of(&set);
         for (pass, planes) in set.iter() {
             let report = PassReport {
                 non_finite: Some(planes.non_finite()),
@@ -214,14 +223,15 @@ fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<Lay
             .map(|p| Missing { pass: p.to_string(), remedy: p.blender_setting() })
             .collect(),
     });
-    Ok(LayerReport {
+    let report = LayerReport {
         name: layer.name.clone(),
         view: layer.view.clone(),
         models: models.collect(),
         passes,
         unrecognised: layer.unrecognised.clone(),
         warnings,
-    })
+    };
+    Ok((report, grain))
 }
 
 fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String> {

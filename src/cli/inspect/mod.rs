@@ -2,6 +2,7 @@
 //! how Blender turns it on, and what looks suspicious.
 
 mod examine;
+mod grain;
 mod print;
 
 use std::{path::PathBuf, process::ExitCode};
@@ -9,7 +10,8 @@ use std::{path::PathBuf, process::ExitCode};
 use clap::Args as ClapArgs;
 
 use super::{SOME_FAILED, inputs, print_line, warn_line};
-use crate::{Result, error::attempt};
+use crate::{Result, denoise, error::attempt};
+use grain::Grain;
 
 /// Arguments of `demc inspect`.
 #[derive(Debug, ClapArgs)]
@@ -34,8 +36,19 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let inputs = inputs::expand(&args.files)?;
     let mut failed = !inputs.unusable.is_empty();
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
+    // The frame before, while files are frames of one sequence in order.
+    let mut before: Option<(PathBuf, Grain)> = None;
     for path in inputs.files {
-        match attempt(&path, || examine::examine(&path, &methods)) {
+        let mut examined = attempt(&path, || examine::examine(&path, &methods));
+        let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
+        if let Ok(report) = &mut examined {
+            let grain = report.grain.take();
+            if let (Some(grain), Some((earlier, of_earlier))) = (&grain, &of_before) {
+                report.warnings.extend(grain.warning(of_earlier, &earlier.display().to_string()));
+            }
+            before = grain.map(|grain| (path, grain));
+        }
+        match examined {
             Ok(report) if args.json => {
                 print_line(&serde_json::to_string(&report).expect("strings and numbers serialise"));
             }

@@ -1,0 +1,118 @@
+//! Whether frames of a sequence share one pattern of noise. Blender draws every frame with the same random numbers unless
+//! the seed is animated: the noise then sticks to the screen while things move beneath it, and no frame can clean another.
+//!
+//! In: passes of consecutive frames. Out: a warning that names the setting.
+
+use crate::{
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// The noise of a frame, as far as it shows: by how much the light of each pixel differs from the mean of those around it,
+/// relative; NaN where that may be texture or an edge.
+pub struct Grain {
+    width: usize,
+    values: Vec<f32>,
+}
+
+/// Guides whose 3x3 pixels differ by more than this show texture or an edge.
+const FLAT: f32 = 0.05;
+
+/// Differences are cut at this: a firefly would decide alone.
+const LARGEST: f32 = 1.0;
+
+/// With a smaller root mean square, what differs is as likely to be detail of the light.
+const LEAST: f64 = 0.03;
+
+/// Fewer pixels tell nothing.
+const PIXELS: usize = 500;
+
+/// Noise of which more than this is the same in two frames is shared; of frames of their own seeds some thousandths are.
+const SHARED: f64 = 0.2;
+
+impl Grain {
+    /// Of a view layer's passes; none without Combined or anything to tell texture by.
+    pub fn of(set: &PassSet) -> Option<Self> {
+        let radiance = set.get(Pass::NoisyImage).or_else(|| set.get(Pass::Combined))?;
+        let guides: Vec<&Planes> =
+            [Pass::DenoisingAlbedo, Pass::DenoisingNormal].iter().filter_map(|pass| set.get(*pass)).collect();
+        let (width, height) = (set.width, set.height);
+        if guides.is_empty() || width < 3 || height < 3 {
+            return None;
+        }
+        let around = |at: usize| [at - width, at - 1, at + 1, at + width];
+        let light = |at: usize| (0..3).map(|c| radiance.channel(c)[at].max(0.0)).sum::<f32>();
+        let is_flat = |at: usize| {
+            guides.iter().all(|guide| {
+                (0..3).all(|c| {
+                    let plane = guide.channel(c);
+                    around(at).iter().all(|other| (plane[*other] - plane[at]).abs() < FLAT)
+                })
+            })
+        };
+        let is_inside =
+            |at: usize| (1..width - 1).contains(&(at % width)) && (1..height - 1).contains(&(at / width));
+        let value = |at: usize| {
+            if !is_inside(at) || !is_flat(at) {
+                return f32::NAN;
+            }
+            let mean = around(at).map(light).iter().sum::<f32>() / 4.0;
+            // Beside black, and where values are not finite, it is no number.
+            if mean > 0.0 { (light(at) / mean - 1.0).clamp(-LARGEST, LARGEST) } else { f32::NAN }
+        };
+        let values = (0..width * height).map(value).collect();
+        Some(Self { width, values })
+    }
+
+    /// How much of the noise is that of `other`, at the same places of the screen: 1 is all. None where too little shows.
+    fn shared(&self, other: &Self) -> Option<f64> {
+        if (self.width, self.values.len()) != (other.width, other.values.len()) {
+            return None;
+        }
+        let both = self.values.iter().zip(&other.values).map(|(a, b)| (f64::from(*a), f64::from(*b)));
+        let both: Vec<(f64, f64)> = both.filter(|(a, b)| a.is_finite() && b.is_finite()).collect();
+        let mean = |of: &dyn Fn(&(f64, f64)) -> f64| both.iter().map(of).sum::<f64>() / both.len() as f64;
+        if both.len() < PIXELS {
+            return None;
+        }
+        // Relative differences of positive values are more often small and negative than large and positive.
+        let (a, b) = (mean(&|v| v.0), mean(&|v| v.1));
+        let [of_a, of_b] = [mean(&|v| (v.0 - a).powi(2)), mean(&|v| (v.1 - b).powi(2))];
+        let product = mean(&|v| (v.0 - a) * (v.1 - b));
+        (of_a.min(of_b).sqrt() > LEAST).then(|| product / (of_a * of_b).sqrt())
+    }
+
+    /// What is to be said of a frame whose grain is `other`'s, the frame before it of the name given.
+    pub fn warning(&self, other: &Self, before: &str) -> Option<String> {
+        let shared = self.shared(other).filter(|shared| *shared > SHARED)?;
+        Some(format!(
+            "its noise is that of {before} ({:.0}% the same, at the same places of the screen): frames cannot clean each other. \
+             In Blender, press the clock beside Render Properties > Sampling > Advanced > Seed (Use Animated Seed)",
+            100.0 * shared
+        ))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::Rng;
+
+    /// Passes of a flat wall with noise of a seed.
+    fn grain(seed: u64, amount: f32) -> Grain {
+        let mut rng = Rng::new(seed, 0);
+        let mut set = PassSet::new("x.exr", "", 64, 48);
+        let noise: Vec<f32> = (0..64 * 48).map(|_| 1.0 + amount * (rng.uniform() - 0.5)).collect();
+        set.insert(Pass::Combined, Planes::from_vec(3, 64, 48, [&noise[..], &noise, &noise].concat()));
+        set.insert(Pass::DenoisingAlbedo, Planes::from_vec(3, 64, 48, vec![0.5; 3 * 64 * 48]));
+        Grain::of(&set).unwrap()
+    }
+
+    #[test]
+    fn noise_that_sticks_to_the_screen_is_found() {
+        let warning = grain(1, 1.0).warning(&grain(1, 0.8), "shot.0001.exr").unwrap();
+        assert!(warning.contains("shot.0001.exr") && warning.contains("Seed"), "{warning}");
+        assert_eq!(grain(1, 1.0).warning(&grain(2, 1.0), "shot.0001.exr"), None);
+        assert_eq!(grain(1, 0.01).warning(&grain(1, 0.01), "shot.0001.exr"), None, "too little to tell");
+    }
+}

@@ -1,0 +1,157 @@
+//! Which files are frames of one sequence, by name and number, and the frames around one.
+//!
+//! In: paths. A frame's number is the digits at the end of its name, of any width, as Blender writes it before the
+//! extension: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`. Neighbours are looked for beside a frame whether
+//! they were named or not: what becomes of it depends on what lies there, not on what else is done by the same command.
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use super::Job;
+
+/// What the names of a sequence's frames have in common.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Key {
+    folder: PathBuf,
+    before: String,
+    after: String,
+}
+
+/// A frame's place in its sequence.
+struct Place {
+    key: Key,
+    number: i64,
+}
+
+impl Place {
+    /// Of a file; none where its name ends in no number.
+    fn of(file: &Path) -> Option<Self> {
+        let name = file.file_name()?.to_str()?;
+        let stem = file.file_stem()?.to_str()?;
+        let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+        let digits = &stem[head.len()..];
+        let number: i64 = digits.parse().ok()?;
+        // A minus is the number's where it stands for nothing else: at the beginning or after a dot.
+        let (head, number) = match head.strip_suffix('-') {
+            Some(rest) if rest.is_empty() || rest.ends_with('.') => (rest, -number),
+            _ => (head, number),
+        };
+        let (before, after) = (head.to_owned(), name[stem.len()..].to_owned());
+        Some(Self { key: Key { folder: file.parent()?.to_owned(), before, after }, number })
+    }
+
+    /// All frames of the sequence that lie on disk, by number; of those that share a number, the first by name.
+    fn siblings(&self) -> BTreeMap<i64, PathBuf> {
+        let own = &self.key.folder;
+        let folder = if own.as_os_str().is_empty() { Path::new(".") } else { own };
+        let mut found: BTreeMap<i64, PathBuf> = BTreeMap::new();
+        // A folder that cannot be listed shows no neighbours, and reading the frame itself says why.
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = own.join(entry.file_name());
+            let Some(place) = Self::of(&path).filter(|place| place.key == self.key) else { continue };
+            let at = found.entry(place.number).or_insert_with(|| path.clone());
+            if path < *at {
+                *at = path;
+            }
+        }
+        found
+    }
+}
+
+/// Whether a file is the frame after another, by their names.
+pub fn follows(file: &Path, before: &Path) -> bool {
+    let [Some(place), Some(before)] = [file, before].map(Place::of) else { return false };
+    place.key == before.key && place.number - before.number == 1
+}
+
+/// Jobs of a sequence, by number, or a job alone.
+pub struct Sequence {
+    /// What lies on disk, the jobs' own files at their numbers.
+    pub files: BTreeMap<i64, PathBuf>,
+    /// Index of each job, and its number.
+    pub jobs: Vec<(usize, i64)>,
+    /// Whether its files' names tell a number.
+    pub is_numbered: bool,
+}
+
+/// The sequences that jobs belong to, in the order of their first jobs.
+pub fn group(jobs: &[Job]) -> Vec<Sequence> {
+    let mut sequences: Vec<Sequence> = Vec::new();
+    let mut known: BTreeMap<Key, usize> = BTreeMap::new();
+    for (index, job) in jobs.iter().enumerate() {
+        let place = Place::of(&job.input);
+        let number = place.as_ref().map_or(0, |place| place.number);
+        // Two files of one number, such as 7 and 0007, are frames of two sequences: neither may hide the other.
+        let at = place.as_ref().and_then(|place| known.get(&place.key)).copied();
+        let at = at.filter(|at| sequences[*at].jobs.iter().all(|(_, other)| *other != number));
+        let at = at.unwrap_or_else(|| {
+            let files = place.as_ref().map(Place::siblings).unwrap_or_default();
+            sequences.push(Sequence { files, jobs: Vec::new(), is_numbered: place.is_some() });
+            sequences.len() - 1
+        });
+        sequences[at].jobs.push((index, number));
+        sequences[at].files.insert(number, job.input.clone());
+        if let Some(place) = place {
+            known.insert(place.key, at);
+        }
+    }
+    sequences.iter_mut().for_each(|sequence| sequence.jobs.sort_by_key(|(_, number)| *number));
+    sequences
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn place(file: &str) -> Option<(String, i64)> {
+        Place::of(Path::new(file)).map(|place| (place.key.before, place.number))
+    }
+
+    #[test]
+    fn numbers_of_any_width_end_names() {
+        for (file, expected) in [
+            ("a/shot_0004spp.0017.exr", Some(("shot_0004spp.", 17))),
+            ("shot17.exr", Some(("shot", 17))),
+            ("shot_10017.exr", Some(("shot_", 10017))),
+            ("0001.exr", Some(("", 1))),
+            ("-0003.exr", Some(("", -3))),
+            ("shot.-0003.exr", Some(("shot.", -3))),
+            ("shot-0003.exr", Some(("shot-", 3))),
+            ("bathroom_0004spp.exr", None),
+            ("bathroom.exr", None),
+            ("a99999999999999999999.exr", None),
+        ] {
+            assert_eq!(place(file), expected.map(|(head, number)| (head.into(), number)), "{file}");
+        }
+    }
+
+    #[test]
+    fn jobs_are_sequences_with_all_that_lies_beside_them() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["a.0009.exr", "a.0010.exr", "a.0012.exr", "a.11.exr", "a.012.exr", "b.0010.exr", "c.exr"]
+        {
+            fs::write(dir.path().join(name), "").unwrap();
+        }
+        let job = |name: &str| Job { input: dir.path().join(name), output: PathBuf::new() };
+        let jobs = ["a.0012.exr", "b.0010.exr", "c.exr", "a.0009.exr", "a.012.exr"].map(job);
+        let sequences = group(&jobs);
+        let listed: Vec<_> = sequences
+            .iter()
+            .map(|s| (s.jobs.clone(), s.files.keys().copied().collect::<Vec<_>>(), s.is_numbered))
+            .collect();
+        assert_eq!(
+            listed,
+            [
+                (vec![(3, 9), (0, 12)], vec![9, 10, 11, 12], true),
+                (vec![(1, 10)], vec![10], true),
+                (vec![(2, 0)], vec![0], false),
+                (vec![(4, 12)], vec![9, 10, 11, 12], true),
+            ]
+        );
+        assert!(sequences[0].files[&12].ends_with("a.0012.exr"));
+        assert!(sequences[3].files[&12].ends_with("a.012.exr"));
+    }
+}

@@ -1,0 +1,361 @@
+//! The frames around the one that is denoised, as far as it needs them, and what it makes of them.
+//!
+//! With N frames on each side, what becomes of a frame depends on the inputs of those 2N + 1 alone:
+//! - its render and guides are averaged with those of the frames next to it, and the model denoises that;
+//! - so are frames up to N - 1 away, and these results are averaged with its own.
+//!
+//! No result is made of an earlier one, so any frame can be done anywhere, in any order, to the same bits; in a stream, each
+//! is read and denoised once. Both averages follow the Vector pass, and leave out what does not agree: see
+//! [`agreement`](crate::filters::agreement).
+
+use std::{collections::BTreeMap, time::Instant};
+
+use super::{
+    Denoised, Options, Report, Views,
+    job::{finish, run},
+};
+use crate::{
+    Error, Result,
+    features::exposure,
+    filters::{
+        agreement::{Evidence, Look, TOLERANCES},
+        motion::{Direction, Flow},
+        temporal::{self, Link},
+    },
+    models::Denoiser,
+    passes::{Layer, Pass, PassSet},
+    planes::Planes,
+    shot::Shot,
+};
+
+/// Passes that are of use besides those of a model: motion, and what frames are told apart by.
+pub const PASSES: [Pass; 6] = [
+    Pass::Vector,
+    Pass::DenoisingAlbedo,
+    Pass::DenoisingNormal,
+    Pass::Normal,
+    Pass::DenoisingDepth,
+    Pass::Depth,
+];
+
+/// How many frames away the renders are, at most, that are averaged: of those further away, what no comparison finds costs
+/// more than they bring (docs/decisions.md).
+const RENDERS: usize = 1;
+
+/// Two frames of which less than this share agrees, of all that both show, are of two shots.
+const CUT: f32 = 0.05;
+
+/// Where vectors are zero everywhere and less than this share agrees, things move, and the vectors are missing.
+const STILL: f32 = 0.5;
+
+/// Name of a view layer, and the stereo view.
+type ViewKey = (String, Option<String>);
+
+/// Why a frame stays without a neighbour.
+#[derive(Clone, Debug)]
+enum Gap {
+    /// As a sentence for the user.
+    Said(String),
+    /// It lies beyond one of which it was said.
+    Beyond,
+}
+
+/// One view of a frame.
+struct Moment {
+    shot: Shot,
+    look: Look,
+    /// By how many frames later the neighbour is.
+    links: BTreeMap<i32, Result<Link, Gap>>,
+    /// What the model makes of it and its neighbours' renders.
+    result: Option<Planes>,
+}
+
+/// What is in memory of a file.
+struct Held {
+    /// All but its passes, until it is written; none where only its neighbours are denoised.
+    rest: Option<Views<()>>,
+    moments: BTreeMap<ViewKey, Moment>,
+    /// Why it could not be read.
+    error: Option<Error>,
+}
+
+/// Frames of one sequence, by number, in memory.
+pub struct Window {
+    /// How many frames away the renders are that are averaged, and the results.
+    reaches: [i32; 2],
+    held: BTreeMap<i64, Held>,
+}
+
+impl Window {
+    /// An empty window of so many frames before and after one.
+    pub fn new(reach: usize) -> Self {
+        let renders = reach.min(RENDERS);
+        Self { reaches: [renders, reach - renders].map(|n| n as i32), held: BTreeMap::new() }
+    }
+
+    /// Takes in what was read of a frame, or why it cannot be; `is_written` if it is to be denoised too.
+    pub fn enter(
+        &mut self,
+        number: i64,
+        loaded: Result<Views<Shot>>,
+        is_written: bool,
+        model: &dyn Denoiser,
+    ) {
+        let mut moments = BTreeMap::new();
+        let rest = loaded.and_then(|loaded| {
+            loaded.each(|layer, shot, _| {
+                moments.insert(key(layer), Moment::new(shot, model));
+                Ok(())
+            })
+        });
+        let (rest, error) = match rest {
+            Ok(rest) => (is_written.then_some(rest), None),
+            Err(error) => (None, Some(error)),
+        };
+        self.held.insert(number, Held { rest, moments, error });
+    }
+
+    /// Lets go of frames before one.
+    pub fn leave(&mut self, before: i64) {
+        self.held = self.held.split_off(&before);
+    }
+
+    /// Denoises a frame that has entered to be written, as all that lies around it has.
+    ///
+    /// # Errors
+    /// It could not be read, or the model cannot denoise it.
+    pub fn denoise(
+        &mut self,
+        number: i64,
+        model: &dyn Denoiser,
+        options: &Options,
+    ) -> Result<Views<Denoised>> {
+        let held = self.held.get_mut(&number).expect("a frame enters before it is denoised");
+        if let Some(error) = held.error.take() {
+            return Err(error);
+        }
+        let rest = held.rest.take().expect("it is denoised once");
+        rest.each(|layer, (), report| {
+            let start = Instant::now();
+            let radiance = self.view(number, &key(layer), model, options, report)?;
+            report.seconds = start.elapsed().as_secs_f64();
+            let shot = &self.moment(number, &key(layer)).expect("its views have entered").shot;
+            finish(shot, radiance, model, report)
+        })
+    }
+
+    fn view(
+        &mut self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+        options: &Options,
+        report: &mut Report,
+    ) -> Result<Planes> {
+        let [renders, results] = self.reaches;
+        let neighbours = offsets(results);
+        for offset in offsets(renders.max(results)) {
+            self.connect(number, view, offset);
+        }
+        self.explain(number, view, report);
+        self.infer(number, view, model, options, report)?;
+        let linked: Vec<i32> =
+            neighbours.filter(|offset| self.link(number, view, *offset).is_some()).collect();
+        for &offset in &linked {
+            self.infer(number + i64::from(offset), view, model, options, report)?;
+        }
+        let own = self.moment(number, view).expect("its views have entered");
+        let image = own.result.as_ref().expect("inferred above");
+        let others: Vec<(&Planes, &Link)> = linked
+            .iter()
+            .filter_map(|&offset| {
+                let other = self.moment(number + i64::from(offset), view)?;
+                Some((other.result.as_ref()?, self.link(number, view, offset)?))
+            })
+            .collect();
+        let radiance = own.shot.passes.require(Pass::Combined, model.name())?;
+        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+    }
+
+    /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
+    fn infer(
+        &mut self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+        options: &Options,
+        report: &mut Report,
+    ) -> Result<()> {
+        let [renders, _] = self.reaches;
+        offsets(renders).for_each(|offset| self.connect(number, view, offset));
+        let own = self.moment(number, view).expect("only frames that are there are inferred");
+        if own.result.is_some() {
+            return Ok(());
+        }
+        let others: Vec<(&PassSet, &Link)> = offsets(renders)
+            .filter_map(|offset| {
+                let other = self.moment(number + i64::from(offset), view)?;
+                Some((&other.shot.passes, self.link(number, view, offset)?))
+            })
+            .collect();
+        // Half buffers are the frame's own: a model that holds them against each other reads no average beside them.
+        let image = if others.is_empty() || model.reads_halves() {
+            run(&own.shot, model, options, report)?
+        } else {
+            run(&Shot::new(average(&own.shot.passes, &others)), model, options, report)?
+        };
+        self.moment_mut(number, view).expect("it is there").result = Some(image);
+        Ok(())
+    }
+
+    /// Finds out how a frame and one of its neighbours belong together, unless that is known.
+    fn connect(&mut self, number: i64, view: &ViewKey, offset: i32) {
+        let is_known = self.moment(number, view).is_none_or(|moment| moment.links.contains_key(&offset));
+        if is_known {
+            return;
+        }
+        let link = self.find_link(number, view, offset);
+        if let Some(moment) = self.moment_mut(number, view) {
+            moment.links.insert(offset, link);
+        }
+    }
+
+    fn find_link(&mut self, number: i64, view: &ViewKey, offset: i32) -> Result<Link, Gap> {
+        let (step, direction) = if offset < 0 { (-1, Direction::Back) } else { (1, Direction::Forth) };
+        // What lies further away is reached through what lies nearer.
+        for nearer in 0..offset.abs() - 1 {
+            let from = number + i64::from(step * nearer);
+            self.connect(from, view, step);
+            if self.link(from, view, step).is_none() {
+                return Err(Gap::Beyond);
+            }
+        }
+        let said = |text: String| Err(Gap::Said(text));
+        let there = number + i64::from(offset);
+        let own = self.moment(number, view).expect("links begin at frames that are there");
+        let Some(held) = self.held.get(&there) else {
+            return said(format!("frame {there} is not there"));
+        };
+        if let Some(error) = &held.error {
+            return said(format!("frame {there} cannot be read ({error})"));
+        }
+        let Some(other) = held.moments.get(view) else {
+            return said(format!("frame {there} has no such view layer or view"));
+        };
+        let place = |set: &PassSet| (set.width, set.height, set.origin);
+        if place(&own.shot.passes) != place(&other.shot.passes) {
+            return said(format!("frame {there} is of another size or region"));
+        }
+        let mut flow = Flow::still(own.shot.passes.width, own.shot.passes.height);
+        let mut moves = false;
+        for nearer in 0..offset.abs() {
+            let at = number + i64::from(step * nearer);
+            let vectors = self.moment(at, view).and_then(|moment| moment.shot.passes.get(Pass::Vector));
+            let Some(vectors) = vectors else {
+                let setting = Pass::Vector.blender_setting();
+                return said(format!(
+                    "frame {at} has no pass Vector; {setting}, and Render Properties > Motion Blur off"
+                ));
+            };
+            moves |= vectors.data.iter().any(|v| *v != 0.0);
+            flow.step(vectors, direction);
+        }
+        let weights = own.look.agreement(&other.look, &flow, &TOLERANCES);
+        let (mut sum, mut inside) = (0.0, 0usize);
+        for y in 0..weights.height {
+            let row = &weights.data[y * weights.width..][..weights.width];
+            sum += row.iter().map(|w| f64::from(*w)).sum::<f64>();
+            inside += flow.row(y).0.iter().filter(|x| !x.is_nan()).count();
+        }
+        let share = (sum / inside.max(1) as f64) as f32;
+        if !moves && share < STILL {
+            return said(format!(
+                "frame {there} shows another picture, and Vector is zero everywhere: a cut, or motion blur was on, with \
+                 which Blender writes no vectors (turn off Render Properties > Motion Blur and blur in the compositor, \
+                 or denoise frame by frame)"
+            ));
+        }
+        if share < CUT {
+            return said(format!("frame {there} shows another picture: a cut"));
+        }
+        Ok(Link { flow, weights })
+    }
+
+    /// Says what a frame stays without, where its window is not full.
+    fn explain(&self, number: i64, view: &ViewKey, report: &mut Report) {
+        let Some(moment) = self.moment(number, view) else { return };
+        let gaps = moment.links.values().filter_map(|link| match link {
+            Err(Gap::Said(text)) => Some(text.as_str()),
+            _ => None,
+        });
+        let mut gaps: Vec<&str> = gaps.collect();
+        gaps.dedup();
+        if gaps.is_empty() {
+            return;
+        }
+        let is_alone = moment.links.values().all(Result::is_err);
+        let end = if is_alone { "denoised alone" } else { "denoised with those that are left" };
+        let note = format!("{}; {end}", gaps.join("; "));
+        if !report.notes.contains(&note) {
+            report.notes.push(note);
+        }
+    }
+
+    fn link(&self, number: i64, view: &ViewKey, offset: i32) -> Option<&Link> {
+        self.moment(number, view)?.links.get(&offset)?.as_ref().ok()
+    }
+
+    fn moment(&self, number: i64, view: &ViewKey) -> Option<&Moment> {
+        self.held.get(&number)?.moments.get(view)
+    }
+
+    fn moment_mut(&mut self, number: i64, view: &ViewKey) -> Option<&mut Moment> {
+        self.held.get_mut(&number)?.moments.get_mut(view)
+    }
+}
+
+impl Moment {
+    fn new(mut shot: Shot, model: &dyn Denoiser) -> Self {
+        let set = &shot.passes;
+        let either = |first, second| set.get(first).or_else(|| set.get(second));
+        let look = Look::of(&Evidence {
+            radiance: set.get(Pass::Combined).expect("a frame is not loaded without it"),
+            albedo: set.get(Pass::DenoisingAlbedo),
+            normal: either(Pass::DenoisingNormal, Pass::Normal),
+            depth: either(Pass::DenoisingDepth, Pass::Depth),
+        });
+        // From here on, the model's passes and the motion are all that is needed.
+        let keeps = |pass: &Pass| {
+            *pass == Pass::Vector || [model.passes(), model.optional_passes()].concat().contains(pass)
+        };
+        PASSES.iter().filter(|pass| !keeps(pass)).for_each(|pass| drop(shot.passes.remove(*pass)));
+        Self { shot, look, links: BTreeMap::new(), result: None }
+    }
+}
+
+fn key(layer: &Layer) -> ViewKey {
+    (layer.name.clone(), layer.view.clone())
+}
+
+/// How many frames later neighbours are, nearest first.
+fn offsets(reach: i32) -> impl Iterator<Item = i32> {
+    (1..=reach).flat_map(|n| [-n, n])
+}
+
+/// A frame's passes averaged with those of its neighbours. Places and motion remain its own.
+fn average(own: &PassSet, others: &[(&PassSet, &Link)]) -> PassSet {
+    let size = (own.width, own.height);
+    let mut set = own.map(size, |pass, planes| {
+        if matches!(pass, Pass::Alpha | Pass::Vector | Pass::Depth | Pass::DenoisingDepth | Pass::Position) {
+            return planes.clone();
+        }
+        let of_others: Vec<(&Planes, &Link)> =
+            others.iter().filter_map(|(set, link)| Some((set.get(pass)?, *link))).collect();
+        temporal::merge(planes, &of_others)
+    });
+    set.origin = own.origin;
+    let links: Vec<&Link> = others.iter().map(|(_, link)| *link).collect();
+    let gain = temporal::gain(&links);
+    set.samples = own.samples.map(|samples| (samples as f32 * gain).round() as u32);
+    set
+}

@@ -1,0 +1,257 @@
+//! Where the content of a frame lies in other frames of its sequence, and planes sampled there.
+//!
+//! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with rows counted
+//! downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y + W) one frame later. Steps
+//! chain: each goes on with the vectors of the frame that the one before it ended in. Vectors are those of the surface that
+//! the camera sees first; what mirrors and glass show, and shadows, move otherwise.
+
+use rayon::prelude::*;
+
+use crate::{kernels::memory::PlaneBuffer, planes::Planes};
+
+/// A direction in time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// To the frame before.
+    Back,
+    /// To the frame after.
+    Forth,
+}
+
+/// For every pixel of a frame, where its content lies in another; NaN where that is outside of it.
+#[derive(Clone, Debug)]
+pub struct Flow {
+    width: usize,
+    height: usize,
+    /// Columns, then rows, as many as pixels each: 0 is the centre of the first.
+    at: PlaneBuffer,
+}
+
+/// Half a pixel: frames reach that far beyond the centres of their outermost pixels.
+const MARGIN: f32 = 0.5;
+
+impl Flow {
+    /// From a frame to itself.
+    pub fn still(width: usize, height: usize) -> Self {
+        let at = Planes::from_rows(2, (width, height), |c, y, out| {
+            out.iter_mut().enumerate().for_each(|(x, out)| *out = if c == 0 { x as f32 } else { y as f32 });
+        });
+        Self { width, height, at: at.data }
+    }
+
+    /// Goes on by one frame, from that in which the flow ends, whose `vectors`, (4, H, W), are given.
+    ///
+    /// # Panics
+    /// If the vectors are of another size.
+    pub fn step(&mut self, vectors: &Planes, direction: Direction) {
+        let (width, height) = (self.width, self.height);
+        assert_eq!(
+            (vectors.channels, vectors.width, vectors.height),
+            (4, width, height),
+            "a pass of the frame"
+        );
+        let (right, up, sign) = match direction {
+            Direction::Back => (0, 1, 1.0),
+            Direction::Forth => (2, 3, -1.0),
+        };
+        let (right, up) = (vectors.channel(right), vectors.channel(up));
+        let (columns, rows) = self.at.split_at_mut(width * height);
+        columns.par_iter_mut().zip(rows).with_min_len(width).for_each(|(x, y)| {
+            // The nearest pixel: between two surfaces, a mean of their vectors would lead to neither.
+            let Some(from) = nearest((*x, *y), (width, height)) else { return };
+            *x += sign * right[from];
+            *y -= sign * up[from];
+            if nearest((*x, *y), (width, height)).is_none() {
+                (*x, *y) = (f32::NAN, f32::NAN);
+            }
+        });
+    }
+
+    /// Pixels in a row, and rows.
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
+    /// Columns and rows of the places in one row of pixels.
+    pub fn row(&self, y: usize) -> (&[f32], &[f32]) {
+        let (columns, rows) = self.at.split_at(self.width * self.height);
+        (&columns[y * self.width..][..self.width], &rows[y * self.width..][..self.width])
+    }
+
+    /// Planes of the other frame, between pixels bilinearly, at the place of each pixel of this one; NaN where that is
+    /// outside.
+    ///
+    /// # Panics
+    /// If the planes are of another size.
+    pub fn bilinear(&self, planes: &Planes) -> Planes {
+        assert_eq!((planes.width, planes.height), self.size(), "frames of one size");
+        Planes::from_rows(planes.channels, self.size(), |c, y, out| {
+            let (columns, rows) = self.row(y);
+            let plane = planes.channel(c);
+            for (out, at) in out.iter_mut().zip(columns.iter().zip(rows)) {
+                *out = bilinear(plane, self.size(), (*at.0, *at.1));
+            }
+        })
+    }
+}
+
+/// The index of the pixel at a place, if it is inside of a frame.
+pub fn nearest((x, y): (f32, f32), (width, height): (usize, usize)) -> Option<usize> {
+    let inside = |v: f32, n: usize| v >= -MARGIN && v < n as f32 - MARGIN;
+    (inside(x, width) && inside(y, height)).then(|| {
+        let [column, row] = [(x, width), (y, height)].map(|(v, n)| ((v + MARGIN) as usize).min(n - 1));
+        row * width + column
+    })
+}
+
+/// The value of a plane at a place between its pixels, beyond which the outermost go on; NaN at NaN.
+pub fn bilinear(plane: &[f32], (width, height): (usize, usize), (x, y): (f32, f32)) -> f32 {
+    if x.is_nan() || y.is_nan() {
+        return f32::NAN;
+    }
+    let (left, right, across) = between(x, width);
+    let (above, below, down) = between(y, height);
+    let row = |y: usize| {
+        let (a, b) = (plane[y * width + left], plane[y * width + right]);
+        a + (b - a) * across
+    };
+    let (a, b) = (row(above), row(below));
+    a + (b - a) * down
+}
+
+/// The two of `n` that a place lies between, and how far it is from the first.
+fn between(v: f32, n: usize) -> (usize, usize, f32) {
+    let v = v.clamp(0.0, (n - 1) as f32);
+    let first = v as usize;
+    (first, (first + 1).min(n - 1), v - first as f32)
+}
+
+/// As [`bilinear`], of three planes and as sharp as they are: by the cubic spline of Catmull and Rom, kept between the
+/// least and the greatest of the four pixels around so that edges don't ring.
+pub fn sharp(planes: &Planes, (x, y): (f32, f32)) -> [f32; 3] {
+    let (width, height) = (planes.width, planes.height);
+    let (columns, across) = spline(x, width);
+    let (rows, down) = spline(y, height);
+    [0, 1, 2].map(|c| {
+        let plane = planes.channel(c);
+        let (mut sum, mut least, mut greatest) = (0.0, f32::INFINITY, f32::NEG_INFINITY);
+        for (j, (&row, down)) in rows.iter().zip(down).enumerate() {
+            let line = &plane[row * width..][..width];
+            let values = columns.map(|column| line[column]);
+            sum += down * values.iter().zip(across).map(|(value, weight)| value * weight).sum::<f32>();
+            if j == 1 || j == 2 {
+                least = least.min(values[1]).min(values[2]);
+                greatest = greatest.max(values[1]).max(values[2]);
+            }
+        }
+        sum.clamp(least, greatest)
+    })
+}
+
+/// The four of `n` around a place, and their weights.
+fn spline(v: f32, n: usize) -> ([usize; 4], [f32; 4]) {
+    let v = v.clamp(0.0, (n - 1) as f32);
+    let first = v as usize;
+    let t = v - first as f32;
+    let at = [0, 1, 2, 3].map(|i| (first + i).saturating_sub(1).min(n - 1));
+    let (squared, cubed) = (t * t, t * t * t);
+    let weights = [
+        -0.5 * t + squared - 0.5 * cubed,
+        1.0 - 2.5 * squared + 1.5 * cubed,
+        0.5 * t + 2.0 * squared - 1.5 * cubed,
+        -0.5 * squared + 0.5 * cubed,
+    ];
+    (at, weights)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: (usize, usize) = (24, 17);
+
+    /// A smooth picture, (3, H, W), moved right by `dx` and down by `dy` pixels.
+    fn picture((dx, dy): (f32, f32)) -> Planes {
+        Planes::from_rows(3, SIZE, |c, y, out| {
+            for (x, out) in out.iter_mut().enumerate() {
+                let (x, y) = (x as f32 - dx, y as f32 - dy);
+                *out = 1.0 + 0.5 * (0.3 * x + c as f32).sin() * (0.25 * y).cos();
+            }
+        })
+    }
+
+    /// The Vector pass of a picture that moves right by `dx` and down by `dy` pixels a frame.
+    fn vectors((dx, dy): (f32, f32)) -> Planes {
+        // It was at (x - dx, y - dy): X = -dx, Y = dy; it will be at (x + dx, y + dy): Z = -dx, W = dy.
+        let values = [-dx, dy, -dx, dy];
+        Planes::from_rows(4, SIZE, |c, _, out| out.fill(values[c]))
+    }
+
+    #[test]
+    fn flows_follow_the_vectors_of_cycles_both_ways_and_chain() {
+        let motion = (1.5, -0.75);
+        for (direction, sign) in [(Direction::Back, -1.0), (Direction::Forth, 1.0)] {
+            for frames in [1, 2] {
+                let mut flow = Flow::still(SIZE.0, SIZE.1);
+                (0..frames).for_each(|_| flow.step(&vectors(motion), direction));
+                let by = sign * frames as f32;
+                let other = picture((by * motion.0, by * motion.1));
+                let (mut inside, here) = (0, picture((0.0, 0.0)));
+                let sampled = flow.bilinear(&other);
+                for y in 1..SIZE.1 - 1 {
+                    let (columns, rows) = flow.row(y);
+                    for x in 1..SIZE.0 - 1 {
+                        let (i, at) = (y * SIZE.0 + x, (columns[x], rows[x]));
+                        // Splines need two pixels more around them.
+                        let deep = |v: f32, n: usize| v > 1.0 && v < n as f32 - 2.0;
+                        if !(deep(at.0, SIZE.0) && deep(at.1, SIZE.1)) {
+                            continue;
+                        }
+                        inside += 1;
+                        for (c, sharp) in sharp(&other, at).into_iter().enumerate() {
+                            let want = here.channel(c)[i];
+                            assert!((sampled.channel(c)[i] - want).abs() < 0.015, "{direction:?} {x} {y}");
+                            assert!((sharp - want).abs() < 0.015, "{direction:?} {x} {y}");
+                        }
+                    }
+                }
+                assert!(inside > 200, "{inside}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_leaves_the_frame_stays_away() {
+        let mut flow = Flow::still(SIZE.0, SIZE.1);
+        flow.step(&vectors((30.0, 0.0)), Direction::Forth);
+        flow.step(&vectors((-30.0, 0.0)), Direction::Forth);
+        assert!(flow.bilinear(&picture((0.0, 0.0))).data.iter().all(|v| v.is_nan()));
+        assert_eq!(nearest((-0.5, 0.0), SIZE), Some(0));
+        assert_eq!(nearest((23.4, 16.4), SIZE), Some(SIZE.0 * SIZE.1 - 1));
+        for outside in [(-0.6, 0.0), (0.0, -0.6), (23.5, 0.0), (0.0, 16.5), (f32::NAN, 0.0)] {
+            assert_eq!(nearest(outside, SIZE), None, "{outside:?}");
+        }
+    }
+
+    #[test]
+    fn a_spline_keeps_what_lies_on_pixels_and_does_not_ring() {
+        let step = Planes::from_rows(3, SIZE, |_, _, out| {
+            out.iter_mut().enumerate().for_each(|(x, out)| *out = if x < 12 { 0.0 } else { 1.0 });
+        });
+        for x in 0..4 * (SIZE.0 - 1) {
+            let x = x as f32 / 4.0;
+            let [value, ..] = sharp(&step, (x, 5.0));
+            assert!((0.0..=1.0).contains(&value), "{value}");
+            if x.fract() == 0.0 {
+                assert_eq!(value, if x < 12.0 { 0.0 } else { 1.0 });
+            }
+        }
+    }
+
+    #[test]
+    fn frames_of_one_pixel_are_sampled() {
+        let one = Planes::from_vec(3, 1, 1, vec![1.0, 2.0, 3.0]);
+        assert_eq!(sharp(&one, (0.3, -0.2)), [1.0, 2.0, 3.0]);
+        assert_eq!(bilinear(one.channel(1), (1, 1), (0.3, 0.4)), 2.0);
+    }
+}

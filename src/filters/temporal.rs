@@ -1,0 +1,247 @@
+//! Averages over frames of a sequence, along motion and weighted by [agreement](super::agreement): before a denoiser, of
+//! what was rendered, and after it, of what was denoised.
+//!
+//! In: planes of a frame and of its neighbours. Out: the frame's, less noisy and steadier. Sums run in the order of the
+//! neighbours: the same window gives the same bits.
+
+use super::motion::{Flow, nearest, sharp};
+use crate::planes::Planes;
+
+/// What is known of a neighbour of a frame: where its content lies there, and how far to believe it.
+#[derive(Clone, Debug)]
+pub struct Link {
+    /// From each pixel of the frame.
+    pub flow: Flow,
+    /// From 0 to 1, (1, H, W).
+    pub weights: Planes,
+}
+
+/// The weight in a merger of a neighbour that agrees entirely: what no comparison finds costs less than at 1.
+const TRUST: f32 = 0.7;
+
+/// Exposed radiance that is added to what is denoised before differences are divided by it.
+const FLOOR: f32 = 0.02;
+
+/// Two results agree where the square of their relative difference, averaged over 3x3 pixels before it is squared, is
+/// below this, or below this share of the noise: the mean squared relative difference of render and result over 7x7.
+const SAME: f32 = 0.002;
+const NOISE_SHARE: f32 = 0.08;
+
+/// In units of the above, how much larger a difference makes the weight smaller by e.
+const DIFFERENT: f32 = 2.0;
+
+/// Squared relative differences of render and result count no more than this: one firefly is not the noise around it.
+const LARGEST: f32 = 4.0;
+
+/// Pixels on each side over which differences, and noise, are averaged.
+const REACH_OF_DIFFERENCE: usize = 1;
+const REACH_OF_NOISE: usize = 3;
+
+/// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the nearest one:
+/// noise stays the noise of single pixels, as denoisers know it, and is not smeared.
+///
+/// # Panics
+/// If sizes differ.
+pub fn merge(own: &Planes, neighbours: &[(&Planes, &Link)]) -> Planes {
+    let size = (own.width, own.height);
+    for (planes, link) in neighbours {
+        assert!((planes.width, planes.height) == size && link.flow.size() == size, "frames of one size");
+        assert_eq!(planes.channels, own.channels, "planes of one pass");
+    }
+    Planes::from_rows(own.channels, size, |c, y, out| {
+        out.copy_from_slice(&own.channel(c)[y * size.0..][..size.0]);
+        let of_neighbours: Vec<_> = neighbours
+            .iter()
+            .map(|(planes, link)| {
+                (planes.channel(c), link.flow.row(y), &link.weights.data[y * size.0..][..size.0])
+            })
+            .collect();
+        for (x, out) in out.iter_mut().enumerate() {
+            let mut sum = 1.0;
+            for (plane, (columns, rows), weights) in &of_neighbours {
+                let weight = weights[x];
+                if weight > 0.0
+                    && let Some(there) = nearest((columns[x], rows[x]), size)
+                {
+                    *out += TRUST * weight * plane[there];
+                    sum += TRUST * weight;
+                }
+            }
+            *out /= sum;
+        }
+    })
+}
+
+/// How many times as many samples as its own a frame has after [`merge`], on average over its pixels.
+pub fn gain(links: &[&Link]) -> f32 {
+    let mean = |link: &&Link| {
+        let sum: f64 = link.weights.data.iter().map(|w| f64::from(*w)).sum();
+        sum / link.weights.pixels().max(1) as f64
+    };
+    1.0 + TRUST * links.iter().map(mean).sum::<f64>() as f32
+}
+
+/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, where these agree within what
+/// denoising leaves of the noise. `radiance` is the frame as rendered, `exposure` what brings it to middle grey.
+///
+/// # Panics
+/// If sizes differ.
+pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&Planes, &Link)]) -> Planes {
+    let size = (image.width, image.height);
+    assert!((radiance.width, radiance.height) == size, "a frame and its denoised image");
+    if neighbours.is_empty() {
+        return image.clone();
+    }
+    let floor = FLOOR / exposure;
+    let row = |planes: &'_ Planes, c: usize, y: usize| c * planes.pixels() + y * size.0;
+    let noise = box_mean(
+        &Planes::from_rows(1, size, |_, y, out| {
+            out.fill(0.0);
+            for c in 0..3 {
+                let image = &image.data[row(image, c, y)..][..size.0];
+                let rendered = &radiance.data[row(radiance, c, y)..][..size.0];
+                for (out, (image, rendered)) in out.iter_mut().zip(image.iter().zip(rendered)) {
+                    let relative = (rendered.max(0.0) - image) / (image.max(0.0) + floor);
+                    *out += (relative * relative).min(LARGEST) * (1.0 / 3.0);
+                }
+            }
+        }),
+        REACH_OF_NOISE,
+    );
+    let mut mean = image.clone();
+    let mut sums = Planes::from_rows(1, size, |_, _, out| out.fill(1.0));
+    for (other, link) in neighbours {
+        assert!((other.width, other.height) == size && link.flow.size() == size, "frames of one size");
+        let there = fetch(image, other, link);
+        let apart = box_mean(
+            &Planes::from_rows(3, size, |c, y, out| {
+                let image = &image.data[row(image, c, y)..][..size.0];
+                let there = &there.data[row(&there, c, y)..][..size.0];
+                for (out, (image, there)) in out.iter_mut().zip(image.iter().zip(there)) {
+                    *out = (there - image) / (image.max(0.0) + floor);
+                }
+            }),
+            REACH_OF_DIFFERENCE,
+        );
+        let weights = Planes::from_rows(1, size, |_, y, out| {
+            let lines = [0, 1, 2].map(|c| &apart.data[row(&apart, c, y)..][..size.0]);
+            let (noise, weights) = (&noise.data[y * size.0..], &link.weights.data[y * size.0..]);
+            for (x, out) in out.iter_mut().enumerate() {
+                let squared = lines.iter().map(|line| line[x] * line[x]).sum::<f32>() * (1.0 / 3.0);
+                let unlike = (squared / (SAME + NOISE_SHARE * noise[x]) - 1.0).max(0.0) / DIFFERENT;
+                *out = if weights[x] > 0.0 { weights[x] * (-unlike).exp() } else { 0.0 };
+            }
+        });
+        mean = Planes::from_rows(3, size, |c, y, out| {
+            let at = row(&mean, c, y);
+            let both = mean.data[at..].iter().zip(&there.data[at..]).zip(&weights.data[y * size.0..]);
+            out.iter_mut().zip(both).for_each(|(out, ((sum, there), weight))| *out = sum + weight * there);
+        });
+        sums.data.iter_mut().zip(&weights.data).for_each(|(sum, weight)| *sum += weight);
+    }
+    Planes::from_rows(3, size, |c, y, out| {
+        let both = mean.data[row(&mean, c, y)..].iter().zip(&sums.data[y * size.0..]);
+        out.iter_mut().zip(both).for_each(|(out, (mean, sum))| *out = mean / sum);
+    })
+}
+
+/// The neighbour's image at the places where the content of the frame lies in it; the frame's own where nothing agrees.
+fn fetch(own: &Planes, other: &Planes, link: &Link) -> Planes {
+    let (width, height) = link.flow.size();
+    // Rows of all three channels at once, (H, C, W): their places are the same.
+    let lines = Planes::from_rows(1, (3 * width, height), |_, y, out| {
+        let (columns, rows) = link.flow.row(y);
+        for x in 0..width {
+            let at = y * width + x;
+            let colours = if link.weights.data[at] > 0.0 {
+                sharp(other, (columns[x], rows[x]))
+            } else {
+                [0, 1, 2].map(|c| own.channel(c)[at])
+            };
+            colours.into_iter().enumerate().for_each(|(c, colour)| out[c * width + x] = colour);
+        }
+    });
+    Planes::from_rows(3, (width, height), |c, y, out| {
+        out.copy_from_slice(&lines.data[(3 * y + c) * width..][..width]);
+    })
+}
+
+/// The mean over the pixels of the frame that are at most `reach` rows and columns away.
+fn box_mean(planes: &Planes, reach: usize) -> Planes {
+    let (width, height) = (planes.width, planes.height);
+    let span = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
+    let down = Planes::from_rows(planes.channels, (width, height), |c, y, out| {
+        out.fill(0.0);
+        let rows = span(y, height);
+        let share = 1.0 / rows.len() as f32;
+        for row in rows {
+            let line = &planes.channel(c)[row * width..][..width];
+            out.iter_mut().zip(line).for_each(|(sum, v)| *sum += share * v);
+        }
+    });
+    Planes::from_rows(planes.channels, (width, height), |c, y, out| {
+        let line = &down.channel(c)[y * width..][..width];
+        for (x, out) in out.iter_mut().enumerate() {
+            let near = &line[span(x, width)];
+            *out = near.iter().sum::<f32>() / near.len() as f32;
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{filters::motion::Direction, nn::Rng};
+
+    const SIZE: (usize, usize) = (40, 30);
+
+    fn grey(value: impl Fn(usize, usize) -> f32 + Sync) -> Planes {
+        Planes::from_rows(3, SIZE, |_, y, out| {
+            out.iter_mut().enumerate().for_each(|(x, out)| *out = value(x, y));
+        })
+    }
+
+    /// A link along a motion of whole pixels to the right, trusted everywhere inside.
+    fn link(right: f32, weight: f32) -> Link {
+        let mut flow = Flow::still(SIZE.0, SIZE.1);
+        flow.step(
+            &Planes::from_rows(4, SIZE, |c, _, out| out.fill(if c == 2 { -right } else { 0.0 })),
+            Direction::Forth,
+        );
+        let weights = Planes::from_rows(1, SIZE, |_, y, out| {
+            let columns = flow.row(y).0;
+            out.iter_mut().zip(columns).for_each(|(out, x)| *out = if x.is_nan() { 0.0 } else { weight });
+        });
+        Link { flow, weights }
+    }
+
+    #[test]
+    fn merging_follows_the_motion_and_the_weights() {
+        let own = grey(|x, y| (x + 2 * y) as f32);
+        let moved = grey(|x, y| x as f32 - 3.0 + 2.0 * y as f32 + 1.0);
+        let merged = merge(&own, &[(&moved, &link(3.0, 0.5))]);
+        for x in 0..SIZE.0 {
+            // One brighter, at half the weight; what leaves the frame is left as it was.
+            let weight = if x + 3 < SIZE.0 { TRUST * 0.5 } else { 0.0 };
+            let more = weight / (1.0 + weight);
+            assert!((merged.channel(1)[x] - x as f32 - more).abs() < 1e-4, "{x}");
+        }
+        assert_eq!(merge(&own, &[]), own);
+        let gain = gain(&[&link(0.0, 0.5), &link(20.0, 1.0)]);
+        assert!((gain - 1.0 - TRUST).abs() < 1e-3, "{gain}");
+    }
+
+    #[test]
+    fn results_that_agree_are_averaged_and_others_left_out() {
+        let mut rng = Rng::new(3, 0);
+        let noise: Vec<f32> = (0..SIZE.0 * SIZE.1).map(|_| rng.uniform()).collect();
+        let radiance = grey(|x, y| 0.6 * noise[y * SIZE.0 + x]);
+        let image = grey(|_, _| 0.3);
+        let link = link(0.0, 1.0);
+        let near = blend(&image, &radiance, 0.6, &[(&grey(|_, _| 0.31), &link)]);
+        assert!(near.data.iter().all(|v| (v - 0.305).abs() < 1e-4), "{}", near.data[0]);
+        let far = blend(&image, &radiance, 0.6, &[(&grey(|_, _| 0.9), &link)]);
+        assert!(far.data.iter().all(|v| (v - 0.3).abs() < 1e-3), "{}", far.data[0]);
+        assert_eq!(blend(&image, &radiance, 0.6, &[]), image);
+    }
+}

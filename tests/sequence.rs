@@ -1,0 +1,382 @@
+//! `demc denoise --temporal` on small sequences of a textured wall that moves by known vectors: what neighbours give, what a
+//! result depends on, and what is said where a neighbour is of no use. And the metric of flicker against numpy.
+//!
+//! The method is `noisy`, which returns its input: what is tested is what is made of it over time.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command as Process,
+};
+
+use assert_cmd::Command;
+use common::{
+    files::{bits, read_exr, samples, values},
+    python,
+};
+use demc::{
+    metrics::flicker::{Pair, flicker},
+    planes::Planes,
+};
+use exr::prelude::*;
+use predicates::{prelude::*, str::contains};
+use tempfile::TempDir;
+
+const SIZE: (usize, usize) = (48, 36);
+
+/// How a frame is made.
+#[derive(Clone, Copy)]
+struct Shot {
+    /// Pixels to the right that the wall moves by in a frame.
+    speed: f32,
+    /// Whether the Vector pass is written.
+    vectors: bool,
+    /// What vectors are multiplied by.
+    vector_scale: f32,
+    /// Another number is another wall, in front of another camera.
+    scene: u32,
+    size: (usize, usize),
+    /// Of the noise.
+    seed: u32,
+    /// Light from column `shadow + 3 * frame` on is a third.
+    shadow: Option<f32>,
+}
+
+const SHOT: Shot =
+    Shot { speed: 2.0, vectors: true, vector_scale: 1.0, scene: 0, size: SIZE, seed: 1, shadow: None };
+
+/// A number from 0 to 1 that depends on all of `parts`.
+fn random(parts: [u32; 3]) -> f32 {
+    let mix = |hash: u32, part: u32| {
+        (hash ^ part).wrapping_mul(0x85eb_ca6b).rotate_left(13).wrapping_mul(0xc2b2_ae35)
+    };
+    let hash = parts.into_iter().fold(0x9e37_79b9, mix);
+    ((hash ^ (hash >> 15)) >> 8) as f32 / (1 << 24) as f32
+}
+
+impl Shot {
+    /// Colour of the wall at a pixel of a frame.
+    fn albedo(&self, c: usize, (x, y): (f32, f32), frame: i64) -> f32 {
+        let x = x - self.speed * frame as f32;
+        let phase = c as f32 + 2.0 * self.scene as f32;
+        0.5 + 0.3 * (0.25 * x + phase).sin() * (0.3 * y + 1.7 * self.scene as f32).cos()
+    }
+
+    fn light(&self, x: f32, frame: i64) -> f32 {
+        match self.shadow {
+            Some(edge) if x > edge + 3.0 * frame as f32 => 0.3,
+            _ => 0.9,
+        }
+    }
+
+    /// Combined without noise.
+    fn truth(&self, c: usize, i: usize, frame: i64) -> f32 {
+        let place = ((i % self.size.0) as f32, (i / self.size.0) as f32);
+        self.light(place.0, frame) * self.albedo(c, place, frame)
+    }
+
+    fn noise(&self, i: usize, frame: i64) -> f32 {
+        0.2 + 1.6 * random([self.seed, frame as u32, i as u32])
+    }
+
+    /// The channels of a view layer, or of one stereo view of it.
+    fn channels(&self, layer: &str, view: &str, frame: i64) -> Vec<AnyChannel<FlatSamples>> {
+        let pixels = self.size.0 * self.size.1;
+        let mut list = Vec::new();
+        let mut add = |pass: &str, component: &str, value: &dyn Fn(usize) -> f32| {
+            let samples = FlatSamples::F32((0..pixels).map(value).collect());
+            list.push(AnyChannel::new(format!("{layer}.{pass}.{view}{component}").as_str(), samples));
+        };
+        for (c, name) in ["R", "G", "B"].into_iter().enumerate() {
+            add("Combined", name, &|i| self.truth(c, i, frame) * self.noise(i, frame));
+            add("Denoising Albedo", name, &|i| {
+                self.albedo(c, ((i % self.size.0) as f32, (i / self.size.0) as f32), frame)
+            });
+        }
+        for (name, value) in [("X", 0.0), ("Y", 0.6 * self.scene as f32), ("Z", 1.0)] {
+            add("Denoising Normal", name, &|_| value);
+        }
+        add("Denoising Depth", "Z", &|_| 5.0 + 3.0 * self.scene as f32);
+        if self.vectors {
+            let speed = -self.speed * self.vector_scale;
+            for (name, value) in [("X", speed), ("Y", 0.0), ("Z", speed), ("W", 0.0)] {
+                add("Vector", name, &|_| value);
+            }
+        }
+        list
+    }
+
+    fn write(&self, path: &Path, frame: i64) {
+        write_channels(path, self.size, self.channels("ViewLayer", "", frame), &[]);
+    }
+
+    /// The mean squared error of a result away from the borders, where neighbours show as much as the frame.
+    fn error(&self, result: &Path, layer: &str, frame: i64) -> f32 {
+        let image = read_exr(result);
+        let (w, h) = self.size;
+        let (mut sum, mut count) = (0.0, 0.0);
+        for (c, name) in ["R", "G", "B"].into_iter().enumerate() {
+            let got = values(&image, &format!("{layer}.{name}"));
+            for i in (0..w * h).filter(|i| (8..w - 8).contains(&(i % w))) {
+                sum += (got[i] - self.truth(c, i, frame)).powi(2);
+                count += 1.0;
+            }
+        }
+        sum / count
+    }
+}
+
+fn write_channels(path: &Path, size: (usize, usize), list: Vec<AnyChannel<FlatSamples>>, views: &[&str]) {
+    let mut attributes = LayerAttributes::default();
+    if !views.is_empty() {
+        attributes.multi_view_names = Some(views.iter().map(|view| Text::from(*view)).collect());
+    }
+    let channels = AnyChannels::sort(list.into_iter().collect());
+    let layer = Layer::new(size, attributes, Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}
+
+/// A folder with `shot_0004spp.NNNN.exr` of these numbers.
+fn sequence(shot: Shot, numbers: std::ops::RangeInclusive<i64>) -> TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    numbers.for_each(|number| shot.write(&named(&dir, number), number));
+    dir
+}
+
+fn named(dir: &TempDir, number: i64) -> PathBuf {
+    dir.path().join(format!("shot_0004spp.{number:04}.exr"))
+}
+
+fn demc(out: &Path) -> Command {
+    let mut command = Command::cargo_bin("demc").unwrap();
+    command.args(["denoise", "--model", "noisy", "--out"]).arg(out);
+    command
+}
+
+/// Where a frame's result lies.
+fn result(out: &Path, number: i64) -> PathBuf {
+    out.join(format!("shot_0004spp.{number:04}.exr"))
+}
+
+/// The bits of a result.
+fn denoised(out: &Path, number: i64) -> Vec<Vec<u32>> {
+    let image = read_exr(result(out, number));
+    ["R", "G", "B"].map(|c| bits(samples(&image, &format!("ViewLayer.Denoised.{c}")).unwrap())).into()
+}
+
+#[test]
+fn neighbours_take_noise_away_along_the_motion() {
+    for shot in [SHOT, Shot { speed: -1.0, ..SHOT }, Shot { speed: 0.0, ..SHOT }] {
+        let dir = sequence(shot, 1..=5);
+        let (alone, with) = (dir.path().join("alone"), dir.path().join("with"));
+        demc(&alone).arg(dir.path()).assert().success();
+        let mut before = shot.error(&result(&alone, 3), "ViewLayer.Denoised", 3);
+        // Further away, frames add their results alone, not their renders.
+        for (reach, share) in [("1", 0.9), ("2", 0.9), ("3", 0.95)] {
+            demc(&with).arg(dir.path()).args(["--overwrite", "--temporal", reach]).assert().success();
+            let error = shot.error(&result(&with, 3), "ViewLayer.Denoised", 3);
+            assert!(error < share * before, "{reach} each side: {error} after {before}");
+            before = error;
+        }
+        // Two on each side without a number.
+        let two = dir.path().join("two");
+        demc(&two).arg(dir.path()).arg("--temporal").assert().success();
+        demc(&with).arg(dir.path()).args(["--overwrite", "--temporal", "2"]).assert().success();
+        (1..=5).for_each(|frame| assert_eq!(denoised(&two, frame), denoised(&with, frame)));
+    }
+}
+
+#[test]
+fn a_result_is_the_same_bits_in_any_order_alone_and_resumed() {
+    let dir = sequence(SHOT, 8..=13);
+    let [whole, other] = ["whole", "other"].map(|name| dir.path().join(name));
+    demc(&whole).arg(dir.path()).arg("--temporal").assert().success();
+    let same = |what: &str| {
+        (8..=13).for_each(|n| assert_eq!(denoised(&whole, n), denoised(&other, n), "{what}, frame {n}"));
+    };
+    // Each by itself, as a farm would, on other threads; its neighbours are found beside it.
+    for n in [12, 8, 13, 10, 9, 11] {
+        demc(&other).arg(named(&dir, n)).args(["--temporal", "--threads", "1"]).assert().success();
+    }
+    same("one by one");
+    fs::remove_dir_all(&other).unwrap();
+    demc(&other).args([13, 9, 11, 8, 12, 10].map(|n| named(&dir, n))).arg("--temporal").assert().success();
+    same("in another order");
+    for gone in [9, 10, 13] {
+        fs::remove_file(result(&other, gone)).unwrap();
+    }
+    let resumed = demc(&other).arg(dir.path()).arg("--temporal").assert().success();
+    resumed.stdout(contains("3 denoised, 3 already there"));
+    same("resumed");
+}
+
+#[test]
+fn a_result_depends_on_its_window_alone() {
+    let dir = sequence(SHOT, 1..=7);
+    let [first, second] = ["first", "second"].map(|name| dir.path().join(name));
+    demc(&first).arg(dir.path()).arg("--temporal").assert().success();
+    Shot { seed: 9, ..SHOT }.write(&named(&dir, 6), 6);
+    demc(&second).arg(dir.path()).arg("--temporal").assert().success();
+    for n in 1..=7 {
+        assert_eq!(denoised(&first, n) == denoised(&second, n), n < 4, "frame {n}");
+    }
+}
+
+#[test]
+fn ends_gaps_and_frames_that_do_not_fit_are_told() {
+    let dir = sequence(SHOT, 9..=11);
+    let out = dir.path().join("out");
+    // 12 is of another size; 14 and 15 are of another shot; 16 is missing, 17 no EXR, 19 has nobody.
+    Shot { size: (40, 36), ..SHOT }.write(&named(&dir, 12), 12);
+    SHOT.write(&named(&dir, 13), 13);
+    let cut = Shot { scene: 1, ..SHOT };
+    [14, 15].into_iter().for_each(|n| cut.write(&named(&dir, n), n));
+    fs::write(named(&dir, 17), "no EXR").unwrap();
+    cut.write(&named(&dir, 19), 19);
+    let assert = demc(&out).arg(dir.path()).arg("--temporal").assert().code(1);
+    let text = String::from_utf8(assert.get_output().stderr.clone()).unwrap();
+    let of = |n: i64| -> String {
+        let name = format!("note: {}", named(&dir, n).display());
+        text.lines().filter(|line| line.contains(&name)).collect()
+    };
+    for (n, parts) in [
+        (9, vec!["frame 8 is not there", "with those that are left"]),
+        (11, vec!["frame 12 is of another size", "with those that are left"]),
+        (12, vec!["frame 11 is of another size", "frame 13 is of another size", "alone"]),
+        (13, vec!["frame 12 is of another size", "frame 14 shows another picture: a cut", "alone"]),
+        (14, vec!["frame 13 shows another picture: a cut", "with those that are left"]),
+        (15, vec!["frame 16 is not there"]),
+        (19, vec!["frame 18 is not there", "frame 20 is not there", "alone"]),
+    ] {
+        parts.iter().for_each(|part| assert!(of(n).contains(part), "frame {n}, '{part}': {text}"));
+    }
+    assert_eq!(of(10), "", "its window is full: {text}");
+    assert!(text.contains("0017.exr"), "{text}");
+    // What is alone is as without the option.
+    let alone = dir.path().join("alone");
+    demc(&alone).arg(dir.path()).assert().code(1);
+    [12, 13, 19].into_iter().for_each(|n| assert_eq!(denoised(&out, n), denoised(&alone, n), "frame {n}"));
+    // A neighbour that cannot be read.
+    cut.write(&named(&dir, 18), 18);
+    let assert = demc(&out).arg(named(&dir, 18)).arg("--temporal").assert().success();
+    assert.stderr(contains("frame 17 cannot be read"));
+}
+
+#[test]
+fn frames_without_vectors_are_done_alone_and_blender_is_told_how() {
+    for (shot, said) in [
+        (
+            Shot { vectors: false, ..SHOT },
+            "no pass Vector; turn on View Layer Properties > Passes > Data > Vector",
+        ),
+        (Shot { vector_scale: 0.0, speed: 9.0, ..SHOT }, "turn off Render Properties > Motion Blur"),
+    ] {
+        let dir = sequence(shot, 1..=3);
+        let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+        demc(&alone).arg(dir.path()).assert().success();
+        let assert = demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+        assert.stderr(contains(said).and(contains("denoised alone")));
+        (1..=3).for_each(|n| assert_eq!(denoised(&out, n), denoised(&alone, n), "{said}"));
+    }
+}
+
+#[test]
+fn a_shadow_that_vectors_do_not_know_is_not_dragged() {
+    let shot = Shot { speed: 0.0, shadow: Some(10.0), ..SHOT };
+    let dir = sequence(shot, 1..=5);
+    let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+    demc(&alone).arg(dir.path()).assert().success();
+    demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+    for n in 1..=5 {
+        let [with, without] = [&out, &alone].map(|dir| shot.error(&result(dir, n), "ViewLayer.Denoised", n));
+        assert!(with < 0.7 * without, "frame {n}: {with} beside {without}");
+    }
+}
+
+#[test]
+fn view_layers_and_stereo_views_follow_their_own_vectors() {
+    let [left, right] = [SHOT, Shot { speed: -3.0, seed: 5, ..SHOT }];
+    let dir = tempfile::tempdir().unwrap();
+    for n in 1..=5 {
+        let stereo =
+            [left.channels("ViewLayer", "left.", n), right.channels("ViewLayer", "right.", n)].concat();
+        write_channels(&dir.path().join(format!("stereo.{n:04}.exr")), SIZE, stereo, &["left", "right"]);
+        let layers = [left.channels("Front", "", n), right.channels("Back", "", n)].concat();
+        write_channels(&dir.path().join(format!("layers.{n:04}.exr")), SIZE, layers, &[]);
+    }
+    let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+    let run = |input: &str, more: &[&str]| {
+        let input = dir.path().join(input);
+        demc(&alone).arg(&input).args(["--overwrite"]).args(more).assert().success();
+        demc(&out).arg(&input).args(["--overwrite", "--temporal"]).args(more).assert().success();
+    };
+    let check = |shot: Shot, file: &str, layer: &str| {
+        let [with, without] = [&out, &alone].map(|dir| shot.error(&dir.join(file), layer, 3));
+        assert!(with < 0.5 * without, "{layer}: {with} beside {without}");
+    };
+    run("stereo.0003.exr", &[]);
+    check(left, "stereo.0003.exr", "ViewLayer.Denoised.left");
+    check(right, "stereo.0003.exr", "ViewLayer.Denoised.right");
+    for (shot, layer) in [(left, "Front"), (right, "Back")] {
+        run("layers.0003.exr", &["--view-layer", layer]);
+        check(shot, "layers.0003.exr", &format!("{layer}.Denoised"));
+    }
+}
+
+#[test]
+fn stills_and_single_frames_are_denoised_as_ever() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    SHOT.write(&dir.path().join("still.exr"), 1);
+    SHOT.write(&dir.path().join("other7.exr"), 1);
+    let assert = demc(&out).arg(dir.path()).args(["--temporal", "1"]).assert().success();
+    assert.stderr(contains("its name ends in no frame number").and(contains("frame 6 is not there")));
+    for name in ["still.exr", "other7.exr"] {
+        let image = read_exr(out.join(name));
+        assert_eq!(values(&image, "ViewLayer.Denoised.R"), values(&image, "ViewLayer.Combined.R"));
+    }
+}
+
+#[test]
+fn flicker_is_what_numpy_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let (w, h) = SIZE;
+    let plane = |seed: u32, channels: usize, value: &dyn Fn(usize, usize, f32) -> f32| {
+        let value = |i: usize| value(i / (w * h), i % (w * h), random([seed, 0, i as u32]));
+        Planes::from_vec(channels, w, h, (0..channels * w * h).map(value).collect())
+    };
+    let references = [3, 2].map(|frame| plane(1, 3, &|c, i, _| SHOT.truth(c, i, frame)));
+    let images = [3, 2]
+        .map(|frame| plane(frame as u32, 3, &|c, i, noise| SHOT.truth(c, i, frame) * (0.7 + 0.6 * noise)));
+    // Not quite the motion, and between pixels: some of the picture changes along it.
+    let vectors = plane(7, 4, &|c, _, noise| if c == 0 { -2.6 + noise } else { 0.8 * noise });
+    let pair = Pair {
+        images: [&images[0], &images[1]],
+        references: [&references[0], &references[1]],
+        vectors: &vectors,
+    };
+    let got = flicker(&pair).unwrap();
+    let all = [&images[0], &images[1], &references[0], &references[1], &vectors];
+    let bytes: Vec<u8> = all.iter().flat_map(|p| p.data.iter().flat_map(|v| v.to_le_bytes())).collect();
+    let file = dir.path().join("planes.f32");
+    fs::write(&file, bytes).unwrap();
+    let script = format!(
+        "import sys, numpy as np
+from scipy.ndimage import map_coordinates, uniform_filter
+p = np.fromfile(sys.argv[1], '<f4').reshape(16, {h}, {w}).astype('f8')
+a, b, r, s, v = p[:3], p[3:6], p[6:9], p[9:12], p[12:]
+y, x = np.mgrid[:{h}, :{w}]
+x, y = x + v[0], y - v[1]
+warp = lambda q: np.stack([map_coordinates(c, [y, x], order=1, mode='nearest') for c in q])
+mean = lambda q: uniform_filter(q, (0, 3, 3), mode='nearest')
+same = (np.abs(mean(r) - warp(mean(s))) < 0.1 * np.abs(mean(r)) + 0.003).all(0)
+same &= (x >= -0.5) & (x < {w} - 0.5) & (y >= -0.5) & (y < {h} - 0.5)
+print(same.mean(), (((a - r) - warp(b - s)) ** 2 / (r * r + 0.001))[:, same].mean())"
+    );
+    let output = python::run(Process::new(python::python()).args(["-c", &script]).arg(&file));
+    let numbers: Vec<f64> = output.split_whitespace().map(|v| v.parse().unwrap()).collect();
+    assert!((0.05..0.95).contains(&numbers[0]), "the test wants pixels of both kinds: {}", numbers[0]);
+    assert!((got / numbers[1] - 1.0).abs() < 1e-4, "{got} beside {}", numbers[1]);
+}
