@@ -6,11 +6,12 @@ use std::{
     time::Instant,
 };
 
+use super::lights::{Along, Alpha, Source, light_passes};
 use crate::{
     Error, Result,
-    frame::{Frame, NewChannel},
+    frame::{Frame, NewChannel, Recoded},
     models::Denoiser,
-    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassSet, is_bare},
+    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
 };
@@ -40,12 +41,24 @@ pub struct Options {
     pub preview: Option<WritePicture>,
     /// Whether a [`super::Batch`] denoises again what is finished.
     pub overwrite: bool,
+    /// What becomes of alpha.
+    pub alpha: Alpha,
+    /// Whether light passes and light groups are denoised as well, so that they add up to the denoised beauty.
+    pub passes: bool,
 }
 
 impl Default for Options {
     /// Adds the layer `Denoised` to the view layer with the most passes.
     fn default() -> Self {
-        Self { view_layer: None, layer: Some("Denoised".into()), tile: None, preview: None, overwrite: false }
+        Self {
+            view_layer: None,
+            layer: Some("Denoised".into()),
+            tile: None,
+            preview: None,
+            overwrite: false,
+            alpha: Alpha::Auto,
+            passes: false,
+        }
     }
 }
 
@@ -112,7 +125,14 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
-    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha]].concat();
+    let lights = if options.passes { light_passes() } else { Vec::new() };
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], &lights].concat();
+    if options.passes && !model.takes_companions() {
+        return Err(Error::Usage(format!(
+            "{} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l",
+            model.name()
+        )));
+    }
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -131,6 +151,9 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
         shot.passes.require_all(needed.iter().copied(), model.name())?;
         if model.reads_halves() {
             shot.read_halves()?;
+        }
+        if options.passes {
+            shot.read_light_groups(&frame, layer)?;
         }
         for (pass, count) in &shot.repaired {
             *report.repaired.entry(pass.to_string()).or_default() += count;
@@ -154,10 +177,11 @@ fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
     })
 }
 
-/// Denoised radiance and the alpha it came with.
+/// Denoised radiance, and what goes with it.
 pub struct Denoised {
     radiance: Planes,
     alpha: Option<Planes>,
+    lights: Vec<(Source, Planes)>,
 }
 
 /// Runs the model over each view.
@@ -175,7 +199,8 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     for (layer, mut shot) in views {
         report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
         let start = Instant::now();
-        let radiance = model.denoise_tiled(&shot, options.tile)?;
+        let mut along = Along::take(&mut shot, model, options, &mut report.notes);
+        let radiance = model.denoise_along(&shot, &mut along.companions, options.tile)?;
         report.seconds += start.elapsed().as_secs_f64();
         let size = (shot.passes.width, shot.passes.height);
         if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
@@ -184,10 +209,13 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
                 format!("model {} returned an image of the wrong size; choose another model", model.name()),
             ));
         }
-        let alpha = shot.passes.remove(Pass::Alpha);
+        let (alpha, lights) = along.finish(&frame, &layer);
+        let alpha = alpha.or_else(|| shot.passes.remove(Pass::Alpha));
         let radiance = finite(radiance, &mut report);
-        done.push((layer, Denoised { radiance, alpha }));
+        let lights = lights.into_iter().map(|(source, light)| (source, finite(light, &mut report))).collect();
+        done.push((layer, Denoised { radiance, alpha, lights }));
     }
+    report.notes.dedup(); // stereo views repeat them
     Ok(Views { frame, views: done, report })
 }
 
@@ -214,39 +242,21 @@ fn layer_name(view_layer: &str, name: &str) -> String {
 /// The result does not fit into the file's format, or cannot be written.
 pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<Report> {
     let Views { mut frame, views, mut report } = denoised;
-    for (layer, Denoised { radiance, alpha }) in &views {
-        let at = &layer.passes[&Pass::Combined];
-        let recoded = match &options.layer {
-            Some(name) => {
-                let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
-                let name = layer_name(&layer.name, name);
-                let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
-                    .iter()
-                    .enumerate()
-                    .map(|(c, component)| NewChannel { component, kind, values: radiance.channel(c) })
-                    .collect();
-                if let Some(alpha) = alpha {
-                    channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
-                }
-                frame.set_layer(at.part, &name, layer.view.as_deref(), &channels)?
+    for (layer, Denoised { radiance, alpha, lights }) in &views {
+        let beauty = (&layer.passes[&Pass::Combined], COMBINED, radiance, alpha.as_ref());
+        let lights = lights.iter().map(|(source, light)| {
+            let at = source.channels(layer);
+            (at, at.name.as_str(), light, None)
+        });
+        for (at, pass, planes, alpha) in std::iter::once(beauty).chain(lights) {
+            if let Some(recoded) = put(&mut frame, layer, (at, pass), (planes, alpha), options)? {
+                let part = frame.parts()[at.part].name.clone();
+                let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
+                report.notes.push(format!("{what}: {recoded}"));
             }
-            None => {
-                let mut channels: Vec<(usize, &[f32])> =
-                    at.channels.iter().enumerate().map(|(c, &i)| (i, radiance.channel(c))).collect();
-                if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
-                    && of_alpha.part == at.part
-                {
-                    channels.push((of_alpha.channels[0], alpha.channel(0)));
-                }
-                frame.replace(at.part, &layer_name(&layer.name, COMBINED), &channels)?
-            }
-        };
-        if let Some(recoded) = recoded {
-            let part = frame.parts()[at.part].name.clone();
-            let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
-            report.notes.push(format!("{what}: {recoded}"));
         }
     }
+    report.notes.dedup();
     if let Some(write) = options.preview {
         for (layer, Denoised { radiance, .. }) in &views {
             let path = preview_path(output, layer, views.len());
@@ -260,6 +270,44 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
     // Last: an EXR that exists is a frame that is finished.
     frame.write(output)?;
     Ok(report)
+}
+
+/// Adds a denoised pass as a layer, or replaces it.
+fn put(
+    frame: &mut Frame,
+    layer: &Layer,
+    (at, pass): (&PassChannels, &str),
+    (planes, alpha): (&Planes, Option<&Planes>),
+    options: &Options,
+) -> Result<Option<Recoded>> {
+    if let Some(added) = &options.layer {
+        let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
+        let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
+            .iter()
+            .enumerate()
+            .map(|(c, component)| NewChannel { component, kind, values: planes.channel(c) })
+            .collect();
+        if let Some(alpha) = alpha {
+            channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
+        }
+        return frame.set_layer(at.part, &added_name(layer, pass, added), layer.view.as_deref(), &channels);
+    }
+    let mut channels: Vec<(usize, &[f32])> =
+        at.channels.iter().enumerate().map(|(c, &i)| (i, planes.channel(c))).collect();
+    if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
+        && of_alpha.part == at.part
+    {
+        channels.push((of_alpha.channels[0], alpha.channel(0)));
+    }
+    frame.replace(at.part, &layer_name(&layer.name, pass), &channels)
+}
+
+/// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse Direct.Denoised`.
+fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
+    match pass {
+        COMBINED => layer_name(&layer.name, added),
+        _ => layer_name(&layer.name, &format!("{pass}.{added}")),
+    }
 }
 
 /// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.

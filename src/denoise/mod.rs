@@ -5,6 +5,7 @@
 
 mod batch;
 mod job;
+mod lights;
 #[cfg(feature = "preview")]
 pub mod preview;
 
@@ -12,6 +13,7 @@ use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper, plan};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+pub use lights::Alpha;
 
 use crate::{Result, models::Denoiser};
 

@@ -11,7 +11,7 @@ use std::{
     process::ExitCode,
 };
 
-use clap::Args as ClapArgs;
+use clap::{Args as ClapArgs, ValueEnum};
 
 use super::{
     SOME_FAILED,
@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    denoise::{self, Batch, End, Job, Options, Outcome, preview},
+    denoise::{self, Alpha, Batch, End, Job, Options, Outcome, preview},
     models,
 };
 
@@ -68,9 +68,25 @@ pub struct Args {
     #[arg(long)]
     preview: bool,
 
+    /// What becomes of alpha: denoised with the beauty's kernels, or kept; auto denoises it where it varies
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = AlphaChoice::Auto)]
+    alpha: AlphaChoice,
+
+    /// Denoise the light passes and light groups as well: they add up to the denoised beauty
+    #[arg(long)]
+    passes: bool,
+
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
+}
+
+/// The values of `--alpha`.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum AlphaChoice {
+    Auto,
+    Denoise,
+    Keep,
 }
 
 /// Runs the batch.
@@ -99,6 +115,12 @@ pub fn run(args: Args) -> Result<ExitCode> {
         tile: args.tile.map(|t| t as usize),
         preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
+        alpha: match args.alpha {
+            AlphaChoice::Auto => Alpha::Auto,
+            AlphaChoice::Denoise => Alpha::Denoise,
+            AlphaChoice::Keep => Alpha::Keep,
+        },
+        passes: args.passes,
     };
     let mut progress = progress::Progress::new(jobs.len() + unusable.len(), args.json);
     for (input, error) in unusable {
