@@ -330,15 +330,29 @@ pub(super) fn existing(output: &Path) -> Option<Frame> {
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers(headers);
-    let chosen = &passes::choose(headers, &layers, options.view_layer.as_deref())?.name;
+    let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
+    let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
     let full_name = layer_name(chosen, name);
     let views = passes::rgb_layers(headers, Some(chosen), name);
-    if views.is_empty() || !headers.is_own_layer(&full_name) {
+    let lacks = |what: &str| {
         let why = format!(
-            "exists without '{full_name}' made by demc; --overwrite denoises the frame again, or choose another --out"
+            "exists without {what} made by demc; --overwrite denoises the frame again, or choose another --out"
         );
-        return Err(Error::invalid(output, why));
+        Err(Error::invalid(output, why))
+    };
+    if views.is_empty() || !headers.is_own_layer(&full_name) {
+        return lacks(&format!("'{full_name}'"));
+    }
+    let is_own = |at: &PassChannels| match &options.layer {
+        Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
+        None => headers.is_own_layer(&layer_name(chosen, &at.name)),
+    };
+    let lights = light_passes();
+    let mut lights =
+        lights.iter().filter_map(|pass| layer.passes.get(pass)).chain(layer.light_groups.values());
+    if options.passes && !lights.any(is_own) {
+        return lacks("denoised light passes");
     }
     let Some(write) = options.preview else { return Ok(()) };
     let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));
