@@ -12,7 +12,7 @@ mod lbf;
 mod shading;
 
 pub use black::keep_black;
-pub use fireflies::{FIREFLY, tame_fireflies};
+pub use fireflies::{FIREFLY, tame_alike, tame_fireflies};
 pub use kpcn::{
     DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
     kpcn_streams,

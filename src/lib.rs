@@ -24,14 +24,15 @@
 //! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits weights;
 //! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
 //! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
-//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given; [`passes`] says what a channel means; [`frame`] is an EXR exactly
-//! as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
+//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given, and
+//! a [`companion`] a layer denoised along; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
 pub mod augment;
 #[cfg(feature = "cli")]
 pub mod cli;
+pub mod companion;
 pub mod denoise;
 pub mod error;
 pub mod features;

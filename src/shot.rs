@@ -25,6 +25,8 @@ pub struct Shot {
     pub halves: Option<[PassSet; 2]>,
     /// Frames of its sequence, by how many frames later they are; those before it have negative numbers.
     pub neighbours: BTreeMap<i32, PassSet>,
+    /// Light groups, which add up to Combined, by name; see [`Shot::read_light_groups`].
+    pub light_groups: BTreeMap<String, Planes>,
     /// Whether Blender had denoised Combined, and the render was taken from the pass `Noisy Image`.
     pub was_denoised: bool,
     /// How many values of each pass were not finite and are repaired; passes that were clean are not listed.
@@ -65,12 +67,27 @@ impl Shot {
         let is_broken = |render: &&Planes| render.data.iter().any(|v| !v.is_finite());
         let unrepaired = passes.get(Pass::Combined).filter(is_broken).cloned();
         let repaired = passes.sanitize();
-        Self { passes, halves: None, neighbours: BTreeMap::new(), was_denoised, repaired, unrepaired }
+        let (halves, neighbours, light_groups) = Default::default();
+        Self { passes, halves, neighbours, light_groups, was_denoised, repaired, unrepaired }
     }
 
     /// The render as it was stored, with values that are not finite where it had any.
     pub fn as_stored(&self) -> Option<&Planes> {
         self.unrepaired.as_ref().or_else(|| self.passes.get(Pass::Combined))
+    }
+
+    /// Reads the light groups of the layer that the shot was made of, repaired like its passes.
+    ///
+    /// # Errors
+    /// Pixels cannot be decoded.
+    pub fn read_light_groups(&mut self, frame: &Frame, layer: &Layer) -> Result<()> {
+        for (name, planes) in passes::read_light_groups(frame, layer)? {
+            let mut set = PassSet::new(&self.passes.path, &layer.name, planes.width, planes.height);
+            set.insert(Pass::Combined, planes);
+            set.sanitize();
+            self.light_groups.extend(set.remove(Pass::Combined).map(|planes| (name, planes)));
+        }
+        Ok(())
     }
 
     /// Reads the half buffers that lie beside the frame's file, if there are any.

@@ -6,16 +6,19 @@ use std::{
     time::Instant,
 };
 
+use super::{
+    lights::{Along, Alpha, Source, light_passes},
+    window,
+};
 use crate::{
     Error, Result,
-    frame::{Frame, NewChannel},
+    companion::Companion,
+    frame::{Frame, NewChannel, Recoded},
     models::Denoiser,
-    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassSet, is_bare},
+    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
 };
-
-use super::window;
 
 /// One file to do.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,6 +47,10 @@ pub struct Options {
     pub overwrite: bool,
     /// Frames before and after one that a [`super::Batch`] makes it better and steadier with; none for frame by frame.
     pub temporal: Option<usize>,
+    /// What becomes of alpha.
+    pub alpha: Alpha,
+    /// Whether light passes and light groups are denoised as well, so that they add up to the denoised beauty.
+    pub passes: bool,
 }
 
 impl Default for Options {
@@ -56,6 +63,8 @@ impl Default for Options {
             preview: None,
             overwrite: false,
             temporal: None,
+            alpha: Alpha::Auto,
+            passes: false,
         }
     }
 }
@@ -124,7 +133,18 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
-    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion].concat();
+    let lights = if options.passes { light_passes() } else { Vec::new() };
+    let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion, &lights].concat();
+    if options.passes && !model.takes_companions() {
+        return Err(Error::Usage(format!(
+            "{} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l",
+            model.name()
+        )));
+    }
+    if options.temporal.is_some() && (options.passes || options.alpha == Alpha::Denoise) {
+        let why = "--passes and --alpha denoise work frame by frame; leave out --temporal, or them";
+        return Err(Error::Usage(why.into()));
+    }
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -143,6 +163,9 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
         shot.passes.require_all(needed.iter().copied(), model.name())?;
         if model.reads_halves() {
             shot.read_halves()?;
+        }
+        if options.passes {
+            shot.read_light_groups(&frame, layer)?;
         }
         for (pass, count) in &shot.repaired {
             *report.repaired.entry(pass.to_string()).or_default() += count;
@@ -166,10 +189,11 @@ fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
     })
 }
 
-/// Denoised radiance and the alpha it came with.
+/// Denoised radiance, and what goes with it.
 pub struct Denoised {
     radiance: Planes,
     alpha: Option<Planes>,
+    lights: Vec<(Source, Planes)>,
 }
 
 /// Runs the model over each view.
@@ -182,9 +206,11 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 }
 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
-    loaded.each(|_, shot, report| {
-        let radiance = run(&shot, model, options, report)?;
-        finish(&shot, radiance, model, report)
+    loaded.each(|frame, layer, mut shot, report| {
+        let mut along = Along::take(&mut shot, model, options, &mut report.notes);
+        let radiance = run(&shot, &mut along.companions, model, options, report)?;
+        let along = along.finish(frame, layer);
+        finish(&shot, radiance, along, model, report)
     })
 }
 
@@ -200,31 +226,33 @@ impl<T> Views<T> {
     /// It becomes nothing of one.
     pub(super) fn each<U>(
         self,
-        mut change: impl FnMut(&Layer, T, &mut Report) -> Result<U>,
+        mut change: impl FnMut(&Frame, &Layer, T, &mut Report) -> Result<U>,
     ) -> Result<Views<U>> {
         let Self { frame, views, mut report } = self;
         let mut done = Vec::with_capacity(views.len());
         for (layer, view) in views {
-            let view = change(&layer, view, &mut report)?;
+            let view = change(&frame, &layer, view, &mut report)?;
             done.push((layer, view));
         }
+        report.notes.dedup(); // stereo views repeat them
         Ok(Views { frame, views: done, report })
     }
 }
 
-/// Runs the model over a view.
+/// Runs the model over a view, and what goes along with it.
 ///
 /// # Errors
 /// The model cannot denoise it.
 pub(super) fn run(
     shot: &Shot,
+    companions: &mut [Companion],
     model: &dyn Denoiser,
     options: &Options,
     report: &mut Report,
 ) -> Result<Planes> {
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
-    let radiance = model.denoise_tiled(shot, options.tile)?;
+    let radiance = model.denoise_along(shot, companions, options.tile)?;
     report.seconds += start.elapsed().as_secs_f64();
     let size = (shot.passes.width, shot.passes.height);
     if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
@@ -236,18 +264,22 @@ pub(super) fn run(
     Ok(radiance)
 }
 
-/// What is stored of a view, whose alpha goes with it.
+/// What is stored of a view: its alpha as rendered, unless another goes along with it, and light passes.
 ///
 /// # Errors
 /// What the model made is of no use.
 pub(super) fn finish(
     shot: &Shot,
     radiance: Planes,
+    (alpha, lights): (Option<Planes>, Vec<(Source, Planes)>),
     model: &dyn Denoiser,
     report: &mut Report,
 ) -> Result<Denoised> {
-    let radiance = finite(radiance, model.name(), &shot.passes.path, report)?;
-    Ok(Denoised { radiance, alpha: shot.passes.get(Pass::Alpha).cloned() })
+    let mut useful = |planes| finite(planes, model.name(), &shot.passes.path, report);
+    let radiance = useful(radiance)?;
+    let lights = lights.into_iter().map(|(source, light)| Ok((source, useful(light)?)));
+    let lights = lights.collect::<Result<_>>()?;
+    Ok(Denoised { radiance, alpha: alpha.or_else(|| shot.passes.get(Pass::Alpha).cloned()), lights })
 }
 
 /// Whatever a model returns, what is written is finite.
@@ -282,39 +314,21 @@ fn layer_name(view_layer: &str, name: &str) -> String {
 /// The result does not fit into the file's format, or cannot be written.
 pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<Report> {
     let Views { mut frame, views, mut report } = denoised;
-    for (layer, Denoised { radiance, alpha }) in &views {
-        let at = &layer.passes[&Pass::Combined];
-        let recoded = match &options.layer {
-            Some(name) => {
-                let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
-                let name = layer_name(&layer.name, name);
-                let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
-                    .iter()
-                    .enumerate()
-                    .map(|(c, component)| NewChannel { component, kind, values: radiance.channel(c) })
-                    .collect();
-                if let Some(alpha) = alpha {
-                    channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
-                }
-                frame.set_layer(at.part, &name, layer.view.as_deref(), &channels)?
+    for (layer, Denoised { radiance, alpha, lights }) in &views {
+        let beauty = (&layer.passes[&Pass::Combined], COMBINED, radiance, alpha.as_ref());
+        let lights = lights.iter().map(|(source, light)| {
+            let at = source.channels(layer);
+            (at, at.name.as_str(), light, None)
+        });
+        for (at, pass, planes, alpha) in std::iter::once(beauty).chain(lights) {
+            if let Some(recoded) = put(&mut frame, layer, (at, pass), (planes, alpha), options)? {
+                let part = frame.parts()[at.part].name.clone();
+                let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
+                report.notes.push(format!("{what}: {recoded}"));
             }
-            None => {
-                let mut channels: Vec<(usize, &[f32])> =
-                    at.channels.iter().enumerate().map(|(c, &i)| (i, radiance.channel(c))).collect();
-                if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
-                    && of_alpha.part == at.part
-                {
-                    channels.push((of_alpha.channels[0], alpha.channel(0)));
-                }
-                frame.replace(at.part, &layer_name(&layer.name, COMBINED), &channels)?
-            }
-        };
-        if let Some(recoded) = recoded {
-            let part = frame.parts()[at.part].name.clone();
-            let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
-            report.notes.push(format!("{what}: {recoded}"));
         }
     }
+    report.notes.dedup();
     if let Some(write) = options.preview {
         for (layer, Denoised { radiance, .. }) in &views {
             let path = preview_path(output, layer, views.len());
@@ -328,6 +342,44 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
     // Last: an EXR that exists is a frame that is finished.
     frame.write(output)?;
     Ok(report)
+}
+
+/// Adds a denoised pass as a layer, or replaces it.
+fn put(
+    frame: &mut Frame,
+    layer: &Layer,
+    (at, pass): (&PassChannels, &str),
+    (planes, alpha): (&Planes, Option<&Planes>),
+    options: &Options,
+) -> Result<Option<Recoded>> {
+    if let Some(added) = &options.layer {
+        let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
+        let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
+            .iter()
+            .enumerate()
+            .map(|(c, component)| NewChannel { component, kind, values: planes.channel(c) })
+            .collect();
+        if let Some(alpha) = alpha {
+            channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
+        }
+        return frame.set_layer(at.part, &added_name(layer, pass, added), layer.view.as_deref(), &channels);
+    }
+    let mut channels: Vec<(usize, &[f32])> =
+        at.channels.iter().enumerate().map(|(c, &i)| (i, planes.channel(c))).collect();
+    if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
+        && of_alpha.part == at.part
+    {
+        channels.push((of_alpha.channels[0], alpha.channel(0)));
+    }
+    frame.replace(at.part, &layer_name(&layer.name, pass), &channels)
+}
+
+/// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse Direct.Denoised`.
+fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
+    match pass {
+        COMBINED => layer_name(&layer.name, added),
+        _ => layer_name(&layer.name, &format!("{pass}.{added}")),
+    }
 }
 
 /// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.
@@ -357,15 +409,29 @@ pub(super) fn existing(output: &Path) -> Option<Frame> {
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers(headers);
-    let chosen = &passes::choose(headers, &layers, options.view_layer.as_deref())?.name;
+    let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
+    let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
     let full_name = layer_name(chosen, name);
     let views = passes::rgb_layers(headers, Some(chosen), name);
-    if views.is_empty() || !headers.is_own_layer(&full_name) {
+    let lacks = |what: &str| {
         let why = format!(
-            "exists without '{full_name}' made by demc; --overwrite denoises the frame again, or choose another --out"
+            "exists without {what} made by demc; --overwrite denoises the frame again, or choose another --out"
         );
-        return Err(Error::invalid(output, why));
+        Err(Error::invalid(output, why))
+    };
+    if views.is_empty() || !headers.is_own_layer(&full_name) {
+        return lacks(&format!("'{full_name}'"));
+    }
+    let is_own = |at: &PassChannels| match &options.layer {
+        Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
+        None => headers.is_own_layer(&layer_name(chosen, &at.name)),
+    };
+    let lights = light_passes();
+    let mut lights =
+        lights.iter().filter_map(|pass| layer.passes.get(pass)).chain(layer.light_groups.values());
+    if options.passes && !lights.any(is_own) {
+        return lacks("denoised light passes");
     }
     let Some(write) = options.preview else { return Ok(()) };
     let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));

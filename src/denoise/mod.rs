@@ -6,6 +6,7 @@
 
 mod batch;
 mod job;
+mod lights;
 #[cfg(feature = "preview")]
 pub mod preview;
 mod sequence;
@@ -15,6 +16,7 @@ use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper, plan};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+pub use lights::Alpha;
 pub use sequence::follows;
 
 use crate::{Result, models::Denoiser};

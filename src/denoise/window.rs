@@ -103,7 +103,7 @@ impl Window {
     ) {
         let mut moments = BTreeMap::new();
         let rest = loaded.and_then(|loaded| {
-            loaded.each(|layer, shot, _| {
+            loaded.each(|_, layer, shot, _| {
                 moments.insert(key(layer), Moment::new(shot, model));
                 Ok(())
             })
@@ -135,12 +135,12 @@ impl Window {
             return Err(error);
         }
         let rest = held.rest.take().expect("it is denoised once");
-        rest.each(|layer, (), report| {
+        rest.each(|_, layer, (), report| {
             let start = Instant::now();
             let radiance = self.view(number, &key(layer), model, options, report)?;
             report.seconds = start.elapsed().as_secs_f64();
             let shot = &self.moment(number, &key(layer)).expect("its views have entered").shot;
-            finish(shot, radiance, model, report)
+            finish(shot, radiance, Default::default(), model, report)
         })
     }
 
@@ -200,9 +200,9 @@ impl Window {
             .collect();
         // Half buffers are the frame's own: a model that holds them against each other reads no average beside them.
         let image = if others.is_empty() || model.reads_halves() {
-            run(&own.shot, model, options, report)?
+            run(&own.shot, &mut [], model, options, report)?
         } else {
-            run(&Shot::new(average(&own.shot.passes, &others)), model, options, report)?
+            run(&Shot::new(average(&own.shot.passes, &others)), &mut [], model, options, report)?
         };
         self.moment_mut(number, view).expect("it is there").result = Some(image);
         Ok(())

@@ -69,6 +69,23 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
     tamed
 }
 
+/// Scales each pixel of a layer, (3, H, W), as [`tame_fireflies`] scaled the beauty from `noisy` to `tamed`.
+pub fn tame_alike(layer: &mut Planes, noisy: &Planes, tamed: &Planes) {
+    let [noisy, tamed] = [noisy, tamed].map(|planes| [0, 1, 2].map(|c| planes.channel(c)));
+    let n = layer.pixels();
+    let changed: Vec<(usize, f32)> = (0..n)
+        .into_par_iter()
+        .filter_map(|at| {
+            // A firefly's colours are all scaled alike, the brightest most exactly.
+            let c = (0..3).max_by(|a, b| noisy[*a][at].total_cmp(&noisy[*b][at]))?;
+            (noisy[c][at] != tamed[c][at]).then(|| (at, tamed[c][at] / noisy[c][at]))
+        })
+        .collect();
+    for plane in layer.data.chunks_exact_mut(n) {
+        changed.iter().for_each(|&(at, factor)| plane[at] *= factor);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -118,11 +118,12 @@ pub struct Render<'a> {
     pub firefly: f32,
 }
 
-/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more than noise.
+/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more than noise. The share
+/// of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
 ///
 /// # Panics
 /// If sizes differ.
-pub fn shrink(image: &mut Planes, render: &Render) {
+pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) {
     let size = (image.width, image.height);
     for planes in [render.radiance, render.albedo, &*image] {
         assert_eq!(
@@ -136,7 +137,17 @@ pub fn shrink(image: &mut Planes, render: &Render) {
     }
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
     let kept = judge(&gather(image, render), size, samples);
-    mix(image, render, &kept, samples);
+    mix(image, render, &kept, samples, shares);
+}
+
+/// Mixes another denoised layer, (C, H, W), with what was rendered of it, by the `shares` of [`shrink`].
+pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
+    let pixels = shares.pixels();
+    let channels = denoised.data.par_chunks_mut(pixels).zip(rendered.data.par_chunks(pixels));
+    channels.for_each(|(denoised, rendered)| {
+        let values = denoised.iter_mut().zip(rendered).zip(&shares.data);
+        values.for_each(|((denoised, rendered), share)| *denoised += (rendered - *denoised) * share);
+    });
 }
 
 /// Rows of squares that a thread gathers at once: the rows of pixels just above and below are computed twice.
@@ -327,8 +338,8 @@ fn judge(sums: &[f32], (width, height): (usize, usize), samples: f32) -> Vec<f32
     kept
 }
 
-/// Mixes every pixel.
-fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
+/// Mixes every pixel, and writes the shares of the render, where they are asked for.
+fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: Option<&mut Planes>) {
     let (width, height) = (image.width, image.height);
     let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
     let floor = FLOOR / render.exposure;
@@ -337,9 +348,14 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
     let (red, rest) = image.data.split_at_mut(width * height);
     let (green, blue) = rest.split_at_mut(width * height);
     let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
-    red.zip(green).zip(blue).enumerate().for_each_init(
+    let shares: Vec<Option<&mut [f32]>> = match shares {
+        Some(shares) => shares.data.chunks_mut(width).map(Some).collect(),
+        None => (0..height).map(|_| None).collect(),
+    };
+    red.zip(green).zip(blue).zip(shares).enumerate().for_each_init(
         || vec![0.0; KEPT * squares],
-        |line, (y, ((red, green), blue))| {
+        |line, (y, (((red, green), blue), mut shares))| {
+            let mut note = |x: usize, share: f32| shares.iter_mut().for_each(|row| row[x] = share);
             let (above, share) = between(y, square_rows);
             let of = |row: usize| &kept[row.min(square_rows - 1) * KEPT * squares..][..KEPT * squares];
             for (line, (a, b)) in line.iter_mut().zip(of(above).iter().zip(of(above + 1))) {
@@ -357,6 +373,7 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
                 let colours = [&mut red[x], &mut green[x], &mut blue[x]];
                 if is_seen(render, x, y) {
                     colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
+                    note(x, 1.0);
                     continue;
                 }
                 let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
@@ -366,9 +383,11 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32) {
                 let shrunk = trust * (1.0 - weight.min(1.0));
                 let seen = if keeps > 0.0 { keeps * beyond_white(render, x, y) } else { 0.0 };
                 let back = shrunk + seen - shrunk * seen;
-                if back > 0.0 && !(own == LARGEST_RESIDUAL && is_firefly(render, x, y)) {
+                let back = if own == LARGEST_RESIDUAL && is_firefly(render, x, y) { 0.0 } else { back };
+                if back > 0.0 {
                     colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v += (noisy - *v) * back);
                 }
+                note(x, back);
             }
         },
     );
@@ -470,7 +489,7 @@ mod tests {
     fn shrunk(denoised: &Planes, radiance: &Planes, albedo: &Planes, samples: Option<u32>) -> Planes {
         let mut image = denoised.clone();
         let render = Render { radiance, albedo, exposure: 0.6, samples, firefly: 32.0 };
-        shrink(&mut image, &render);
+        shrink(&mut image, &render, None);
         image
     }
 
@@ -564,7 +583,7 @@ mod tests {
                     samples: None,
                     firefly: 32.0,
                 };
-                shrink(&mut image, &render);
+                shrink(&mut image, &render, None);
                 assert!(image.data.iter().all(|x| x.is_finite() && *x <= v && *x >= 0.5 * v), "{w}x{h}, {v}");
             }
         }

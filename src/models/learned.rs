@@ -5,13 +5,15 @@ use std::path::Path;
 use super::{
     Denoiser,
     network::{Architecture, Network},
+    refuse_companions,
     weights_file::{self, Metadata},
 };
 use crate::{
     Error, Result,
     augment::Augment,
-    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows},
-    filters::shrinkage::{Render, shrink},
+    companion::{Companion, Kind},
+    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike},
+    filters::shrinkage::{Render, shrink, take_back},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -104,14 +106,33 @@ impl Learned {
     /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a square as before, so
     /// a column or row is added at what becomes the beginning; fireflies are tamed before it mirrors them, since two would be
     /// company for each other. The clean guides are those of the first look.
-    fn second_look(&self, passes: &PassSet, guides: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn second_look(
+        &self,
+        passes: &PassSet,
+        guides: &PassSet,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
         let size = (passes.width, passes.height);
         let odd = (size.0 | 1, size.1 | 1);
-        let exposure = exposure(passes.require(Pass::Combined, TURNED)?);
-        let turned = HALF_TURN.passes(&guide_rows(passes, 0..size.1, odd, exposure, TURNED)?);
+        let radiance = passes.require(Pass::Combined, TURNED)?;
+        let grown = guide_rows(passes, 0..size.1, odd, exposure(radiance), TURNED)?;
+        if !companions.is_empty() {
+            let (noisy, tamed) =
+                (radiance.padded_rows(0..size.1, odd), grown.require(Pass::Combined, TURNED)?);
+            for Companion { kind, planes } in &mut *companions {
+                *planes = planes.padded_rows(0..size.1, odd);
+                if *kind == Kind::Light {
+                    tame_alike(planes, &noisy, tamed);
+                }
+                *planes = planes.turned();
+            }
+        }
         let guides = HALF_TURN.passes(&guides.padded_rows(&PREFILTERED_PASSES, 0..size.1, odd));
-        let image = self.network.infer_with(&turned, &guides, tile)?.turned();
-        Ok(image.window((0, 0), size))
+        let image = self.network.infer_with(&HALF_TURN.passes(&grown), &guides, companions, tile)?;
+        let back = |image: &Planes| image.turned().window((0, 0), size);
+        companions.iter_mut().for_each(|companion| companion.planes = back(&companion.planes));
+        Ok(back(&image))
     }
 
     /// Multiply-accumulates for one pixel of the frame.
@@ -142,42 +163,84 @@ impl Denoiser for Learned {
     }
 
     fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
+        self.denoise_along(shot, &mut [], tile)
+    }
+
+    fn takes_companions(&self) -> bool {
+        self.network.takes_companions()
+    }
+
+    fn denoise_along(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
         let passes = &shot.passes;
         if self.metadata.network.architecture != Architecture::Pyramid {
+            refuse_companions(&self.name, companions)?;
             return self.network.infer(passes, tile);
         }
         let (place, size) = rendered(passes);
-        if size == (passes.width, passes.height) {
-            return self.restrained(passes, tile);
+        let whole = (passes.width, passes.height);
+        if size == whole {
+            return self.restrained(passes, companions, tile);
         }
-        let part = self.restrained(&passes.window(place, size), tile)?;
-        Ok(part.placed_in((passes.width, passes.height), place))
+        companions.iter_mut().for_each(|companion| companion.planes = companion.planes.window(place, size));
+        let part = self.restrained(&passes.window(place, size), companions, tile)?;
+        companions
+            .iter_mut()
+            .for_each(|companion| companion.planes = companion.planes.placed_in(whole, place));
+        Ok(part.placed_in(whole, place))
     }
 }
 
 impl Learned {
     /// What the network makes of a frame, and no more of it than there was noise.
-    fn restrained(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        let mut image = self.looks(passes, tile)?;
+    fn restrained(
+        &self,
+        passes: &PassSet,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        let rendered = companions.to_vec();
+        let mut image = self.looks(passes, companions, tile)?;
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
-        shrink(&mut image, &Render { radiance, albedo, exposure, samples, firefly: FIREFLY });
+        let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
+        if companions.is_empty() {
+            shrink(&mut image, &render, None);
+            return Ok(image);
+        }
+        let mut shares = Planes::unwritten(1, image.width, image.height);
+        shrink(&mut image, &render, Some(&mut shares));
+        for (denoised, rendered) in companions.iter_mut().zip(&rendered) {
+            take_back(&mut denoised.planes, &rendered.planes, &shares);
+        }
         Ok(image)
     }
 
     /// What the network makes of a frame.
-    fn looks(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn looks(&self, passes: &PassSet, companions: &mut [Companion], tile: Option<usize>) -> Result<Planes> {
         if !self.turned {
-            return self.network.infer(passes, tile);
+            return self.network.infer_along(passes, companions, tile);
         }
         let guides = self.network.clean_guides(passes)?.expect("what looks twice has a prefilter");
-        let mut image = self.network.infer_with(passes, &guides, tile)?;
-        let second = self.second_look(passes, &guides, tile)?;
-        let values = image.data.iter_mut().zip(&second.data);
-        values.for_each(|(first, second)| *first = 0.5 * (*first + second));
+        let mut seen_turned = companions.to_vec();
+        let mut image = self.network.infer_with(passes, &guides, companions, tile)?;
+        let second = self.second_look(passes, &guides, &mut seen_turned, tile)?;
+        average(&mut image, &second);
+        for (first, second) in companions.iter_mut().zip(&seen_turned) {
+            average(&mut first.planes, &second.planes);
+        }
         Ok(image)
     }
+}
+
+/// Makes planes the mean of two.
+fn average(first: &mut Planes, second: &Planes) {
+    first.data.iter_mut().zip(&second.data).for_each(|(first, second)| *first = 0.5 * (*first + second));
 }
 
 /// Of the pixels around a region that was rendered of a frame, the share that holds something.

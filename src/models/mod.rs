@@ -14,7 +14,7 @@ use std::{path::Path, time::Instant};
 
 use network::{Architecture, Config, Network};
 
-use crate::{Error, Result, nn::Precision, passes::Pass, planes::Planes, shot::Shot};
+use crate::{Error, Result, companion::Companion, nn::Precision, passes::Pass, planes::Planes, shot::Shot};
 
 /// One way to remove noise from a frame.
 pub trait Denoiser: Send + Sync {
@@ -56,6 +56,26 @@ pub trait Denoiser: Send + Sync {
         self.denoise(shot)
     }
 
+    /// Whether it denoises layers along with the beauty.
+    fn takes_companions(&self) -> bool {
+        false
+    }
+
+    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along with the beauty,
+    /// in its place.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`], or there are companions and the method takes none.
+    fn denoise_along(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        refuse_companions(self.name(), companions)?;
+        self.denoise_tiled(shot, tile)
+    }
+
     /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
     /// reports its filter's time, without start and file traffic.
     ///
@@ -72,6 +92,16 @@ pub trait Denoiser: Send + Sync {
     fn is_warm(&self) -> bool {
         false
     }
+}
+
+/// Stops a method that takes no companions where there are some.
+fn refuse_companions(name: &str, companions: &[Companion]) -> Result<()> {
+    if companions.is_empty() {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "{name} denoises the beauty alone; demc-s, demc-m and demc-l take other layers along"
+    )))
 }
 
 /// A denoised frame and what it cost.

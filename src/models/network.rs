@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Result,
+    companion::Companion,
     features::Inputs,
     kernels::{Shape, memory::PlaneBuffer},
     nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
@@ -212,11 +213,30 @@ pub trait Network: Send + Sync {
         Ok(None)
     }
 
-    /// [`Network::infer`] where [`Network::clean_guides`] are known.
+    /// [`Network::infer`] and [`Network::infer_along`] where [`Network::clean_guides`] are known.
+    ///
+    /// # Errors
+    /// As theirs.
+    fn infer_with(
+        &self,
+        passes: &PassSet,
+        _: &PassSet,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        self.infer_along(passes, companions, tile)
+    }
+
+    /// Whether it can denoise layers along with the beauty.
+    fn takes_companions(&self) -> bool {
+        false
+    }
+
+    /// [`Network::infer`], and each of the companions denoised along with it, where [`Network::takes_companions`].
     ///
     /// # Errors
     /// As [`Network::infer`].
-    fn infer_with(&self, passes: &PassSet, _: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn infer_along(&self, passes: &PassSet, _: &mut [Companion], tile: Option<usize>) -> Result<Planes> {
         self.infer(passes, tile)
     }
 

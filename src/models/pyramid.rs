@@ -27,6 +27,7 @@ use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, duplicate};
 use crate::{
     Result,
+    companion::Companion,
     features::{
         GUIDE_PASSES, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target,
         exposure, guide_rows, guide_targets, guides, noisy_guides, normal_of_target,
@@ -509,7 +510,7 @@ impl Network for Pyramid {
             };
             return Ok(Planes::from_rows(6, (passes.width, passes.height), rows));
         }
-        bands::infer(self, passes, None, tile)
+        bands::infer(self, passes, None, &mut [], tile)
     }
 
     fn clean_guides(&self, passes: &PassSet) -> Result<Option<PassSet>> {
@@ -521,8 +522,27 @@ impl Network for Pyramid {
         Ok(Some(guides))
     }
 
-    fn infer_with(&self, passes: &PassSet, guides: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        bands::infer(self, passes, Some(guides), tile)
+    fn infer_with(
+        &self,
+        passes: &PassSet,
+        guides: &PassSet,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        bands::infer(self, passes, Some(guides), companions, tile)
+    }
+
+    fn takes_companions(&self) -> bool {
+        !self.denoises_guides()
+    }
+
+    fn infer_along(
+        &self,
+        passes: &PassSet,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        bands::infer(self, passes, None, companions, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

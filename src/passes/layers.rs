@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{
     Pass, PassSet,
-    names::{ChannelName, POSITION_AOV, TABLE},
+    names::{ChannelName, POSITION_AOV, TABLE, light_group},
 };
 use crate::{
     Error, Result,
@@ -21,6 +21,8 @@ pub struct Layer {
     pub view: Option<String>,
     /// The passes recognised.
     pub passes: BTreeMap<Pass, PassChannels>,
+    /// The light groups, which add up to Combined, by name.
+    pub light_groups: BTreeMap<String, PassChannels>,
     /// Whether the position is averaged over samples (a shader AOV) and not Cycles' aliased pass.
     pub position_averaged: bool,
     /// Names of channels that mean nothing to demc.
@@ -103,7 +105,8 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
         let name = name.strip_prefix(&format!("{layer}.")).unwrap_or(name);
         let at = match_components(channels.get(name)?, &["R", "G", "B"])?;
         let passes = [(Pass::Combined, PassChannels { name: name.into(), ..at })].into();
-        Some(Layer { name: layer, view, passes, position_averaged: false, unrecognised: Vec::new() })
+        let (position_averaged, light_groups, unrecognised) = Default::default();
+        Some(Layer { name: layer, view, passes, light_groups, position_averaged, unrecognised })
     };
     found.filter_map(as_combined).collect()
 }
@@ -121,6 +124,14 @@ fn assign(name: String, view: Option<String>, channels: BTreeMap<String, Vec<Una
             known.extend(found.channels.iter().map(|&c| (found.part, c)));
             // Every name of the row is recognised; the first one present is the one used.
             passes.entry(row.pass).or_insert(PassChannels { name: (*pass_name).into(), ..found });
+        }
+    }
+    let mut light_groups = BTreeMap::new();
+    for (pass_name, candidates) in &channels {
+        let Some(group) = light_group(pass_name) else { continue };
+        if let Some(found) = match_components(candidates, &["R", "G", "B"]) {
+            known.extend(found.channels.iter().map(|&c| (found.part, c)));
+            light_groups.insert(group.to_owned(), PassChannels { name: pass_name.clone(), ..found });
         }
     }
     // The fourth channel of an AOV or a noisy image is part of what was recognised.
@@ -141,6 +152,7 @@ fn assign(name: String, view: Option<String>, channels: BTreeMap<String, Vec<Una
         view,
         position_averaged: passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV),
         passes,
+        light_groups,
         unrecognised: unrecognised.into_iter().map(|(.., n)| n).collect(),
     }
 }
@@ -242,20 +254,47 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let samples = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
     set.samples = samples.and_then(|count| count.trim().parse().ok());
 
-    // One decoding run for each part: in single-part files all passes share their blocks.
-    let mut by_part: BTreeMap<usize, Vec<(Pass, &[usize])>> = BTreeMap::new();
-    for (&pass, at) in held() {
-        by_part.entry(at.part).or_default().push((pass, &at.channels));
+    decode(frame, window, held().map(|(pass, at)| (*pass, at)), |pass, planes| set.insert(pass, planes))?;
+    Ok(set)
+}
+
+/// The light groups of a view layer, cut as [`read_layer`] cuts its passes, each (3, H, W).
+///
+/// # Errors
+/// Pixels cannot be decoded.
+pub fn read_light_groups(frame: &Frame, layer: &Layer) -> Result<BTreeMap<String, Planes>> {
+    let mut groups = BTreeMap::new();
+    if let Some(anchor) = layer.passes.get(&Pass::Combined) {
+        let window = frame.parts()[anchor.part].data_window;
+        let held = layer.light_groups.iter().map(|(name, at)| (name.clone(), at));
+        decode(frame, window, held, |name, planes| drop(groups.insert(name, planes)))?;
     }
-    for (part, passes) in by_part {
-        let channels: Vec<&[usize]> = passes.iter().map(|(_, channels)| *channels).collect();
+    Ok(groups)
+}
+
+/// Decodes channels, cut to a window, and hands them out under their keys. One decoding run for each part: in single-part files
+/// all passes share their blocks.
+fn decode<'a, K>(
+    frame: &Frame,
+    window: Window,
+    wanted: impl Iterator<Item = (K, &'a PassChannels)>,
+    mut put: impl FnMut(K, Planes),
+) -> Result<()> {
+    let mut by_part: BTreeMap<usize, (Vec<K>, Vec<&[usize]>)> = BTreeMap::new();
+    for (key, at) in wanted {
+        let (keys, channels) = by_part.entry(at.part).or_default();
+        keys.push(key);
+        channels.push(&at.channels);
+    }
+    for (part, (keys, channels)) in by_part {
         let stored = frame.parts()[part].data_window;
-        for ((pass, channels), image) in passes.iter().zip(frame.decode(part, &channels)?) {
+        let images = frame.decode(part, &channels)?;
+        for ((key, channels), image) in keys.into_iter().zip(channels).zip(images) {
             let image = crop(image, stored, window);
-            set.insert(*pass, Planes::from_vec(channels.len(), window.width, window.height, image));
+            put(key, Planes::from_vec(channels.len(), window.width, window.height, image));
         }
     }
-    Ok(set)
+    Ok(())
 }
 
 /// The values of `image`, (C, H, W) and stored in `from`, at the pixels of `to`.

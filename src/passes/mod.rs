@@ -15,7 +15,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-pub use layers::{Layer, PassChannels, choose, choose_like, layers, read, read_layer, rgb_layers};
+pub use layers::{
+    Layer, PassChannels, choose, choose_like, layers, read, read_layer, read_light_groups, rgb_layers,
+};
 pub use names::{COMBINED, NOISY_IMAGE, POSITION_AOV, is_bare};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};
@@ -65,6 +67,8 @@ pub enum Pass {
     Emission,
     /// Background seen directly, RGB.
     Environment,
+    /// What shadow catchers leave of the light behind them: 1 without shadow, RGB.
+    ShadowCatcher,
     /// Distance from the camera of the first sample, one channel; 1e10 where nothing is hit.
     Depth,
     /// Motion to the previous (XY) and next (ZW) frame in pixels, four channels.
@@ -73,7 +77,7 @@ pub enum Pass {
 
 impl Pass {
     /// Every pass.
-    pub const ALL: [Pass; 23] = [
+    pub const ALL: [Pass; 24] = [
         Pass::Combined,
         Pass::Alpha,
         Pass::Normal,
@@ -95,6 +99,7 @@ impl Pass {
         Pass::VolumeIndirect,
         Pass::Emission,
         Pass::Environment,
+        Pass::ShadowCatcher,
         Pass::Depth,
         Pass::Vector,
     ];

@@ -12,6 +12,13 @@ pub const NOISY_IMAGE: &str = "Noisy Image";
 
 /// The renderer's image.
 pub const COMBINED: &str = "Combined";
+/// What the names of light groups begin with (Cycles' `engine.py`); the group's own name follows.
+const LIGHT_GROUP: &str = "Combined_";
+
+/// The light group whose pass has that name.
+pub fn light_group(pass: &str) -> Option<&str> {
+    pass.strip_prefix(LIGHT_GROUP).filter(|group| !group.is_empty() && !group.contains('.'))
+}
 
 /// How the components of a pass are named; alternatives are tried in order.
 type Components = &'static [&'static [&'static str]];
@@ -67,6 +74,7 @@ pub const TABLE: &[Row] = &[
     row!(VolumeIndirect, ["Volume Indirect", "VolumeInd"], RGB, "Light > Volume > Indirect"),
     row!(Emission, ["Emission", "Emit"], RGB, "Light > Emission"),
     row!(Environment, ["Environment", "Env"], RGB, "Light > Environment"),
+    row!(ShadowCatcher, ["Shadow Catcher"], RGB, "Light > Shadow Catcher"),
     row!(DenoisingNormal, ["Denoising Normal"], XYZ, "Data > Denoising Data"),
     row!(DenoisingAlbedo, ["Denoising Albedo"], RGB, "Data > Denoising Data"),
     row!(DenoisingDepth, ["Denoising Depth"], DEPTH, "Data > Denoising Data"),
@@ -113,6 +121,14 @@ impl ChannelName {
             prefix = head;
         }
         let (view_layer, pass) = prefix.rsplit_once('.').unwrap_or(("", prefix));
+        // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`.
+        let (head, owner) = view_layer.rsplit_once('.').unwrap_or(("", view_layer));
+        let is_of_pass = light_group(owner).is_some() || TABLE.iter().any(|row| row.names.contains(&owner));
+        let (view_layer, pass) = if is_of_pass {
+            (head, &prefix[prefix.len() - owner.len() - 1 - pass.len()..])
+        } else {
+            (view_layer, pass)
+        };
         // Single-layer images: `R G B A`, and `Z` for depth. In a view layer such a name is an AOV's.
         let bare = view_layer.is_empty() && (pass.is_empty() || is_bare(pass));
         let (pass, component) = match (bare, component) {
@@ -157,6 +173,8 @@ mod tests {
         check("ViewLayer.Beauty.R", None, &[], ("ViewLayer", "Beauty", None, "R"));
         check("X", Some("Normal"), &[], ("", "Normal", None, "X"));
         check("ViewLayer.Combined.R", Some("any part"), &[], ("ViewLayer", "Combined", None, "R"));
+        check("a.Diffuse Direct.Denoised.R", None, &[], ("a", "Diffuse Direct.Denoised", None, "R"));
+        check("a.b.Combined_Key.Denoised.R", None, &[], ("a.b", "Combined_Key.Denoised", None, "R"));
     }
 
     #[test]

@@ -8,7 +8,7 @@ mod progress;
 
 use std::{path::PathBuf, process::ExitCode};
 
-use clap::Args as ClapArgs;
+use clap::{Args as ClapArgs, ValueEnum};
 use frames::Frames;
 use progress::{Progress, Style};
 
@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    denoise::{self, Batch, End, Job, Options, Outcome, preview},
+    denoise::{self, Alpha, Batch, End, Job, Options, Outcome, preview},
     frame::prepare_folder,
     models,
 };
@@ -82,6 +82,14 @@ pub struct Args {
     #[arg(long)]
     preview: bool,
 
+    /// What becomes of alpha: denoised with the beauty's kernels, or kept; auto denoises it where it varies
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = AlphaChoice::Auto)]
+    alpha: AlphaChoice,
+
+    /// Denoise the light passes and light groups as well: they add up to the denoised beauty
+    #[arg(long)]
+    passes: bool,
+
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
@@ -89,6 +97,14 @@ pub struct Args {
     /// Print failures alone
     #[arg(long, short)]
     quiet: bool,
+}
+
+/// The values of `--alpha`.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum AlphaChoice {
+    Auto,
+    Denoise,
+    Keep,
 }
 
 /// Runs the batch.
@@ -122,6 +138,12 @@ pub fn run(args: Args) -> Result<ExitCode> {
         preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
         temporal: args.temporal.map(usize::from),
+        alpha: match args.alpha {
+            AlphaChoice::Auto => Alpha::Auto,
+            AlphaChoice::Denoise => Alpha::Denoise,
+            AlphaChoice::Keep => Alpha::Keep,
+        },
+        passes: args.passes,
     };
     let style = match (args.json, args.quiet) {
         (true, _) => Style::Json,

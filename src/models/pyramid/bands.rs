@@ -7,13 +7,15 @@
 use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
+use rayon::prelude::*;
 
 use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
 use crate::{
     Result,
+    companion::{Companion, Kind},
     features::{
         self, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
-        guide_rows, keep_black, noisy_guides, normal_of_target,
+        guide_rows, keep_black, noisy_guides, normal_of_target, tame_alike,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{Shape, blend::Place},
@@ -29,8 +31,8 @@ type Field = crate::nn::Field<NoneTape>;
 /// Pixels of a band: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
 const BAND_PIXELS: usize = 9 << 14;
 
-/// Denoised radiance of a frame, (3, H, W). `guides` are its clean albedo and normal, where they are known; `rows` those of a
-/// band, if the user has an opinion.
+/// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean albedo and
+/// normal, where they are known; `rows` those of a band, if the user has an opinion.
 ///
 /// # Errors
 /// A pass is missing.
@@ -38,6 +40,7 @@ pub fn infer(
     network: &Pyramid,
     passes: &PassSet,
     guides: Option<&PassSet>,
+    companions: &mut [Companion],
     rows: Option<usize>,
 ) -> Result<Planes> {
     let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
@@ -49,11 +52,17 @@ pub fn infer(
     // Normal and albedo of what the refit has under way.
     let mut clean: [Planes; 2] = Default::default();
     let mut image = Planes::default();
-    let mut write = |first: usize, parts: Vec<Planes>| {
+    let kinds: Vec<Kind> = companions.iter().map(|companion| companion.kind).collect();
+    let mut written: Vec<Planes> = kinds.iter().map(|_| Planes::default()).collect();
+    let mut write = |first: usize, mut parts: Vec<Planes>| {
+        let of_companions = parts.split_off(3);
         let [part, normal, albedo] = parts.try_into().expect("radiance, normal and albedo");
         let end = first + part.height;
         append(&mut image, size, first, part);
+        written.iter_mut().zip(of_companions).for_each(|(all, part)| append(all, size, first, part));
         let first = refit.done();
+        let before = if kinds.contains(&Kind::Light) { end - first } else { 0 };
+        let before = image.window((0, first), (size.0, before));
         for (clean, new) in clean.iter_mut().zip([normal, albedo]) {
             *clean = if clean.height == 0 { new } else { clean.above(&new) };
         }
@@ -61,21 +70,44 @@ pub fn infer(
         let samples = Samples::Rendered(&radiance.data, exposure);
         refit.advance(guides, &mut image.data, samples, end, |v, factor| *v = *v * factor * exposure.recip());
         let done = refit.done() - first;
+        for (light, _) in written.iter_mut().zip(&kinds).filter(|(_, kind)| **kind == Kind::Light) {
+            follow(light, (&before, &image), first, done, exposure.recip());
+        }
         for clean in &mut clean {
             *clean = clean.window((0, done), (size.0, clean.height - done));
         }
         Ok(())
     };
-    let mut beauty = Feed::new(network, size, cut.rows);
+    let mut beauty = Feed::new(network, size, cut.rows, &kinds);
     let shading = Shading::of(passes, exposure, NEEDED_BY)?;
     let mut feed = |rows: Range<usize>, [albedo, normal]: [Planes; 2]| {
         let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
-        let padded = cut.padded(&rows);
+        let (padded, seen) = (cut.padded(&rows), rows.clone());
         let refined = Refined { albedo, normal, shading }.padded_to(padded);
         let band = guide_rows(passes, rows, padded, exposure, NEEDED_BY)?;
         // A refit takes exposed radiance, and scales it last.
         let inputs = Inputs { scale: 1.0, ..features::guides(&band, refined, exposure, NEEDED_BY)? };
-        beauty.push(inputs, &mut write)
+        let divisor = &inputs.planes[1];
+        let tamed = band.require(Pass::Combined, NEEDED_BY)?;
+        let noisy = if kinds.contains(&Kind::Light) {
+            radiance.padded_rows(seen.clone(), padded)
+        } else {
+            Planes::default()
+        };
+        let divided = companions.iter().map(|companion| {
+            let mut planes = companion.planes.padded_rows(seen.clone(), padded);
+            if companion.kind == Kind::Light {
+                tame_alike(&mut planes, &noisy, tamed);
+            }
+            let scale = if companion.kind == Kind::Light { exposure } else { 1.0 };
+            if companion.kind != Kind::Share {
+                let values = planes.data.par_iter_mut().zip(&divisor.data);
+                values.for_each(|(value, divisor)| *value = *value * scale / divisor);
+            }
+            planes
+        });
+        let divided = divided.collect();
+        beauty.push(inputs, divided, &mut write)
     };
     if let Some(guides) = guides {
         for band in cut.bands() {
@@ -103,7 +135,29 @@ pub fn infer(
         })?;
     }
     keep_black(&mut image, radiance, albedo);
+    for (companion, mut planes) in companions.iter_mut().zip(written) {
+        match companion.kind {
+            Kind::Light => keep_black(&mut planes, radiance, albedo),
+            // What is nothing all around stays nothing.
+            Kind::Share => keep_black(&mut planes, &companion.planes, &companion.planes),
+            Kind::Colour => {}
+        }
+        companion.planes = planes;
+    }
     Ok(image)
+}
+
+/// Changes `done` rows of a light, from row `first` on, as a refit changed the beauty: to the `scale` of the result, times the
+/// beauty after over the beauty `before`, which begins at that row.
+fn follow(light: &mut Planes, (before, after): (&Planes, &Planes), first: usize, done: usize, scale: f32) {
+    let (width, pixels) = (light.width, light.pixels());
+    light.data.par_chunks_mut(pixels).enumerate().for_each(|(c, plane)| {
+        let of_rows = first * width..(first + done) * width;
+        let beauty = before.channel(c).iter().zip(&after.channel(c)[of_rows.clone()]);
+        for (value, (before, after)) in plane[of_rows].iter_mut().zip(beauty) {
+            *value *= if *before == 0.0 { scale } else { after / before };
+        }
+    });
 }
 
 /// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them, each (3, H, W).
@@ -129,11 +183,11 @@ fn prefilter_bands(
 ) -> Result<()> {
     let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
     passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
-    let mut feed = Feed::new(prefilter, (passes.width, passes.height), cut.rows);
+    let mut feed = Feed::new(prefilter, (passes.width, passes.height), cut.rows, &[]);
     for band in cut.bands() {
         let padded = cut.padded(&band);
         let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
-        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, done)?;
+        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, Vec::new(), done)?;
     }
     Ok(())
 }
@@ -196,22 +250,24 @@ struct Feed<'a> {
 }
 
 impl<'a> Feed<'a> {
-    fn new(network: &'a Pyramid, size: (usize, usize), band: usize) -> Self {
-        let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band);
+    fn new(network: &'a Pyramid, size: (usize, usize), band: usize, companions: &[Kind]) -> Self {
+        let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band, companions);
         Self { frame, size }
     }
 
     /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, each (3, R, W), and
-    /// its first row: radiance, in its scale, the normal, and what radiance was divided by; of a prefilter albedo and normal, in
-    /// their scale.
+    /// its first row: radiance, in its scale, the normal, what radiance was divided by, and the companions, which come in divided
+    /// alike; of a prefilter albedo and normal, in their scale.
     fn push(
         &mut self,
         Inputs { planes, scale }: Inputs,
+        companions: Vec<Planes>,
         done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
     ) -> Result<()> {
         let (width, height) = self.size;
-        // Normal and albedo of radiance have none.
-        let scales = if self.frame.network.denoises_guides() { [scale; 3] } else { [scale, 1.0, 1.0] };
+        // What goes with radiance has none.
+        let others = if self.frame.network.denoises_guides() { scale } else { 1.0 };
+        let scales = || std::iter::once(scale).chain(std::iter::repeat(others));
         let mut result = Ok(());
         let mut hand_out = |first: usize, fields: &[Field]| {
             let (_, _, h, w) = fields[0].extent();
@@ -226,9 +282,9 @@ impl<'a> Feed<'a> {
                     into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
                 })
             };
-            result = done(first, fields.iter().zip(scales).map(part).collect());
+            result = done(first, fields.iter().zip(scales()).map(part).collect());
         };
-        self.frame.push(planes);
+        self.frame.push(planes, companions);
         self.frame.advance(&mut hand_out);
         while self.frame.is_whole() && !self.frame.is_done() {
             self.frame.advance(&mut hand_out);
@@ -254,6 +310,8 @@ struct Frame<'a> {
     /// to divide.
     quotient: Line<Field>,
     ratio: Line<Field>,
+    /// Companions wait for the same. They are the images of each scale after the first.
+    companions: Vec<(Kind, Line<Field>)>,
     /// What normals tell of the light, until the network says how far to follow it.
     shading: Line<Field>,
     /// Logits of the gains, a field for each kernel of full resolution.
@@ -276,7 +334,7 @@ struct Decoded {
 
 /// A level of the pyramid.
 struct Scale {
-    /// What is filtered: radiance, or albedo and normal.
+    /// What is filtered: radiance and its companions, or albedo and normal.
     images: Vec<Filtered>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet blended, and for those not yet filtered.
@@ -296,7 +354,7 @@ struct Filtered {
 }
 
 impl<'a> Frame<'a> {
-    fn new(network: &'a Pyramid, height: usize, band: usize) -> Self {
+    fn new(network: &'a Pyramid, height: usize, band: usize, companions: &[Kind]) -> Self {
         let rows = |level: usize| height >> (level + 1);
         let encoder = || {
             let level = |l| Encoded {
@@ -313,7 +371,7 @@ impl<'a> Frame<'a> {
             blended: Line::new(height >> s),
             smooth: Line::new(height >> s),
         };
-        let images = if network.denoises_guides() { 2 } else { 1 };
+        let images = if network.denoises_guides() { 2 } else { 1 + companions.len() };
         let scale = |s: usize| Scale {
             images: (0..images).map(|_| filtered(s)).collect(),
             confidence: Line::new(height >> s),
@@ -331,26 +389,29 @@ impl<'a> Frame<'a> {
             normal: Line::new(height),
             quotient: Line::new(height),
             ratio: Line::new(height),
+            companions: companions.iter().map(|kind| (*kind, Line::new(height))).collect(),
             shading: Line::new(height),
             gains: VecDeque::new(),
         }
     }
 
     /// Adds the inputs of the next rows.
-    fn push(&mut self, inputs: Vec<Planes>) {
+    fn push(&mut self, inputs: Vec<Planes>, companions: Vec<Planes>) {
         let mut inputs = inputs.into_iter();
         let mut next = || inputs.next().expect("`guides` makes seven planes, `noisy_guides` four");
         let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
         let [image, second, radiance, guide] = std::array::from_fn(|_| next());
-        if let [first, normal] = &mut self.scales[0].images[..] {
-            first.image.push(field(image));
-            normal.image.push(field(second));
+        if self.network.denoises_guides() {
+            let images = self.scales[0].images.iter_mut().zip([image, second]);
+            images.for_each(|(filtered, planes)| filtered.image.push(field(planes)));
         } else {
             self.quotient.push(field(image));
             self.albedo.push(field(second));
             self.ratio.push(field(next()));
             self.shading.push(field(next()));
             self.normal.push(field(next()));
+            let lines = self.companions.iter_mut().zip(companions);
+            lines.for_each(|((_, line), planes)| line.push(field(planes)));
         }
         let layers = self.network.encoders.iter().map(|encoder| &encoder.levels[0][0]);
         for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip([radiance, guide]) {
@@ -430,7 +491,15 @@ impl<'a> Frame<'a> {
                 let rows = 2 * rows.start..2 * rows.end;
                 if let Some((divisor, shade)) = refined {
                     let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
-                    self.scales[0].images[0].image.push(quotient.redivide(ratio, divisor));
+                    let (beauty, others) = self.scales[0].images.split_at_mut(1);
+                    for (filtered, (kind, line)) in others.iter_mut().zip(&self.companions) {
+                        let planes = line.rows(rows.clone());
+                        filtered.image.push(match kind {
+                            Kind::Light | Kind::Colour => planes.redivide(ratio.fork(), divisor.fork()),
+                            Kind::Share => planes,
+                        });
+                    }
+                    beauty[0].image.push(quotient.redivide(ratio, divisor));
                     gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
                 }
                 self.gains.push_back(gain);
@@ -490,24 +559,35 @@ impl<'a> Frame<'a> {
             let trust = confidence.rows(near.clone());
             let sources: Vec<Field> =
                 images.iter().map(|image| image.source(scale).rows(near.clone())).collect();
-            let outputs = match &sources[..] {
-                [image, normal] => Field::filter_rows([image, normal], inside, &kernel, &trust).into(),
+            // Of images that are filtered together, each weight is computed once.
+            let filtered_together = |images: &[Field]| match images {
+                [a, b, c] => Field::filter_rows([a, b, c], inside, &kernel, &trust).into(),
+                [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
                 images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
             };
+            let outputs = sources.chunks(3).flat_map(filtered_together);
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let mut outputs = outputs.into_iter();
+            let mut outputs = outputs;
             let image = outputs.next().expect("something is filtered");
-            if let Some(normal) = outputs.next() {
+            if self.network.denoises_guides() {
+                let normal = outputs.next().expect("guides are two");
                 done(rows.start, &[image.amplify(gain), normal]);
                 continue;
             }
             let [normal, albedo] = [&self.normal, &self.albedo].map(|line| line.rows(rows.clone()));
-            done(rows.start, &[image.product(albedo.fork()).amplify(gain), normal, albedo]);
+            let companions = outputs.zip(&self.companions).map(|(planes, (kind, _))| match kind {
+                Kind::Light => planes.product(albedo.fork()).amplify(gain.fork()),
+                Kind::Colour => planes.product(albedo.fork()),
+                Kind::Share => planes,
+            });
+            let companions: Vec<Field> = companions.collect();
+            let beauty = [image.product(albedo.fork()).amplify(gain), normal, albedo];
+            done(rows.start, &beauty.into_iter().chain(companions).collect::<Vec<_>>());
         }
     }
 
@@ -546,6 +626,7 @@ impl<'a> Frame<'a> {
         let Scale { images, filtered, .. } = &self.scales[0];
         let divided = images[0].image.end();
         self.quotient.forget(divided);
+        self.companions.iter_mut().for_each(|(_, line)| line.forget(divided));
         self.ratio.forget(divided);
         self.shading.forget(divided);
         self.albedo.forget(*filtered);

@@ -1,0 +1,53 @@
+//! Companions: layers of a frame that are denoised along with its beauty, by what the beauty's network decides.
+//!
+//! A network that predicts kernels decides from the beauty and its guides which neighbours each pixel is averaged
+//! with. Those averages, and all that follows them, are linear in the radiance. So any layer can go the same way: light
+//! passes that add up to the beauty add up to the denoised beauty, and alpha keeps fitting the colours it goes with.
+
+use crate::planes::Planes;
+
+/// How far a companion goes the beauty's way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A part of the beauty's light: all that happens to the beauty happens to it, so that parts keep adding up.
+    Light,
+    /// A surface's colour. It is divided by the albedo, averaged by the beauty's kernels and multiplied again, so that
+    /// texture stays sharp, but gets none of the gains by which light is corrected.
+    Colour,
+    /// A share, such as alpha: an average by the beauty's kernels alone, so that it stays between the least and the most
+    /// of what was rendered.
+    Share,
+}
+
+/// A layer that is denoised along with the beauty.
+#[derive(Clone, Debug)]
+pub struct Companion {
+    /// What becomes of it.
+    pub kind: Kind,
+    /// Noisy before, denoised after, (3, H, W). A layer of one channel has it three times.
+    pub planes: Planes,
+}
+
+impl Companion {
+    /// A layer as rendered.
+    ///
+    /// # Panics
+    /// If it has neither one nor three channels.
+    pub fn new(kind: Kind, planes: Planes) -> Self {
+        let planes = match planes.channels {
+            1 => Planes::from_rows(3, (planes.width, planes.height), |_, y, row| {
+                row.copy_from_slice(&planes.data[y * planes.width..][..planes.width]);
+            }),
+            channels => {
+                assert_eq!(channels, 3, "layers have one channel or three");
+                planes
+            }
+        };
+        Self { kind, planes }
+    }
+
+    /// The same layer with other pixels.
+    pub fn with(&self, planes: Planes) -> Self {
+        Self { kind: self.kind, planes }
+    }
+}

@@ -1,0 +1,181 @@
+//! The layers of a frame that go along with its beauty: alpha, and the light passes of which Cycles makes it.
+//!
+//! Cycles adds up Combined as `(direct + indirect) * colour` of diffuse, glossy and transmissive surfaces, plus volumes, emission
+//! and environment; or as the sum of the light groups. A light pass that is stored without its colour is denoised with it and
+//! divided by the denoised colour afterwards, so that the same sum over the results is the denoised Combined.
+
+use half::f16;
+
+use super::Options;
+use crate::{
+    companion::{Companion, Kind},
+    frame::{Frame, SampleKind},
+    models::Denoiser,
+    passes::{Layer, Pass, PassChannels},
+    planes::Planes,
+    shot::Shot,
+};
+
+/// What becomes of alpha.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Alpha {
+    /// It is denoised where it differs from pixel to pixel and the model can, and else kept.
+    #[default]
+    Auto,
+    /// It is denoised.
+    Denoise,
+    /// It stays as rendered.
+    Keep,
+}
+
+/// Light that is stored divided by a colour, and that colour.
+const LIT: [([Pass; 2], Pass); 3] = [
+    ([Pass::DiffuseDirect, Pass::DiffuseIndirect], Pass::DiffuseColor),
+    ([Pass::GlossyDirect, Pass::GlossyIndirect], Pass::GlossyColor),
+    ([Pass::TransmissionDirect, Pass::TransmissionIndirect], Pass::TransmissionColor),
+];
+
+/// Light that is stored as it is added.
+const ADDED: [Pass; 4] = [Pass::VolumeDirect, Pass::VolumeIndirect, Pass::Emission, Pass::Environment];
+
+/// A denoised colour is at least this where there is light to be divided by it: enough for half floats to hold it exactly
+/// enough, and too little to be seen.
+const LEAST_COLOUR: f32 = 1e-3;
+
+/// Every pass that may go along, but for alpha.
+pub fn light_passes() -> Vec<Pass> {
+    let lit = LIT.iter().flat_map(|(lights, colour)| [lights[0], lights[1], *colour]);
+    lit.chain(ADDED).chain([Pass::ShadowCatcher]).collect()
+}
+
+/// Where a companion comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// A pass.
+    Pass(Pass),
+    /// The light group of that name.
+    LightGroup(String),
+}
+
+impl Source {
+    /// Where it is stored in a frame.
+    pub fn channels<'a>(&self, layer: &'a Layer) -> &'a PassChannels {
+        match self {
+            Self::Pass(pass) => &layer.passes[pass],
+            Self::LightGroup(name) => &layer.light_groups[name],
+        }
+    }
+}
+
+/// The layers that go along with a beauty.
+#[derive(Default)]
+pub struct Along {
+    sources: Vec<Source>,
+    /// As many, for the model.
+    pub companions: Vec<Companion>,
+}
+
+impl Along {
+    /// Takes out of a shot what is to go along, and says what cannot.
+    pub fn take(shot: &mut Shot, model: &dyn Denoiser, options: &Options, notes: &mut Vec<String>) -> Self {
+        let mut along = Self::default();
+        let denoises_alpha = match options.alpha {
+            Alpha::Keep => false,
+            Alpha::Denoise => true,
+            Alpha::Auto => {
+                let varies = |alpha: &Planes| alpha.data.iter().any(|v| *v != alpha.data[0]);
+                model.takes_companions() && shot.passes.get(Pass::Alpha).is_some_and(varies)
+            }
+        };
+        if denoises_alpha && let Some(alpha) = shot.passes.get(Pass::Alpha) {
+            along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha.clone());
+        }
+        if options.passes {
+            along.take_lights(shot, notes);
+        }
+        along
+    }
+
+    fn push(&mut self, source: Source, kind: Kind, planes: Planes) {
+        self.sources.push(source);
+        self.companions.push(Companion::new(kind, planes));
+    }
+
+    fn take_lights(&mut self, shot: &mut Shot, notes: &mut Vec<String>) {
+        for (lights, colour) in LIT {
+            let held = lights.map(|light| shot.passes.get(light).is_some());
+            let Some(colours) = shot.passes.remove(colour) else {
+                if let Some(light) = lights.iter().zip(held).find_map(|(light, held)| held.then_some(light)) {
+                    let setting = colour.blender_setting();
+                    notes.push(format!(
+                        "{light} is not denoised: it takes {colour}, which is missing; {setting}"
+                    ));
+                }
+                continue;
+            };
+            for light in lights {
+                if let Some(mut planes) = shot.passes.remove(light) {
+                    planes.data.iter_mut().zip(&colours.data).for_each(|(light, colour)| *light *= colour);
+                    self.push(Source::Pass(light), Kind::Light, planes);
+                }
+            }
+            if held.contains(&true) {
+                self.push(Source::Pass(colour), Kind::Colour, colours);
+            }
+        }
+        for pass in ADDED {
+            if let Some(planes) = shot.passes.remove(pass) {
+                self.push(Source::Pass(pass), Kind::Light, planes);
+            }
+        }
+        if let Some(planes) = shot.passes.remove(Pass::ShadowCatcher) {
+            self.push(Source::Pass(Pass::ShadowCatcher), Kind::Share, planes);
+        }
+        for (name, planes) in std::mem::take(&mut shot.light_groups) {
+            self.push(Source::LightGroup(name), Kind::Light, planes);
+        }
+        if !self.sources.iter().any(|source| *source != Source::Pass(Pass::Alpha)) {
+            notes.push(
+                "holds no light passes to denoise; turn on View Layer Properties > Passes > Light, or light groups".into(),
+            );
+        }
+    }
+
+    /// The layers as they are to be stored, once the model has denoised them: alpha, (1, H, W), and all others, (3, H, W).
+    pub fn finish(self, frame: &Frame, layer: &Layer) -> (Option<Planes>, Vec<(Source, Planes)>) {
+        let denoised = self.companions.into_iter().map(|companion| companion.planes);
+        let mut done: Vec<(Source, Planes)> = self.sources.into_iter().zip(denoised).collect();
+        let alpha = done.iter().position(|(source, _)| *source == Source::Pass(Pass::Alpha));
+        let alpha = alpha.map(|at| {
+            let (_, alpha) = done.remove(at);
+            let first = alpha.channel(0).iter().map(|share| share.clamp(0.0, 1.0));
+            Planes::from_vec(1, alpha.width, alpha.height, first.collect())
+        });
+        for (lights, colour) in LIT {
+            divide(&mut done, lights, colour, frame, layer);
+        }
+        (alpha, done)
+    }
+}
+
+/// Divides denoised light by its denoised colour, which is first made what the file can store of it.
+fn divide(done: &mut [(Source, Planes)], lights: [Pass; 2], colour: Pass, frame: &Frame, layer: &Layer) {
+    let find = |done: &[(Source, Planes)], pass| done.iter().position(|(s, _)| *s == Source::Pass(pass));
+    let Some(at) = find(done, colour) else { return };
+    let lights: Vec<usize> = lights.into_iter().filter_map(|light| find(done, light)).collect();
+    let stored = layer.passes.get(&colour).map(|at| frame.parts()[at.part].channels[at.channels[0]].kind);
+    let mut colours = std::mem::take(&mut done[at].1);
+    for (i, colour) in colours.data.iter_mut().enumerate() {
+        if lights.iter().any(|&light| done[light].1.data[i] > 0.0) {
+            *colour = colour.max(LEAST_COLOUR);
+        }
+        if stored == Some(SampleKind::Half) {
+            *colour = f16::from_f32(*colour).to_f32();
+        }
+    }
+    for light in lights {
+        let values = done[light].1.data.iter_mut().zip(&colours.data);
+        values.for_each(|(light, colour)| *light = if *colour > 0.0 { *light / colour } else { 0.0 });
+    }
+    done[at].1 = colours;
+}
