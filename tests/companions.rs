@@ -1,0 +1,187 @@
+//! Layers that go along with the beauty, on a render that Cycles makes here: what light passes add up to, and alpha.
+
+mod common;
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+    sync::LazyLock,
+};
+
+use common::python::{self, run};
+use demc::passes::{self, Pass, PassSet};
+use predicates::str::contains;
+use tempfile::TempDir;
+
+/// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4 and of 256 samples.
+static RENDERS: LazyLock<TempDir> = LazyLock::new(|| {
+    let folder = tempfile::tempdir().unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data/light_passes.py");
+    for (name, options) in [("sky", &["4"][..]), ("film", &["4", "film"]), ("clean", &["256", "film"])] {
+        let path = folder.path().join(format!("{name}.exr"));
+        run(Command::new(python::python()).arg(&script).arg(path).args(options));
+    }
+    folder
+});
+
+fn render(name: &str) -> PathBuf {
+    RENDERS.path().join(name)
+}
+
+fn denoise(name: &str, out: &Path, arguments: &str) -> PathBuf {
+    let mut command = common::demc();
+    command.arg("denoise").arg(render(name)).arg("--out").arg(out);
+    command.args(arguments.split_whitespace()).assert().success();
+    out.join(name)
+}
+
+/// Three channels of a layer of the result, one after the other.
+fn layer(path: &Path, name: &str) -> Vec<f32> {
+    let frame = demc::frame::Frame::read(path).unwrap();
+    let parts = frame.parts();
+    let find = |c: &str| {
+        let full = format!("ViewLayer.{name}.{c}");
+        let at = |part: &demc::frame::Part| part.channels.iter().position(|channel| channel.name == full);
+        parts
+            .iter()
+            .enumerate()
+            .find_map(|(p, part)| Some((p, at(part)?)))
+            .unwrap_or_else(|| panic!("{full}"))
+    };
+    let read = |c: &str| {
+        let (part, channel) = find(c);
+        frame.decode(part, &[&[channel]]).unwrap().remove(0)
+    };
+    ["R", "G", "B"].map(read).concat()
+}
+
+/// What Cycles makes Combined of, of layers by these names: an environment that a transparent film does not show is no part.
+fn sum_of_passes(name: &str, read: impl Fn(&str) -> Vec<f32>) -> Vec<f32> {
+    let mut sum = vec![0.0; read("Emission").len()];
+    for kind in ["Diffuse", "Glossy", "Transmission"] {
+        let [direct, indirect, colour] =
+            ["Direct", "Indirect", "Color"].map(|part| read(&format!("{kind} {part}")));
+        for (i, sum) in sum.iter_mut().enumerate() {
+            *sum += (direct[i] + indirect[i]) * colour[i];
+        }
+    }
+    let environment = (name == "sky.exr").then_some("Environment");
+    for pass in ["Volume Direct", "Volume Indirect", "Emission"].into_iter().chain(environment) {
+        sum.iter_mut().zip(read(pass)).for_each(|(sum, light)| *sum += light);
+    }
+    sum
+}
+
+#[track_caller]
+fn assert_adds_up(sum: &[f32], whole: &[f32], what: &str) {
+    for (i, (sum, whole)) in sum.iter().zip(whole).enumerate() {
+        assert!((sum - whole).abs() <= 1e-3 * whole.abs() + 1e-6, "{what}, value {i}: {sum} for {whole}");
+    }
+}
+
+#[test]
+fn light_passes_and_light_groups_add_up_to_the_denoised_beauty() {
+    let out = tempfile::tempdir().unwrap();
+    for name in ["sky.exr", "film.exr"] {
+        let rendered = layer(&render(name), "Combined");
+        assert_adds_up(&sum_of_passes(name, |pass| layer(&render(name), pass)), &rendered, "Cycles' own sum");
+        for model in ["demc-s", "demc-m:f32", "demc-l"] {
+            let what = format!("{model} on {name}");
+            let done = denoise(name, out.path(), &format!("--model {model} --passes --overwrite"));
+            let beauty = layer(&done, "Denoised");
+            assert!(beauty != rendered, "{what} did something");
+            assert_adds_up(
+                &sum_of_passes(name, |pass| layer(&done, &format!("{pass}.Denoised"))),
+                &beauty,
+                &what,
+            );
+            // The beauty is what it is without them.
+            let alone = tempfile::tempdir().unwrap();
+            let alone = denoise(name, alone.path(), &format!("--model {model}"));
+            assert_eq!(beauty, layer(&alone, "Denoised"), "{what}");
+            if name == "film.exr" {
+                continue; // the world's group holds the sky, which the film does not show
+            }
+            let [mut groups, rest] = ["Key", "Rest"].map(|g| layer(&done, &format!("Combined_{g}.Denoised")));
+            groups.iter_mut().zip(rest).for_each(|(sum, light)| *sum += light);
+            assert_adds_up(&groups, &beauty, &format!("light groups, {what}"));
+        }
+    }
+}
+
+#[test]
+fn light_passes_are_replaced_where_the_beauty_is() {
+    let out = tempfile::tempdir().unwrap();
+    let added = layer(&denoise("sky.exr", out.path(), "--model demc-s --passes"), "Glossy Direct.Denoised");
+    let done = denoise("sky.exr", out.path(), "--model demc-s --passes --replace --overwrite");
+    assert_adds_up(
+        &sum_of_passes("sky.exr", |pass| layer(&done, pass)),
+        &layer(&done, "Combined"),
+        "replaced",
+    );
+    assert_eq!(layer(&done, "Glossy Direct"), added);
+    assert_eq!(layer(&done, "Denoising Albedo"), layer(&render("sky.exr"), "Denoising Albedo"));
+}
+
+#[test]
+fn a_result_without_light_passes_is_not_taken_for_one_with_them() {
+    let out = tempfile::tempdir().unwrap();
+    denoise("sky.exr", out.path(), "--model demc-s");
+    let again = |arguments: &str| {
+        let mut command = common::demc();
+        command.arg("denoise").arg(render("sky.exr")).arg("--out").arg(out.path());
+        command.args(arguments.split_whitespace()).assert()
+    };
+    again("--model demc-s --passes").code(1).stderr(contains("without denoised light passes"));
+    again("--model demc-s --passes --overwrite").success();
+    again("--model demc-s --passes").success();
+    again("--model noisy --passes --overwrite").code(1).stderr(contains("takes demc-s, demc-m or demc-l"));
+}
+
+fn over_white(set: &PassSet, pass: (&[f32], &[f32])) -> Vec<f32> {
+    let (light, alpha) = pass;
+    let pixels = set.width * set.height;
+    light.iter().enumerate().map(|(i, light)| light + 1.0 - alpha[i % pixels]).collect()
+}
+
+#[test]
+fn alpha_is_denoised_with_the_beauty_and_fits_it_over_any_background() {
+    let out = tempfile::tempdir().unwrap();
+    let noisy = passes::load(render("film.exr"), None).unwrap();
+    let clean = passes::load(render("clean.exr"), None).unwrap();
+    let of = |set: &PassSet, pass| set.get(pass).unwrap().data.to_vec();
+    let truth = of(&clean, Pass::Alpha);
+    let reference = over_white(&clean, (&of(&clean, Pass::Combined), &truth));
+    let error = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+    for model in ["demc-s", "demc-m", "demc-l"] {
+        let read = |how: &str| {
+            let arguments = format!("--model {model} --alpha {how} --overwrite --replace");
+            passes::load(denoise("film.exr", out.path(), &arguments), None).unwrap()
+        };
+        let (kept, denoised) = (read("keep"), read("auto"));
+        assert_eq!(of(&kept, Pass::Alpha), of(&noisy, Pass::Alpha), "{model}");
+        assert_eq!(of(&kept, Pass::Combined), of(&denoised, Pass::Combined), "{model}");
+        let alpha = of(&denoised, Pass::Alpha);
+        assert!(alpha.iter().all(|v| (0.0..=1.0).contains(v)));
+        let [before, after] = [of(&noisy, Pass::Alpha), alpha.clone()].map(|alpha| error(&alpha, &truth));
+        assert!(after < 0.8 * before, "{model}: alpha is off by {after}, as rendered by {before}");
+        let composed = |set: &PassSet, alpha: &[f32]| {
+            error(&over_white(set, (&of(set, Pass::Combined), alpha)), &reference)
+        };
+        let [with, without] = [composed(&denoised, &alpha), composed(&kept, &of(&kept, Pass::Alpha))];
+        assert!(with < without, "{model}: over white {with}, with the noisy alpha {without}");
+        // Some pixels away from all that is there, nothing comes.
+        let above = &alpha[..6 * clean.width];
+        assert!(
+            truth[..10 * clean.width].iter().all(|v| *v == 0.0) && above.iter().all(|v| *v < 1e-3),
+            "{model}"
+        );
+    }
+}
+
+#[test]
+fn opaque_frames_keep_their_alpha_to_the_bit() {
+    let out = tempfile::tempdir().unwrap();
+    let done = passes::load(denoise("sky.exr", out.path(), "--model demc-s --replace"), None).unwrap();
+    assert!(done.get(Pass::Alpha).unwrap().data.iter().all(|v| *v == 1.0));
+}
