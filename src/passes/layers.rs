@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{
     Pass, PassSet,
-    names::{ChannelName, POSITION_AOV, TABLE, light_group},
+    names::{ChannelName, POSITION_AOV, TABLE, is_pass, light_group},
 };
 use crate::{
     Error, Result,
@@ -87,7 +87,7 @@ fn channels_by_pass(frame: &Frame) -> Vec<(LayerKey, BTreeMap<String, Vec<Unassi
 
 /// Whether a part is called `<view layer>.<pass>`.
 fn ends_in_pass(part: &str) -> bool {
-    part.rsplit_once('.').is_some_and(|(_, tail)| TABLE.iter().any(|row| row.names.contains(&tail)))
+    part.rsplit_once('.').is_some_and(|(_, tail)| is_pass(tail))
 }
 
 /// The view layers of a frame, in file order, once for each stereo view.

@@ -90,6 +90,11 @@ pub fn is_bare(name: &str) -> bool {
     ["rgb", "rgba", "beauty"].iter().any(|bare| bare.eq_ignore_ascii_case(name))
 }
 
+/// Whether the table has a pass of that name.
+pub fn is_pass(name: &str) -> bool {
+    TABLE.iter().any(|row| row.names.contains(&name))
+}
+
 /// What the name of a channel says.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChannelName {
@@ -121,14 +126,13 @@ impl ChannelName {
             prefix = head;
         }
         let (view_layer, pass) = prefix.rsplit_once('.').unwrap_or(("", prefix));
-        // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`.
-        let (head, owner) = view_layer.rsplit_once('.').unwrap_or(("", view_layer));
-        let is_of_pass = light_group(owner).is_some() || TABLE.iter().any(|row| row.names.contains(&owner));
-        let (view_layer, pass) = if is_of_pass {
-            (head, &prefix[prefix.len() - owner.len() - 1 - pass.len()..])
-        } else {
-            (view_layer, pass)
-        };
+        // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a pass's:
+        // a view layer may be called like a pass.
+        let is_rendered = |name: &str| is_pass(name) || light_group(name).is_some();
+        let of_pass =
+            view_layer.rsplit_once('.').filter(|(_, owner)| is_rendered(owner) && !is_rendered(pass));
+        let (view_layer, pass) =
+            of_pass.map_or((view_layer, pass), |(head, _)| (head, &prefix[head.len() + 1..]));
         // Single-layer images: `R G B A`, and `Z` for depth. In a view layer such a name is an AOV's.
         let bare = view_layer.is_empty() && (pass.is_empty() || is_bare(pass));
         let (pass, component) = match (bare, component) {
@@ -175,6 +179,10 @@ mod tests {
         check("ViewLayer.Combined.R", Some("any part"), &[], ("ViewLayer", "Combined", None, "R"));
         check("a.Diffuse Direct.Denoised.R", None, &[], ("a", "Diffuse Direct.Denoised", None, "R"));
         check("a.b.Combined_Key.Denoised.R", None, &[], ("a.b", "Combined_Key.Denoised", None, "R"));
+        // View layers that are called like a pass.
+        check("Environment.Combined.R", None, &[], ("Environment", "Combined", None, "R"));
+        check("Environment.Denoised.R", None, &[], ("Environment", "Denoised", None, "R"));
+        check("a.Depth.Combined.R", None, &[], ("a.Depth", "Combined", None, "R"));
     }
 
     #[test]
