@@ -45,9 +45,4 @@ impl Companion {
         };
         Self { kind, planes }
     }
-
-    /// The same layer with other pixels.
-    pub fn with(&self, planes: Planes) -> Self {
-        Self { kind: self.kind, planes }
-    }
 }

@@ -113,9 +113,7 @@ pub struct Views<T> {
 /// # Errors
 /// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is not demc's.
 pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
-    if let Some(Err(why)) = options.layer.as_deref().map(check_layer_name) {
-        return Err(Error::Usage(format!("layer '{}': {why}", options.layer.as_deref().unwrap_or_default())));
-    }
+    check_options(model, options)?;
     let frame = Frame::read(input)?;
     let layers = passes::layers(&frame);
     let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
@@ -135,16 +133,6 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
     let lights = if options.passes { light_passes() } else { Vec::new() };
     let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion, &lights].concat();
-    if options.passes && !model.takes_companions() {
-        return Err(Error::Usage(format!(
-            "{} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l",
-            model.name()
-        )));
-    }
-    if options.temporal.is_some() && (options.passes || options.alpha == Alpha::Denoise) {
-        let why = "--passes and --alpha denoise work frame by frame; leave out --temporal, or them";
-        return Err(Error::Usage(why.into()));
-    }
     // Beside its stereo views a view layer may hold channels of no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
@@ -175,6 +163,24 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     report.notes.dedup(); // stereo views repeat them
     Ok(Views { frame, views, report })
+}
+
+/// Whether the model can do what is asked for, and all of it at once: known before anything is read.
+fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
+    let wrong = |why: String| Err(Error::Usage(why));
+    if let Some((name, Err(why))) = options.layer.as_deref().map(|name| (name, check_layer_name(name))) {
+        return wrong(format!("layer '{name}': {why}"));
+    }
+    if options.passes && !model.takes_companions() {
+        let name = model.name();
+        return wrong(format!("{name} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l"));
+    }
+    if options.temporal.is_some() && (options.passes || options.alpha == Alpha::Denoise) {
+        return wrong(
+            "--passes and --alpha denoise work frame by frame; leave out --temporal, or them".into(),
+        );
+    }
+    Ok(())
 }
 
 fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {

@@ -1,8 +1,8 @@
 //! The denoise engine: files in, each of them out again with a layer more.
 //!
-//! [`file`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`] and [`store`]
-//! are the steps of which both are made. With [`Options::temporal`], a batch does
-//! frames of a sequence with their neighbours. Nothing is printed: what the user should know is in each frame's [`Report`].
+//! [`file`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`]
+//! and [`store`] are the steps of which both are made. With [`Options::temporal`], a batch does frames of a sequence
+//! with their neighbours. Nothing is printed: what the user should know is in each frame's [`Report`].
 
 mod batch;
 mod job;
@@ -17,7 +17,7 @@ use std::path::Path;
 pub use batch::{Batch, End, Outcome, Stopper, plan};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
 pub use lights::Alpha;
-pub use sequence::follows;
+pub use sequence::{follows, frame_number};
 
 use crate::{Result, models::Denoiser};
 

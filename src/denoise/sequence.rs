@@ -61,6 +61,11 @@ impl Place {
     }
 }
 
+/// The frame number that a file's name ends in; none where it ends in none.
+pub fn frame_number(file: &Path) -> Option<i64> {
+    Place::of(file).map(|place| place.number)
+}
+
 /// Whether a file is the frame after another, by their names.
 pub fn follows(file: &Path, before: &Path) -> bool {
     let [Some(place), Some(before)] = [file, before].map(Place::of) else { return false };
@@ -153,5 +158,20 @@ mod tests {
         );
         assert!(sequences[0].files[&12].ends_with("a.0012.exr"));
         assert!(sequences[3].files[&12].ends_with("a.012.exr"));
+    }
+
+    #[test]
+    fn frame_numbers_end_names() {
+        for (name, expected) in [
+            ("shot_0004spp.0017.exr", Some(17)),
+            ("shot0017.exr", Some(17)),
+            ("a-3/shot-0017.exr", Some(17)),
+            ("shot.-0003.exr", Some(-3)),
+            ("0001.exr", Some(1)),
+            ("shot_0004spp.exr", None),
+            ("shot.exr", None),
+        ] {
+            assert_eq!(frame_number(Path::new(name)), expected, "{name}");
+        }
     }
 }

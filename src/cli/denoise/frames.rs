@@ -1,14 +1,11 @@
 //! `--frames`: which of the inputs are worked on, by the number that ends their names.
 //!
-//! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the files whose names end in one of
-//! these numbers, as Blender writes them: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
+//! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the files
+//! whose names end in one of these numbers, as Blender writes them: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
 
-use std::{
-    path::{Path, PathBuf},
-    str::FromStr,
-};
+use std::{path::PathBuf, str::FromStr};
 
-use crate::{Error, Result, cli::warn_line};
+use crate::{Error, Result, cli::warn_line, denoise::frame_number};
 
 /// Frames as the user lists them.
 #[derive(Clone, Debug)]
@@ -68,7 +65,7 @@ impl Frames {
     /// There is no such file.
     pub fn pick(&self, files: Vec<PathBuf>) -> Result<Vec<PathBuf>> {
         let picked: Vec<PathBuf> =
-            files.into_iter().filter(|file| number(file).is_some_and(|n| self.contains(n))).collect();
+            files.into_iter().filter(|file| frame_number(file).is_some_and(|n| self.contains(n))).collect();
         if picked.is_empty() {
             return Err(Error::Usage(
                 "--frames: none of the inputs has a name that ends in one of these numbers, as in shot.0017.exr"
@@ -76,22 +73,12 @@ impl Frames {
             ));
         }
         for single in self.0.iter().filter(|span| span.first == span.last) {
-            if !picked.iter().any(|file| number(file) == Some(single.first)) {
+            if !picked.iter().any(|file| frame_number(file) == Some(single.first)) {
                 warn_line(&format!("demc: note: --frames {}: no input is of this frame", single.first));
             }
         }
         Ok(picked)
     }
-}
-
-/// The frame that a file's name ends in.
-fn number(file: &Path) -> Option<i64> {
-    let stem = file.file_stem()?.to_str()?;
-    let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
-    let frame: i64 = stem[head.len()..].parse().ok()?;
-    // A minus is the number's where it stands for nothing else: at the beginning or after a dot.
-    let negative = head.strip_suffix('-').is_some_and(|rest| rest.is_empty() || rest.ends_with('.'));
-    Some(if negative { -frame } else { frame })
 }
 
 #[cfg(test)]
@@ -121,21 +108,6 @@ mod tests {
         ] {
             let error = wrong.parse::<Frames>().unwrap_err();
             assert!(error.contains(why), "{wrong}: {error}");
-        }
-    }
-
-    #[test]
-    fn numbers_end_names() {
-        for (name, expected) in [
-            ("shot_0004spp.0017.exr", Some(17)),
-            ("shot0017.exr", Some(17)),
-            ("a-3/shot-0017.exr", Some(17)),
-            ("shot.-0003.exr", Some(-3)),
-            ("0001.exr", Some(1)),
-            ("shot_0004spp.exr", None),
-            ("shot.exr", None),
-        ] {
-            assert_eq!(number(Path::new(name)), expected, "{name}");
         }
     }
 }

@@ -97,8 +97,8 @@ pub fn methods() -> Vec<Method> {
     built_in.chain(others).collect()
 }
 
-/// Reads and decodes a whole file.
-pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
+/// Reads and decodes a whole file. Its noise is described if it `is_compared` with that of another.
+pub fn examine(path: &Path, methods: &[Method], is_compared: bool) -> Result<FileReport> {
     let frame = Frame::read(path)?;
     let parts = frame.parts().iter().map(|p| PartReport {
         name: p.name.clone(),
@@ -128,7 +128,7 @@ pub fn examine(path: &Path, methods: &[Method]) -> Result<FileReport> {
             .push(format!("nothing to denoise: no Combined pass; {}", Pass::Combined.blender_setting()));
     }
     for layer in &layers {
-        let (layer, grain) = examine_layer(&frame, layer, methods)?;
+        let (layer, grain) = examine_layer(&frame, layer, methods, is_compared)?;
         report.layers.push(layer);
         report.grain = report.grain.or(grain);
     }
@@ -167,7 +167,12 @@ fn undecodable_warnings(frame: &Frame) -> Vec<String> {
     warnings
 }
 
-fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<(LayerReport, Option<Grain>)> {
+fn examine_layer(
+    frame: &Frame,
+    layer: &Layer,
+    methods: &[Method],
+    is_compared: bool,
+) -> Result<(LayerReport, Option<Grain>)> {
     let mut grain = None;
     let mut passes = Vec::new();
     let mut warnings = Vec::new();
@@ -187,7 +192,7 @@ fn examine_layer(frame: &Frame, layer: &Layer, methods: &[Method]) -> Result<(La
     };
     if !decodable.is_empty() {
         let set = passes::read_layer(frame, layer, &decodable)?;
-        grain = Grain::of(&set);
+        grain = is_compared.then(|| Grain::of(&set)).flatten();
         for (pass, planes) in set.iter() {
             let report = PassReport {
                 non_finite: Some(planes.non_finite()),

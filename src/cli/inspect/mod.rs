@@ -38,8 +38,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
     // The frame before, while files are frames of one sequence in order.
     let mut before: Option<(PathBuf, Grain)> = None;
+    let is_compared = inputs.files.len() > 1;
     for path in inputs.files {
-        let mut examined = attempt(&path, || examine::examine(&path, &methods));
+        let mut examined = attempt(&path, || examine::examine(&path, &methods, is_compared));
         let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
         if let Ok(report) = &mut examined {
             let grain = report.grain.take();

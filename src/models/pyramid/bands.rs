@@ -565,14 +565,13 @@ impl<'a> Frame<'a> {
                 [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
                 images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
             };
-            let outputs = sources.chunks(3).flat_map(filtered_together);
+            let mut outputs = sources.chunks(3).flat_map(filtered_together);
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let mut outputs = outputs;
             let image = outputs.next().expect("something is filtered");
             if self.network.denoises_guides() {
                 let normal = outputs.next().expect("guides are two");
