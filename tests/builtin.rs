@@ -221,9 +221,7 @@ fn passes_without_a_single_number_still_make_a_finite_image() {
 
 #[test]
 fn radiance_256_times_darker_or_brighter_is_denoised_alike() {
-    let mut plain = window(160, 96);
-    // Light that is seen directly is what the albedo says; all other light has no scale.
-    edit(&mut plain, Pass::DenoisingAlbedo, |v| v.iter_mut().for_each(|v| *v = v.min(0.9)));
+    let plain = window(160, 96);
     for name in ["demc-s", "demc-m", "demc-l"] {
         let model = models::open(name).unwrap();
         let expected = model.denoise(&Shot::new(plain.clone())).unwrap();

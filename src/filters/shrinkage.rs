@@ -13,7 +13,8 @@
 //! tells it.
 //!
 //! Light that the camera sees directly (sky, screens, lamps) has no noise but that of antialiasing. Cycles writes it
-//! into the albedo as well, which tells where it is: such light is kept.
+//! into the albedo as well, which tells where it is: such light is kept. Of few samples, though, antialiasing is noise
+//! like any other: a gap of a blind before a bright sky is a quarter of the sky, or nothing.
 
 use rayon::prelude::*;
 
@@ -89,9 +90,12 @@ const FINAL_POWER: f32 = 0.75;
 /// What a frame is taken for that does not tell its number of samples.
 const UNKNOWN_SAMPLES: u32 = 16;
 
-/// Of no more than the first number of samples, no light is kept that the albedo shows beyond white without being equal to it:
-/// through glass it is noise. From the second on, all is.
+/// Of no more than the first number of samples, no light is kept because the albedo shows it: its antialiasing is noise,
+/// as all of it is through glass. From the second on, all is.
 const KEPT_SAMPLES: (f32, f32) = (16.0, 64.0);
+
+/// A frame whose pixels are all their albedo but for this share is no picture of light on surfaces: all of it is kept.
+const UNLIKE: f64 = 1e-3;
 
 /// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter counts less.
 const ALONE: f32 = 4.0;
@@ -344,7 +348,9 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: 
     let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
     let floor = FLOOR / render.exposure;
     let (few, many) = KEPT_SAMPLES;
-    let keeps = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
+    let is_all_seen = is_all_seen(render);
+    let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
+    let keeps = if is_all_seen { 1.0 } else { by_samples };
     let (red, rest) = image.data.split_at_mut(width * height);
     let (green, blue) = rest.split_at_mut(width * height);
     let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
@@ -371,7 +377,8 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: 
                 });
                 let noisy = radiance.map(|row| row[x].max(0.0));
                 let colours = [&mut red[x], &mut green[x], &mut blue[x]];
-                if is_seen(render, x, y) {
+                let is_seen = is_all_seen || (keeps > 0.0 && is_seen(render, x, y));
+                if is_seen && keeps == 1.0 {
                     colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
                     note(x, 1.0);
                     continue;
@@ -381,9 +388,14 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: 
                 let own = difference.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
                 let weight = noise / residual.max(own * own / OUTLIER).max(f32::MIN_POSITIVE);
                 let shrunk = trust * (1.0 - weight.min(1.0));
-                let seen = if keeps > 0.0 { keeps * beyond_white(render, x, y) } else { 0.0 };
+                let seen = match keeps {
+                    0.0 => 0.0,
+                    _ if is_seen => keeps,
+                    _ => keeps * beyond_white(render, x, y),
+                };
                 let back = shrunk + seen - shrunk * seen;
-                let back = if own == LARGEST_RESIDUAL && is_firefly(render, x, y) { 0.0 } else { back };
+                let is_noise = !is_seen && own == LARGEST_RESIDUAL && is_firefly(render, x, y);
+                let back = if is_noise { 0.0 } else { back };
                 if back > 0.0 {
                     colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v += (noisy - *v) * back);
                 }
@@ -400,17 +412,26 @@ fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item
     around(y, planes.height).flat_map(move |y| columns.clone().map(move |x| (x, y)))
 }
 
+/// Whether a pixel has the brightness of its albedo.
+fn equals_albedo(render: &Render, at: usize) -> bool {
+    let (relative, absolute) = SAME;
+    (0..3).all(|c| {
+        let (light, albedo) = (render.radiance.channel(c)[at], render.albedo.channel(c)[at]);
+        (light - albedo).abs() <= relative * albedo.abs() + absolute
+    })
+}
+
+/// Whether a frame is nothing but light that is seen directly.
+fn is_all_seen(render: &Render) -> bool {
+    let pixels = render.radiance.pixels();
+    let most = (UNLIKE * pixels as f64) as usize;
+    (0..pixels).filter(|at| !equals_albedo(render, *at)).take(most + 1).count() <= most
+}
+
 /// Whether the light of a pixel comes straight to the camera, as that of its neighbours does.
 fn is_seen(render: &Render, x: usize, y: usize) -> bool {
     let Render { radiance, albedo, .. } = render;
-    let (relative, absolute) = SAME;
-    let equals_albedo = |x: usize, y: usize| {
-        let at = y * radiance.width + x;
-        (0..3).all(|c| {
-            let (light, albedo) = (radiance.channel(c)[at], albedo.channel(c)[at]);
-            (light - albedo).abs() <= relative * albedo.abs() + absolute
-        })
-    };
+    let equals_albedo = |x: usize, y: usize| equals_albedo(render, y * radiance.width + x);
     // Black is no light, but where a lamp or a star ends it is as good company as any.
     let is_lit = (0..3).any(|c| albedo.channel(c)[y * radiance.width + x] > 0.0);
     is_lit && equals_albedo(x, y) && {
@@ -546,7 +567,7 @@ mod tests {
         let albedo =
             planes(|c, x, y| if light(c, x, y) == 0.25 && (x, y) != (10, 10) { 0.5 } else { light(c, x, y) });
         let radiance = planes(light);
-        let image = shrunk(&planes(|_, _, _| 0.3), &radiance, &albedo, Some(4));
+        let image = shrunk(&planes(|_, _, _| 0.3), &radiance, &albedo, Some(64));
         let at = |c: usize, x: usize, y: usize| image.channel(c)[y * SIZE.0 + x];
         for (x, y) in [(35, 25), (49, 24), (40, 20), (70, 50)] {
             assert_eq!([0, 1, 2].map(|c| at(c, x, y)), [0, 1, 2].map(|c| light(c, x, y)), "at {x}, {y}");
@@ -557,6 +578,26 @@ mod tests {
             [0, 1, 2].map(|c| at(c, 12, 12)),
             "one pixel of its albedo's brightness is nothing special"
         );
+    }
+
+    #[test]
+    fn of_few_samples_what_antialiasing_makes_of_a_bright_sky_is_noise() {
+        // Gaps of a blind, of which a quarter of the samples see the sky: 0 to 4 of 4, by chance.
+        let mut rng = Rng::new(3, 0);
+        let (w, h) = SIZE;
+        let hit = |_| (0..4).filter(|_| rng.uniform() < 0.25).count() as f32;
+        let seen: Vec<f32> = (0..w * h).map(hit).collect();
+        let is_wall = |x: usize| x > 70;
+        let sky = planes(|_, x, y| if is_wall(x) { 0.25 } else { 1.25 * seen[y * w + x] });
+        let albedo = planes(|c, x, y| if is_wall(x) { 0.5 } else { sky.channel(c)[y * w + x] });
+        let truth = planes(|_, x, _| if is_wall(x) { 0.25 } else { 1.25 });
+        let off = |image: &Planes| -> f32 {
+            image.data.iter().zip(&truth.data).map(|(a, b)| (a - b) * (a - b)).sum()
+        };
+        let image = shrunk(&truth, &sky, &albedo, Some(4));
+        assert!(off(&image) < 0.05 * off(&sky), "{} of {}", off(&image), off(&sky));
+        // The same light in a frame of nothing else is a picture, and stays.
+        assert!(shrunk(&truth, &sky, &sky, Some(4)) == sky, "a picture has changed");
     }
 
     #[test]
