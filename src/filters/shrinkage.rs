@@ -233,10 +233,14 @@ impl Vectorised for Read<'_> {
         let Row { light, ratio, scales: [of_light, of_ratio], residual, cut } = row;
         let [light, ratio, of_light, of_ratio, residual, cut] =
             [light, ratio, of_light, of_ratio, residual, cut].map(|line| &mut line[1..][..width]);
+        // Until it is needed, `cut` holds by how much more than a rounding error the light differs from the albedo: 0
+        // where it is seen directly.
         for c in 0..3 {
             for x in 0..width {
                 let over = 1.0 / (3.0 * (albedo[c][x].max(0.0) + ALBEDO_FLOOR));
                 let (noisy, denoised) = (radiance[c][x].max(0.0), image[c][x].max(0.0));
+                let rounding = SAME.0 * albedo[c][x].abs() + SAME.1;
+                cut[x] = cut[x].max((noisy - albedo[c][x]).abs() - rounding);
                 light[x] += noisy * (1.0 / 3.0);
                 ratio[x] += noisy * over;
                 of_light[x] += denoised * (1.0 / 3.0);
@@ -244,6 +248,10 @@ impl Vectorised for Read<'_> {
             }
         }
         for x in 0..width {
+            // The noise of light that is seen directly is in the albedo as well, and their quotient tells nothing of it.
+            let is_seen = cut[x] <= 0.0;
+            ratio[x] = if is_seen { light[x] } else { ratio[x] };
+            of_ratio[x] = if is_seen { of_light[x] } else { of_ratio[x] };
             let relative = 1.0 / (of_light[x] + floor);
             let whole = (light[x] - of_light[x]) * relative;
             residual[x] = whole.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
@@ -596,6 +604,15 @@ mod tests {
         };
         let image = shrunk(&truth, &sky, &albedo, Some(4));
         assert!(off(&image) < 0.05 * off(&sky), "{} of {}", off(&image), off(&sky));
+        // So is what a sky of fine clouds looks like: its noise is in the albedo as well, which it is divided by.
+        let clouds = planes(|_, x, y| if is_wall(x) { 0.25 } else { 0.8 + 0.2 * seen[y * w + x] });
+        let albedo = planes(|c, x, y| if is_wall(x) { 0.5 } else { clouds.channel(c)[y * w + x] });
+        let truth = planes(|_, x, _| if is_wall(x) { 0.25 } else { 1.0 });
+        let image = shrunk(&truth, &clouds, &albedo, Some(4));
+        let off = |image: &Planes| -> f32 {
+            image.data.iter().zip(&truth.data).map(|(a, b)| (a - b) * (a - b)).sum()
+        };
+        assert!(off(&image) < 0.1 * off(&clouds), "{} of {}", off(&image), off(&clouds));
         // The same light in a frame of nothing else is a picture, and stays.
         assert!(shrunk(&truth, &sky, &sky, Some(4)) == sky, "a picture has changed");
     }
