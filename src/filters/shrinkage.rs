@@ -104,6 +104,19 @@ const ALONE: f32 = 4.0;
 /// float, and next to nothing besides.
 const SAME: (f32, f32) = (0.004, 1e-6);
 
+/// Light that is seen directly is its albedo times the film's exposure, which Cycles applies to light alone. It is told
+/// from the quotients of light and albedo, counted by these steps of an octave over so many octaves up and down.
+const STEPS: usize = 128;
+const OCTAVES: usize = 20;
+
+/// An exposure needs at least this many pixels, and this many times more of them than its second and third neighbours
+/// have on the average: quotients of what is only lit are spread by noise and by shape.
+const LEAST_EXPOSED: u32 = 16;
+const PEAK: f32 = 8.0;
+
+/// About as many pixels as are counted.
+const COUNTED: usize = 1 << 17;
+
 /// Pixels of the 3x3 around one, itself included, that must be seen directly for it to be: any pixel may be as bright as
 /// its albedo by chance.
 const SEEN_TOGETHER: usize = 6;
@@ -140,8 +153,9 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
         return;
     }
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
-    let kept = judge(&gather(image, render), size, samples);
-    mix(image, render, &kept, samples, shares);
+    let seen = Seen { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) };
+    let kept = judge(&gather(image, render, &seen), size, samples);
+    mix(image, render, &seen, &kept, samples, shares);
 }
 
 /// Mixes another denoised layer, (C, H, W), with what was rendered of it, by the `shares` of [`shrink`].
@@ -154,11 +168,51 @@ pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
     });
 }
 
+/// What light that is seen directly was multiplied by, as most such light of the frame has it; 1 if there is any such.
+fn film_exposure(render: &Render) -> f32 {
+    let Render { radiance, albedo, .. } = render;
+    let pixels = radiance.pixels();
+    let per_octave = STEPS as f32 / std::f32::consts::LN_2;
+    let middle = STEPS * OCTAVES;
+    let mut counts = vec![0u32; 2 * middle + 1];
+    for at in (0..pixels).step_by(pixels.div_ceil(COUNTED)) {
+        let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
+        let sums = [light, white].map(|colours| colours.iter().sum::<f32>());
+        if sums.into_iter().all(|sum| sum > f32::MIN_POSITIVE) && equals(light, white, sums[0] / sums[1]) {
+            let step = (ln(sums[0] / sums[1]) * per_octave).round() + middle as f32;
+            if let Some(count) = counts.get_mut(step as usize) {
+                *count += 1;
+            }
+        }
+    }
+    let is_peak = |step: usize| {
+        let around = [step - 3, step - 2, step + 2, step + 3].map(|step| counts[step]);
+        let usual = around.iter().sum::<u32>() as f32 / around.len() as f32;
+        counts[step] >= LEAST_EXPOSED && counts[step] as f32 > PEAK * usual
+    };
+    if is_peak(middle) {
+        return 1.0;
+    }
+    let peaks = (3..counts.len() - 3).filter(|step| is_peak(*step));
+    let highest = peaks.max_by_key(|step| counts[*step]).unwrap_or(middle);
+    // Whole octaves apart from the rest, so that they are exact.
+    let steps = highest as i32 - middle as i32;
+    let (octave, rest) = (steps.div_euclid(STEPS as i32), steps.rem_euclid(STEPS as i32));
+    (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
+}
+
+/// Whether light is white times `film` but for rounding.
+#[inline(always)]
+fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
+    let (relative, absolute) = SAME;
+    (0..3).all(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute))
+}
+
 /// Rows of squares that a thread gathers at once: the rows of pixels just above and below are computed twice.
 const STRIP: usize = 4;
 
 /// The sums of every row of squares, [`SUMS`] lines each.
-fn gather(image: &Planes, render: &Render) -> Vec<f32> {
+fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
     let (width, height) = (image.width, image.height);
     let squares = width.div_ceil(SQUARE);
     let mut sums = vec![0.0; height.div_ceil(SQUARE) * SUMS * squares];
@@ -167,7 +221,7 @@ fn gather(image: &Planes, render: &Render) -> Vec<f32> {
         let end = (first + STRIP * SQUARE).min(height);
         // One row more on either side; beyond the frame lies its mirror image.
         let rows: Vec<Row> = (first as isize - 1..end as isize + 1)
-            .map(|y| Row::read(image, render, mirrored(y.unsigned_abs(), height)))
+            .map(|y| Row::read(image, render, seen.film, mirrored(y.unsigned_abs(), height)))
             .collect();
         let mut columns = vec![0.0; SUMS * width];
         for (sums, first_row) in sums.chunks_exact_mut(SUMS * squares).zip((0..end - first).step_by(SQUARE)) {
@@ -199,7 +253,7 @@ struct Row {
 }
 
 impl Row {
-    fn read(image: &Planes, render: &Render, y: usize) -> Self {
+    fn read(image: &Planes, render: &Render, film: f32, y: usize) -> Self {
         let width = image.width;
         let line = || vec![0.0; width + 2];
         let mut row =
@@ -207,7 +261,7 @@ impl Row {
         let [image, radiance, albedo] = [image, render.radiance, render.albedo]
             .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
         let floor = FLOOR / render.exposure;
-        vectorised::run(Read { image, radiance, albedo, floor, row: &mut row });
+        vectorised::run(Read { image, radiance, albedo, film, floor, row: &mut row });
         for line in [&mut row.light, &mut row.ratio, &mut row.residual] {
             line[0] = line[1 + mirrored(1, width)];
             line[width + 1] = line[1 + mirrored(width, width)];
@@ -221,6 +275,7 @@ struct Read<'a> {
     image: [&'a [f32]; 3],
     radiance: [&'a [f32]; 3],
     albedo: [&'a [f32]; 3],
+    film: f32,
     floor: f32,
     row: &'a mut Row,
 }
@@ -228,7 +283,7 @@ struct Read<'a> {
 impl Vectorised for Read<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self { image, radiance, albedo, floor, row } = self;
+        let Self { image, radiance, albedo, film, floor, row } = self;
         let width = image[0].len();
         let Row { light, ratio, scales: [of_light, of_ratio], residual, cut } = row;
         let [light, ratio, of_light, of_ratio, residual, cut] =
@@ -237,10 +292,11 @@ impl Vectorised for Read<'_> {
         // where it is seen directly.
         for c in 0..3 {
             for x in 0..width {
-                let over = 1.0 / (3.0 * (albedo[c][x].max(0.0) + ALBEDO_FLOOR));
+                // No surface reflects more light than it gets: what is beyond white is light that is seen.
+                let over = 1.0 / (3.0 * (albedo[c][x].clamp(0.0, 1.0) + ALBEDO_FLOOR));
                 let (noisy, denoised) = (radiance[c][x].max(0.0), image[c][x].max(0.0));
-                let rounding = SAME.0 * albedo[c][x].abs() + SAME.1;
-                cut[x] = cut[x].max((noisy - albedo[c][x]).abs() - rounding);
+                let rounding = film * (SAME.0 * albedo[c][x].abs() + SAME.1);
+                cut[x] = cut[x].max((noisy - film * albedo[c][x]).abs() - rounding);
                 light[x] += noisy * (1.0 / 3.0);
                 ratio[x] += noisy * over;
                 of_light[x] += denoised * (1.0 / 3.0);
@@ -351,12 +407,19 @@ fn judge(sums: &[f32], (width, height): (usize, usize), samples: f32) -> Vec<f32
 }
 
 /// Mixes every pixel, and writes the shares of the render, where they are asked for.
-fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: Option<&mut Planes>) {
+fn mix(
+    image: &mut Planes,
+    render: &Render,
+    seen: &Seen,
+    kept: &[f32],
+    samples: f32,
+    shares: Option<&mut Planes>,
+) {
     let (width, height) = (image.width, image.height);
     let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
     let floor = FLOOR / render.exposure;
     let (few, many) = KEPT_SAMPLES;
-    let is_all_seen = is_all_seen(render);
+    let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
     let (red, rest) = image.data.split_at_mut(width * height);
@@ -385,7 +448,7 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: 
                 });
                 let noisy = radiance.map(|row| row[x].max(0.0));
                 let colours = [&mut red[x], &mut green[x], &mut blue[x]];
-                let is_seen = is_all_seen || (keeps > 0.0 && is_seen(render, x, y));
+                let is_seen = is_all_seen || (keeps > 0.0 && seen.is_at(x, y));
                 if is_seen && keeps == 1.0 {
                     colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
                     note(x, 1.0);
@@ -396,12 +459,12 @@ fn mix(image: &mut Planes, render: &Render, kept: &[f32], samples: f32, shares: 
                 let own = difference.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
                 let weight = noise / residual.max(own * own / OUTLIER).max(f32::MIN_POSITIVE);
                 let shrunk = trust * (1.0 - weight.min(1.0));
-                let seen = match keeps {
+                let direct = match keeps {
                     0.0 => 0.0,
                     _ if is_seen => keeps,
-                    _ => keeps * beyond_white(render, x, y),
+                    _ => keeps * seen.beyond_white(x, y),
                 };
-                let back = shrunk + seen - shrunk * seen;
+                let back = shrunk + direct - shrunk * direct;
                 let is_noise = !is_seen && own == LARGEST_RESIDUAL && is_firefly(render, x, y);
                 let back = if is_noise { 0.0 } else { back };
                 if back > 0.0 {
@@ -420,52 +483,61 @@ fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item
     around(y, planes.height).flat_map(move |y| columns.clone().map(move |x| (x, y)))
 }
 
-/// Whether a pixel has the brightness of its albedo.
-fn equals_albedo(render: &Render, at: usize) -> bool {
-    let (relative, absolute) = SAME;
-    (0..3).all(|c| {
-        let (light, albedo) = (render.radiance.channel(c)[at], render.albedo.channel(c)[at]);
-        (light - albedo).abs() <= relative * albedo.abs() + absolute
-    })
+/// Tells light that comes straight to the camera.
+struct Seen<'a> {
+    radiance: &'a Planes,
+    albedo: &'a Planes,
+    /// What the film's exposure multiplied light by, and not the albedo.
+    film: f32,
 }
 
-/// Whether a frame is nothing but light that is seen directly.
-fn is_all_seen(render: &Render) -> bool {
-    let pixels = render.radiance.pixels();
-    let most = (UNLIKE * pixels as f64) as usize;
-    (0..pixels).filter(|at| !equals_albedo(render, *at)).take(most + 1).count() <= most
-}
-
-/// Whether the light of a pixel comes straight to the camera, as that of its neighbours does.
-fn is_seen(render: &Render, x: usize, y: usize) -> bool {
-    let Render { radiance, albedo, .. } = render;
-    let equals_albedo = |x: usize, y: usize| equals_albedo(render, y * radiance.width + x);
-    // Black is no light, but where a lamp or a star ends it is as good company as any.
-    let is_lit = (0..3).any(|c| albedo.channel(c)[y * radiance.width + x] > 0.0);
-    is_lit && equals_albedo(x, y) && {
-        let beyond = 9 - near(radiance, x, y, 1).count();
-        let seen = near(radiance, x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
-        seen + beyond >= SEEN_TOGETHER
+impl Seen<'_> {
+    /// Whether a pixel has the brightness of its albedo.
+    fn equals_albedo(&self, at: usize) -> bool {
+        let [light, white] =
+            [self.radiance, self.albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
+        equals(light, white, self.film)
     }
-}
 
-/// The share of a pixel's light that comes straight to the camera, or by way of mirrors, as far as the albedo shows it beyond
-/// white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
-fn beyond_white(render: &Render, x: usize, y: usize) -> f32 {
-    let Render { radiance, albedo, .. } = render;
-    let beyond = |x: usize, y: usize| {
-        let at = y * radiance.width + x;
-        let colours = (0..3).map(|c| (albedo.channel(c)[at].min(radiance.channel(c)[at]) - 1.0, c));
-        colours.fold((0.0, 0), |most, colour| if colour.0 > most.0 { colour } else { most })
-    };
-    let (light, c) = beyond(x, y);
-    if light <= 0.0 {
-        return 0.0;
+    /// Whether a frame is nothing but such light.
+    fn is_all(&self) -> bool {
+        let pixels = self.radiance.pixels();
+        let most = (UNLIKE * pixels as f64) as usize;
+        (0..pixels).filter(|at| !self.equals_albedo(*at)).take(most + 1).count() <= most
     }
-    let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
-    let company = others.map(|(x, y)| beyond(x, y).0).fold(0.0, f32::max);
-    let share = light / radiance.channel(c)[y * radiance.width + x];
-    share * (ALONE * company / light).min(1.0)
+
+    /// Whether the light of a pixel is such, as that of its neighbours is.
+    fn is_at(&self, x: usize, y: usize) -> bool {
+        let width = self.radiance.width;
+        let equals_albedo = |x: usize, y: usize| self.equals_albedo(y * width + x);
+        // Black is no light, but where a lamp or a star ends it is as good company as any.
+        let is_lit = (0..3).any(|c| self.albedo.channel(c)[y * width + x] > 0.0);
+        is_lit && equals_albedo(x, y) && {
+            let beyond = 9 - near(self.radiance, x, y, 1).count();
+            let seen = near(self.radiance, x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
+            seen + beyond >= SEEN_TOGETHER
+        }
+    }
+
+    /// The share of a pixel's light that is such, or comes by way of mirrors, as far as the albedo shows it beyond
+    /// white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
+    fn beyond_white(&self, x: usize, y: usize) -> f32 {
+        let Self { radiance, albedo, film } = self;
+        let beyond = |x: usize, y: usize| {
+            let at = y * radiance.width + x;
+            let colours =
+                (0..3).map(|c| (albedo.channel(c)[at].min(radiance.channel(c)[at] / film) - 1.0, c));
+            colours.fold((0.0, 0), |most, colour| if colour.0 > most.0 { colour } else { most })
+        };
+        let (light, c) = beyond(x, y);
+        if light <= 0.0 {
+            return 0.0;
+        }
+        let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
+        let company = others.map(|(x, y)| beyond(x, y).0).fold(0.0, f32::max);
+        let share = film * light / radiance.channel(c)[y * radiance.width + x];
+        share * (ALONE * company / light).min(1.0)
+    }
 }
 
 /// Whether a pixel is far brighter than all around it.
@@ -586,6 +658,41 @@ mod tests {
             [0, 1, 2].map(|c| at(c, 12, 12)),
             "one pixel of its albedo's brightness is nothing special"
         );
+    }
+
+    #[test]
+    fn the_exposure_of_the_film_hides_no_light_that_is_seen() {
+        // A screen over a third of the frame; the rest is a noisy wall. The film's exposure multiplies light alone.
+        let albedo = planes(|c, x, y| if x < 30 { 0.2 + ((x * 7 + y * 5 + c) % 11) as f32 } else { 0.5 });
+        let wall = noisy(0.3);
+        let radiance = planes(|c, x, y| (if x < 30 { &albedo } else { &wall }).channel(c)[y * SIZE.0 + x]);
+        let image = shrunk(&planes(picture), &radiance, &albedo, Some(64));
+        assert!((0..3).all(|c| image.channel(c)[..30] == radiance.channel(c)[..30]), "the screen is kept");
+        for film in [0.5, 1.0, 1.3, 4.0, 2f32.powi(-12), 2f32.powi(12)] {
+            let times = |image: &Planes| planes(|c, x, y| film * image.channel(c)[y * SIZE.0 + x]);
+            let render = Render {
+                radiance: &times(&radiance),
+                albedo: &albedo,
+                exposure: 0.6 / film,
+                samples: Some(64),
+                firefly: 32.0,
+            };
+            assert!((film_exposure(&render) / film - 1.0).abs() < 0.003, "{film}");
+            let mut exposed = times(&planes(picture));
+            shrink(&mut exposed, &render, None);
+            let near = |(a, b): (&f32, &f32)| (a / film - b).abs() <= 1e-4 * b.abs();
+            let same = exposed.data.iter().zip(&image.data).filter(|pair| near(*pair)).count();
+            assert!(same == image.data.len(), "{film}: {same} of {}", image.data.len());
+        }
+        // A wall alone has no such light, whatever its noise.
+        let render = Render {
+            radiance: &wall,
+            albedo: &planes(|_, _, _| 0.5),
+            exposure: 1.0,
+            samples: None,
+            firefly: 32.0,
+        };
+        assert_eq!(film_exposure(&render), 1.0);
     }
 
     #[test]
