@@ -25,7 +25,7 @@ use demc::{
     planes::Planes,
     shot::Shot,
 };
-use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray3};
+use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray3, ndarray::Axis};
 use pyo3::{create_exception, exceptions, prelude::*};
 
 create_exception!(
@@ -101,16 +101,8 @@ fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
 fn planes(image: &PyReadonlyArray3<'_, f32>) -> Planes {
     let image = image.as_array();
     let (height, width, _) = image.dim();
-    let mut planes = Planes::new(3, width, height);
-    for c in 0..3 {
-        let plane = planes.channel_mut(c);
-        for ((y, x, channel), value) in image.indexed_iter() {
-            if channel == c {
-                plane[y * width + x] = *value;
-            }
-        }
-    }
-    planes
+    let channels = (0..3).flat_map(|c| image.index_axis_move(Axis(2), c).into_iter().copied());
+    Planes::from_vec(3, width, height, channels.collect())
 }
 
 /// What an array is called, of the passes that arrays are taken for.
