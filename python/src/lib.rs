@@ -25,7 +25,7 @@ use demc::{
     planes::Planes,
     shot::Shot,
 };
-use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray3, ndarray::Axis};
+use numpy::{PyArray1, PyReadonlyArray3, ndarray::Axis};
 use pyo3::{create_exception, exceptions, prelude::*};
 
 create_exception!(

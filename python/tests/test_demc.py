@@ -106,7 +106,7 @@ class Package(unittest.TestCase):
             ("float64; give float32", (color.astype(np.float64),)),
             ("is a list", ([1.0],)),
             ("arrays of one render", (color, albedo[:-1], normal)),
-            ("needs albedo and normal", (color,)),
+            ("needs normal and albedo", (color,)),
             ("no model 'nosuch'", (color, albedo, normal, "nosuch")),
         ]:
             with self.subTest(words), self.assertRaisesRegex(ValueError, words):
