@@ -18,9 +18,8 @@ use std::{
 use demc::{
     kernels::{Shape, peak, simd::Tier},
     models::{
-        self,
+        self, catalogue,
         demc::PAPER_WIDTHS,
-        learned::Learned,
         network::{Architecture, Batch, Config, Network},
     },
     nn::{Precision, Rng, Stats, clear_buffers},
@@ -110,7 +109,8 @@ fn jobs(small: bool) -> Vec<Job> {
     }
     for name in LADDER {
         for (width, height) in if small { vec![(160, 96)] } else { vec![USUAL, (1920, 1080)] } {
-            let macs = Learned::built_in(name).expect("it is in the list").macs_per_pixel();
+            let model = catalogue::find(name).expect("it is in the list").learned();
+            let macs = model.expect("its weights are built in").macs_per_pixel();
             jobs.push(Job {
                 name: format!("{name} {width}x{height}"),
                 flops: Some(2.0 * macs * (width * height) as f64),

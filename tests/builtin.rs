@@ -16,7 +16,12 @@ use demc::{
     features::{self, GUIDE_PASSES},
     filters::shrinkage::{Render, shrink},
     metrics,
-    models::{self, learned, network::Architecture},
+    models::{
+        self,
+        catalogue::{METHODS, find},
+        learned,
+        network::Architecture,
+    },
     passes::{self, Pass, PassSet},
     planes::Planes,
     shot::Shot,
@@ -274,7 +279,7 @@ fn upside_down(frame: &PassSet) -> PassSet {
 #[test]
 fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let twice = models::open("demc-l").unwrap();
-    let mut once = learned::Learned::built_in("demc-m").unwrap().with_precision("demc-m", None).unwrap();
+    let mut once = find("demc-m").unwrap().learned().unwrap().with_precision("demc-m", None).unwrap();
     let (network, frame) = (once.network(), window(50, 37));
     // In 51 columns, the first of the turned frame is the one that was added, and what shared a square is apart.
     let grown = |passes: &PassSet, of: &[Pass]| upside_down(&passes.padded_rows(of, 0..37, (51, 37)));
@@ -403,14 +408,24 @@ fn eight_bits_need_known_ranges() {
 
 #[test]
 fn every_built_in_weights_file_is_sound_and_small() {
-    assert!(learned::BUILT_IN.iter().any(|(name, _)| *name == "demc-m"), "the default model");
-    for (name, bytes) in learned::BUILT_IN {
+    let with_weights: Vec<_> = METHODS
+        .iter()
+        .filter_map(|method| match (method.built_in(), method.weights_file()) {
+            (Some(bytes), _) => Some((method, bytes.len())),
+            (_, Some(path)) => Some((method, fs::metadata(path).unwrap().len() as usize)),
+            _ => None,
+        })
+        .collect();
+    let names: Vec<&str> = with_weights.iter().map(|(method, _)| method.name).collect();
+    assert_eq!(names, ["demc-s", "demc-m", "demc-l", "demc", "demc-nofusion", "semc", "kpcn", "lbf"]);
+    for (method, bytes) in with_weights {
+        let name = method.name;
         // The README beside the weights says why one may be larger.
         let trained = if name == learned::TURNED { "demc-m" } else { name };
         let limit = if trained == "demc-m" { 6 << 20 } else { 5 << 20 };
-        assert!(bytes.len() < limit, "{name}: {} bytes", bytes.len());
-        let mut model = learned::Learned::built_in(name).unwrap();
-        let config = |name| models::trainable().into_iter().find(|(n, _)| *n == name);
+        assert!(bytes < limit, "{name}: {bytes} bytes");
+        let mut model = method.learned().unwrap();
+        let config = |name| models::trainable().find(|(n, _)| *n == name);
         let mut expected = config(trained).expect("it is trainable").1;
         // Trained on frames without light passes, kpcn is its single stream over Combined.
         if name == "kpcn" && model.metadata.network.architecture == Architecture::KpcnCombined {

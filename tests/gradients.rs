@@ -227,7 +227,7 @@ fn check_network(name: &str, network: &mut dyn Network, batch: &Batch) {
 }
 
 fn trainable(name: &str) -> Config {
-    models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1
+    models::trainable().find(|(n, _)| *n == name).expect("it is trainable").1
 }
 
 #[test]

@@ -106,8 +106,7 @@ fn every_network_takes_every_size_from_one_pixel_up() {
 #[test]
 fn tiles_give_the_same_bits_as_the_whole_frame() {
     for name in ["demc", "kpcn", "kpcn-combined", "lbf"] {
-        let mut config =
-            models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1;
+        let mut config = models::trainable().find(|(n, _)| *n == name).expect("it is trainable").1;
         config.widths.fill(8);
         let network = models::build(&config, 1);
         let passes = random_passes(1300, 40, 11);
@@ -275,7 +274,7 @@ fn networks_that_filter_scale_with_their_input() {
 }
 
 fn trainable(name: &str) -> Config {
-    models::trainable().into_iter().find(|(n, _)| *n == name).expect("it is trainable").1
+    models::trainable().find(|(n, _)| *n == name).expect("it is trainable").1
 }
 
 #[test]
@@ -334,7 +333,7 @@ fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     passes.insert(Pass::Combined, flat(0.7));
     passes.insert(Pass::DenoisingAlbedo, flat(0.4));
     passes.insert(Pass::DenoisingNormal, flat(0.5));
-    let config = models::trainable().into_iter().find(|(n, _)| *n == "demc-m").expect("it is trainable").1;
+    let config = models::trainable().find(|(n, _)| *n == "demc-m").expect("it is trainable").1;
     let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 7);

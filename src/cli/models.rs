@@ -5,7 +5,7 @@ use crate::{
     Result,
     models::{
         self,
-        learned::{BUILT_IN, Learned},
+        catalogue::{Kind, METHODS, Method},
         network::Network,
     },
 };
@@ -22,7 +22,7 @@ pub struct Args {
 #[derive(serde::Serialize)]
 struct Row {
     model: String,
-    /// "built in" or "untrained".
+    /// "built in", "untrained", or "file" where a file next to the program holds them.
     weights: &'static str,
     parameters: usize,
     kmac_per_pixel: f64,
@@ -31,10 +31,14 @@ struct Row {
     trained: Option<String>,
 }
 
-fn row(model: &str, network: &mut dyn Network, macs: f64, trained: Option<String>) -> Row {
+fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<String>) -> Row {
     Row {
-        model: model.into(),
-        weights: if trained.is_some() { "built in" } else { "untrained" },
+        model: method.name.into(),
+        weights: match trained {
+            None => "untrained",
+            Some(_) if method.built_in().is_some() => "built in",
+            Some(_) => "file",
+        },
         parameters: network.params().iter().filter(|p| p.trainable).map(|p| p.values().len()).sum(),
         kmac_per_pixel: (macs / 100.0).round() / 10.0,
         // Rows and columns of the square that an output pixel can see.
@@ -44,26 +48,28 @@ fn row(model: &str, network: &mut dyn Network, macs: f64, trained: Option<String
     }
 }
 
-fn built_in(name: &str) -> Option<Row> {
-    let mut model = Learned::built_in(name)?;
+fn trained(method: &Method) -> Result<Row> {
+    let mut model = method.learned()?;
     let t = &model.metadata.training;
     let last = if t.init.is_some() { ", the last of several runs (docs/training.md)" } else { "" };
     let hours = t.seconds / 3600.0;
     let trained =
         format!("{} steps of {} crops from {} frames in {hours:.1} h{last}", t.steps, t.batch, t.frames);
     let macs = model.macs_per_pixel();
-    Some(row(name, model.network(), macs, Some(trained)))
+    Ok(row(method, model.network(), macs, Some(trained)))
 }
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let untrained = models::untrained().map(|(name, config)| {
-        let mut network = models::build(&config, 0);
+    let with_weights = |method: &&Method| method.built_in().is_some() || method.weights_file().is_some();
+    let untrained = METHODS.iter().filter(|method| !with_weights(method)).filter_map(|method| {
+        let Kind::Learned { config, .. } = method.kind else { return None };
+        let mut network = models::build(&config(), 0);
         let macs = network.macs_per_pixel();
-        row(name, &mut *network, macs, None)
+        Some(Ok(row(method, &mut *network, macs, None)))
     });
-    let rows: Vec<Row> =
-        BUILT_IN.into_iter().filter_map(|(name, _)| built_in(name)).chain(untrained).collect();
+    let rows = METHODS.iter().filter(with_weights).map(trained).chain(untrained);
+    let rows: Vec<Row> = rows.collect::<Result<_>>()?;
     if args.json {
         super::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
         return Ok(ExitCode::SUCCESS);

@@ -200,7 +200,7 @@ fn has_light_passes(pair: &Pair) -> Result<bool> {
 
 impl Args {
     fn options(&self) -> Result<Options> {
-        let known = models::trainable();
+        let known: Vec<_> = models::trainable().collect();
         let mut network =
             known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(|| {
                 let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();

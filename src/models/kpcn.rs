@@ -33,6 +33,11 @@ use crate::{
 /// Channels of the hidden layers as published.
 pub const PUBLISHED_WIDTH: usize = 100;
 
+/// A network of the default width, of two streams or one.
+pub fn config(architecture: Architecture) -> Config {
+    Config::new(architecture, &[32])
+}
+
 /// Convolutions of a stream, and their taps in a row.
 const LAYERS: usize = 9;
 const TAPS: usize = 5;

@@ -19,7 +19,7 @@ use dfdx::{
     tensor_ops::{clamp, exp, ln, sigmoid},
 };
 
-use super::network::{Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
@@ -29,6 +29,11 @@ use crate::{
 
 /// Hidden units as published.
 pub const PUBLISHED_WIDTH: usize = 10;
+
+/// The network as published.
+pub fn config() -> Config {
+    Config::new(Architecture::Lbf, &[PUBLISHED_WIDTH])
+}
 
 /// Pixels from the centre of the filter's window to its edge.
 const RADIUS: usize = 10;

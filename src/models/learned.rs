@@ -20,8 +20,6 @@ use crate::{
     shot::Shot,
 };
 
-const DEMC_M: &[u8] = include_bytes!("weights/demc-m.safetensors");
-
 /// The built-in model that looks at a frame twice, the second time upside down and with its 2x2 squares one pixel further
 /// on, and answers with the mean: what a network gets wrong depends on how its squares and levels happen to lie on the
 /// picture, and half of that averages out (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
@@ -29,18 +27,6 @@ pub const TURNED: &str = "demc-l";
 
 /// What [`TURNED`] does to a frame of odd width and height.
 const HALF_TURN: Augment = Augment { turns: 2, ..Augment::IDENTITY };
-
-/// The built-in weights, name and file: ours, fastest first, then the paper's networks and its rivals.
-pub const BUILT_IN: [(&str, &[u8]); 8] = [
-    ("demc-s", include_bytes!("weights/demc-s.safetensors")),
-    ("demc-m", DEMC_M),
-    (TURNED, DEMC_M),
-    ("demc", include_bytes!("weights/demc.safetensors")),
-    ("demc-nofusion", include_bytes!("weights/demc-nofusion.safetensors")),
-    ("semc", include_bytes!("weights/semc.safetensors")),
-    ("kpcn", include_bytes!("weights/kpcn.safetensors")),
-    ("lbf", include_bytes!("weights/lbf.safetensors")),
-];
 
 /// A network with its weights.
 pub struct Learned {
@@ -53,12 +39,10 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// The built-in model of that name, if there is one.
-    pub fn built_in(name: &str) -> Option<Self> {
-        let (name, bytes) = BUILT_IN.iter().find(|(n, _)| *n == name)?;
-        let (network, metadata) = weights_file::parse(bytes, Path::new(name))
-            .expect("built-in weights are sound; a test reads them");
-        Some(Self { name: name.to_string(), network, turned: *name == TURNED, metadata })
+    /// The model of the catalogue whose weights file is given, built in or read from `path`.
+    pub(super) fn parse(name: &str, bytes: &[u8], path: &Path) -> Result<Self> {
+        let (network, metadata) = weights_file::parse(bytes, path)?;
+        Ok(Self { name: name.to_string(), network, turned: name == TURNED, metadata })
     }
 
     /// The model in a weights file, named like the file.

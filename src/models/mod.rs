@@ -1,5 +1,6 @@
-//! Every denoising method behind one trait. A new method is one file here and one line in the catalogue.
+//! Every denoising method behind one trait. A new method is one file here and one row in the [`catalogue`].
 
+pub mod catalogue;
 pub mod demc;
 pub mod kpcn;
 pub mod lbf;
@@ -139,29 +140,19 @@ impl Denoiser for Noisy {
 /// No built-in method or readable weights file goes by that name, or it has no such arithmetic.
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     let (plain, precision) = split_precision(name_or_file);
-    let learned = |model: learned::Learned| -> Result<Box<dyn Denoiser>> {
-        Ok(Box::new(model.with_precision(name_or_file, precision)?))
+    let model = match catalogue::find(plain) {
+        Some(catalogue::Method { kind: catalogue::Kind::Fixed(make), .. }) => return Ok(make()),
+        Some(method) => method.learned()?,
+        None if Path::new(plain).extension().is_some_and(|e| e == "safetensors") => {
+            learned::Learned::from_file(Path::new(plain))?
+        }
+        None => {
+            return Err(Error::Usage(format!(
+                "no model '{plain}': `demc models` lists the built-in ones; weights files end in .safetensors"
+            )));
+        }
     };
-    match plain {
-        "noisy" => Ok(Box::new(Noisy)),
-        nfor::NAME => Ok(Box::new(nfor::Nfor)),
-        name if oidn::NAMES.contains(&name) => {
-            Ok(Box::new(oidn::Oidn::new(name, None).expect("the name is in the list")))
-        }
-        other if Path::new(other).extension().is_some_and(|e| e == "safetensors") => {
-            learned(learned::Learned::from_file(Path::new(other))?)
-        }
-        other => match learned::Learned::built_in(other) {
-            Some(model) => learned(model),
-            None if untrained().any(|(name, _)| name == other) => Err(Error::Usage(format!(
-                "{other} comes without weights: `demc train --model {other} --data DIR --out RUN` makes them, \
-                 and RUN/best.safetensors then names the method"
-            ))),
-            None => Err(Error::Usage(format!(
-                "no model '{other}': `demc models` lists the built-in ones; weights files end in .safetensors"
-            ))),
-        },
-    }
+    Ok(Box::new(model.with_precision(name_or_file, precision)?))
 }
 
 /// A method's name or weights file, and the arithmetic asked for: `demc-m:f32`.
@@ -174,9 +165,6 @@ pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
     }
 }
 
-/// Widths of the paper's networks unless told otherwise: a quarter of the published at full resolution.
-const PAPER_NARROW: [usize; demc::PAPER_WIDTHS.len()] = [16, 32, 32, 48, 48];
-
 /// The widths of a network for those asked for: `semc` gets what makes it as large as `demc` of them,
 /// every other network gets them as they are.
 pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
@@ -186,37 +174,9 @@ pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
     }
 }
 
-/// Widths of the prefilters of `demc-s` and `demc-m`.
-const SMALL_PREFILTER: [usize; pyramid::LEVELS] = [16, 24, 32, 40];
-const PREFILTER: [usize; pyramid::LEVELS] = [32, 48, 48, 48];
-
 /// Names of the networks that can be trained, and the configuration each begins with.
-pub fn trainable() -> Vec<(&'static str, Config)> {
-    let paper = |architecture| Config::new(architecture, &widths(architecture, &PAPER_NARROW));
-    let pyramid = |widths: [usize; pyramid::LEVELS], prefilter: [usize; pyramid::LEVELS]| Config {
-        prefilter: prefilter.into(),
-        ..Config::new(Architecture::Pyramid, &widths)
-    };
-    let kpcn = |architecture| Config::new(architecture, &[32]);
-    vec![
-        ("demc-s", pyramid([16, 48, 64, 64], SMALL_PREFILTER)),
-        ("demc-m", pyramid([80, 96, 96, 112], PREFILTER)),
-        ("prefilter", Config::new(Architecture::Prefilter, &PREFILTER)),
-        ("demc", paper(Architecture::Demc)),
-        ("demc-nofusion", paper(Architecture::DemcNofusion)),
-        ("semc", paper(Architecture::Semc)),
-        ("kpcn", kpcn(Architecture::Kpcn)),
-        ("kpcn-combined", kpcn(Architecture::KpcnCombined)),
-        ("lbf", Config::new(Architecture::Lbf, &[lbf::PUBLISHED_WIDTH])),
-    ]
-}
-
-/// Those that come without weights; a prefilter is no method by itself.
-pub fn untrained() -> impl Iterator<Item = (&'static str, Config)> {
-    let is_built_in = |name| learned::BUILT_IN.iter().any(|(built_in, _)| *built_in == name);
-    let methods =
-        trainable().into_iter().filter(|(_, config)| config.architecture != Architecture::Prefilter);
-    methods.filter(move |(name, _)| !is_built_in(*name))
+pub fn trainable() -> impl Iterator<Item = (&'static str, Config)> {
+    catalogue::METHODS.iter().filter_map(|method| Some((method.name, method.config()?)))
 }
 
 /// Whether a configuration describes a network that [`build`] can make.
@@ -285,7 +245,7 @@ mod tests {
 
     #[test]
     fn parameters_are_told_before_they_are_built() {
-        let mut configs: Vec<Config> = trainable().into_iter().map(|(_, config)| config).collect();
+        let mut configs: Vec<Config> = trainable().map(|(_, config)| config).collect();
         // The least and the most that levels of other widths need between them.
         configs.push(Config::new(Architecture::Prefilter, &[64, 8, 8, 8]));
         configs.push(Config::new(Architecture::Prefilter, &[8, 8, 8, 96]));

@@ -41,6 +41,14 @@ impl Oidn {
         Some(Self { name, program: absolute.unwrap_or(program) })
     }
 
+    /// The method of a row of the catalogue.
+    ///
+    /// # Panics
+    /// If it is not in [`NAMES`].
+    pub fn boxed(name: &str) -> Box<dyn Denoiser> {
+        Box::new(Self::new(name, None).expect("the catalogue's names are those of the qualities"))
+    }
+
     /// Where the program lies: for a bare name, the first on the search path.
     pub fn program(&self) -> PathBuf {
         let path = std::env::var_os("PATH").unwrap_or_default();

@@ -42,6 +42,25 @@ use crate::{
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
 pub const LEVELS: usize = 4;
 
+/// Widths of the prefilters of `demc-s` and `demc-m`.
+const PREFILTER_OF_S: [usize; LEVELS] = [16, 24, 32, 40];
+const PREFILTER_OF_M: [usize; LEVELS] = [32, 48, 48, 48];
+
+/// The configuration of `demc-s`.
+pub fn small() -> Config {
+    Config { prefilter: PREFILTER_OF_S.into(), ..Config::new(Architecture::Pyramid, &[16, 48, 64, 64]) }
+}
+
+/// The configuration of `demc-m`.
+pub fn medium() -> Config {
+    Config { prefilter: PREFILTER_OF_M.into(), ..Config::new(Architecture::Pyramid, &[80, 96, 96, 112]) }
+}
+
+/// The prefilter of `demc-m`, to be trained alone.
+pub fn prefilter() -> Config {
+    Config::new(Architecture::Prefilter, &PREFILTER_OF_M)
+}
+
 /// Rows and columns of kernels, and of the radiance kernels at full resolution: what is as thin as a pixel there, texture and
 /// edges, was divided away with the guides, whose own kernels need more than nine pixels to average along it.
 const KERNEL: usize = 5;

@@ -7,7 +7,7 @@
 
 use plotters::prelude::RGBColor;
 
-use super::NOISY;
+use crate::models::catalogue::{self, Family};
 
 /// Text and axes.
 pub const INK: RGBColor = RGBColor(35, 35, 40);
@@ -18,55 +18,35 @@ pub const FAINT: RGBColor = RGBColor(120, 120, 130);
 /// The noisy input.
 pub const NOISY_GREY: RGBColor = RGBColor(165, 165, 170);
 
-/// Whose method it is, by its name.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Family {
-    Noisy,
-    /// The networks of the DEMC paper.
-    Paper,
-    /// The paper's rivals.
-    Rival,
-    Oidn,
-    /// The built-in models, and weights files.
-    Own,
+/// The family of a method by its name; weights files are ours.
+fn family(name: &str) -> Family {
+    catalogue::find(name).map_or(Family::Own, |method| method.family)
 }
 
-impl Family {
-    fn of(name: &str) -> Self {
-        match name {
-            NOISY => Self::Noisy,
-            "demc" | "demc-nofusion" | "semc" => Self::Paper,
-            "kpcn" | "lbf" | "nfor" => Self::Rival,
-            _ if name.starts_with("oidn-") => Self::Oidn,
-            _ => Self::Own,
-        }
-    }
-
-    fn hue(self) -> RGBColor {
-        match self {
-            Self::Noisy => NOISY_GREY,
-            Self::Paper => RGBColor(0, 158, 115),
-            Self::Rival => RGBColor(190, 90, 150),
-            Self::Oidn => RGBColor(213, 94, 0),
-            Self::Own => RGBColor(0, 114, 178),
-        }
+fn hue(family: Family) -> RGBColor {
+    match family {
+        Family::Noisy => NOISY_GREY,
+        Family::Paper => RGBColor(0, 158, 115),
+        Family::Rival => RGBColor(190, 90, 150),
+        Family::Oidn => RGBColor(213, 94, 0),
+        Family::Own => RGBColor(0, 114, 178),
     }
 }
 
 /// The colours of `names`, in their order.
 pub fn colours<S: AsRef<str>>(names: &[S]) -> Vec<RGBColor> {
-    let families: Vec<Family> = names.iter().map(|n| Family::of(n.as_ref())).collect();
+    let families: Vec<Family> = names.iter().map(|n| family(n.as_ref())).collect();
     let shade = |at: usize| {
         let family = families[at];
         let members = families.iter().filter(|f| **f == family).count();
         let rank = families[..at].iter().filter(|f| **f == family).count();
         if family == Family::Noisy || members == 1 {
-            return family.hue();
+            return hue(family);
         }
         // From 40 % towards white to 35 % towards black.
         let place = 0.4 - 0.75 * rank as f64 / (members - 1) as f64;
         let target = if place > 0.0 { RGBColor(255, 255, 255) } else { RGBColor(0, 0, 0) };
-        mix(family.hue(), target, place.abs())
+        mix(hue(family), target, place.abs())
     };
     (0..names.len()).map(shade).collect()
 }

@@ -22,7 +22,8 @@ use crate::{
     frame::{atomically, prepare_folder},
     metrics,
     models::{
-        self, learned,
+        self,
+        catalogue::METHODS,
         network::{Network, stack},
         weights_file::{self, Facts},
     },
@@ -198,7 +199,7 @@ fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
     {
         return Ok(());
     }
-    for (name, bytes) in learned::BUILT_IN {
+    for (name, bytes) in METHODS.iter().filter_map(|method| Some((method.name, method.built_in()?))) {
         if weights_file::parse_config(bytes, Path::new(name))?.prefilter == *wanted {
             return weights_file::set_prefilter(network, bytes, Path::new(name));
         }

@@ -9,9 +9,8 @@ use crate::{
     Result,
     frame::{Frame, Window},
     models::{
-        self, Denoiser,
-        learned::{BUILT_IN, Learned},
-        nfor,
+        self,
+        catalogue::{Family, METHODS},
     },
     passes::{self, Layer, POSITION_AOV, Pass},
     planes::Planes,
@@ -87,14 +86,11 @@ pub struct Method {
     passes: Vec<Pass>,
 }
 
-/// The networks with weights, the classical methods and the peers, with the passes they need.
+/// The methods there are, with the passes they need: networks with weights, classical methods, peers.
 pub fn methods() -> Vec<Method> {
-    let method = |name: &str, passes: &[Pass]| Method { name: name.into(), passes: passes.to_vec() };
-    let built_in =
-        BUILT_IN.into_iter().filter_map(|(name, _)| Some(method(name, Learned::built_in(name)?.passes())));
-    let others = [nfor::NAME].into_iter().chain(models::oidn::NAMES);
-    let others = others.filter_map(|name| Some(method(name, models::open(name).ok()?.passes())));
-    built_in.chain(others).collect()
+    let opened = METHODS.iter().filter(|method| method.family != Family::Noisy);
+    let opened = opened.filter_map(|method| models::open(method.name).ok());
+    opened.map(|method| Method { name: method.name().into(), passes: method.passes().to_vec() }).collect()
 }
 
 /// Reads and decodes a whole file. Its noise is described if it `is_compared` with that of another.
