@@ -1,15 +1,17 @@
 //! `demc compare A B`: the metrics of one image against another, one `name value` a line.
 
-use std::{path::PathBuf, process::ExitCode};
+use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
 use super::{print_line, warn_line};
+use crate::cli::ExitCode;
 use crate::{
     Error, Result,
     frame::Frame,
-    metrics,
+    metrics::{self, Scores},
     passes::{self, COMBINED, Layer, Pass, PassSet},
+    planes::Planes,
     report::number,
 };
 
@@ -43,11 +45,40 @@ pub struct Args {
     json: bool,
 }
 
+impl Args {
+    /// What is compared by default.
+    pub fn of(image: &Path, reference: &Path) -> Self {
+        let (image, reference, reference_layer) = (image.into(), reference.into(), COMBINED.into());
+        Self { image, reference, view_layer: None, layer: None, reference_layer, json: false }
+    }
+}
+
 /// Prints the scores.
 ///
 /// # Errors
 /// A file is unusable, or the images cannot be compared.
 pub fn run(args: &Args) -> Result<ExitCode> {
+    let (scores, reference) = scores(args)?;
+    if args.json {
+        let object: serde_json::Map<String, serde_json::Value> =
+            scores.named().into_iter().map(|(name, value)| (name.into(), value.into())).collect();
+        print_line(&serde_json::Value::from(object).to_string());
+        return Ok(ExitCode::SUCCESS);
+    }
+    for (name, value) in scores.named() {
+        match value {
+            Some(value) => print_line(&format!("{name} {}", number(value))),
+            None => warn_line(&format!("{name}: none, {}", metrics::why_undefined(&reference))),
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The scores, and the image that is the reference.
+///
+/// # Errors
+/// As [`run`].
+pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
     let image = judged(args)?;
     let reference = reference(args, &image.view_layer)?;
     if image.view_layer != reference.view_layer {
@@ -62,19 +93,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let remedy = "no metric is defined on them; render anew or denoise first";
         Error::invalid(&args.image, format!("cannot be compared with {reference}: {why}; {remedy}"))
     })?;
-    if args.json {
-        let object: serde_json::Map<String, serde_json::Value> =
-            scores.named().into_iter().map(|(name, value)| (name.into(), value.into())).collect();
-        print_line(&serde_json::Value::from(object).to_string());
-        return Ok(ExitCode::SUCCESS);
-    }
-    for (name, value) in scores.named() {
-        match value {
-            Some(value) => print_line(&format!("{name} {}", number(value))),
-            None => warn_line(&format!("{name}: none, {}", metrics::why_undefined(&reference))),
-        }
-    }
-    Ok(ExitCode::SUCCESS)
+    Ok((scores, reference))
 }
 
 /// What is judged, as the Combined of its view layer: the layer named, or by default `Denoised`, or else Combined.

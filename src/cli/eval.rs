@@ -1,11 +1,12 @@
 //! `demc eval`: methods against references, with times, tables, charts and comparison sheets.
 
-use std::{collections::HashSet, io::IsTerminal, path::PathBuf, process::ExitCode};
+use std::{collections::HashSet, io::IsTerminal, path::PathBuf};
 
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{methods, print_line, warn_line};
+use crate::cli::ExitCode;
 use crate::{
     Error, Result,
     report::{self, Event, Method, Options, Row},

@@ -1,6 +1,8 @@
 //! `demc completions` and `demc man`: what a shell and `man` know of this program, made from the command line itself.
 
-use std::{path::PathBuf, process::ExitCode};
+use std::path::PathBuf;
+
+use crate::cli::ExitCode;
 
 use clap::{Args as ClapArgs, Command};
 use clap_complete::Shell;

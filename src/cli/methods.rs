@@ -3,12 +3,12 @@
 use std::{
     collections::HashSet,
     path::{Path, PathBuf},
-    process::ExitCode,
 };
 
 use clap::Args as ClapArgs;
 
 use super::{SOME_FAILED, peak_memory, warn_line};
+use crate::cli::ExitCode;
 use crate::{
     Error, Result,
     models::{self, Denoiser, oidn::Oidn},
@@ -51,7 +51,7 @@ impl Args {
     pub fn methods(&self) -> Result<Vec<Method>> {
         let threads = self.threads();
         // Built-in methods change with the program.
-        let program = std::env::current_exe().map_or("unknown".into(), |path| report::file_stamp(&path));
+        let program = super::program().map_or("unknown".into(), |path| report::file_stamp(&path));
         let asked = self.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
         let mut seen = HashSet::new();
         let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();

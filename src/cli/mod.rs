@@ -19,14 +19,21 @@ mod stop;
 mod train;
 
 use std::{
-    io::Write,
+    ffi::OsString,
+    io::{self, Write},
     panic::{catch_unwind, set_hook},
-    process::ExitCode,
+    path::{Path, PathBuf},
+    process,
+    sync::OnceLock,
 };
 
 use clap::{CommandFactory, Parser, Subcommand};
 
-use crate::{Error, Result, error::panic_message};
+use crate::{
+    Error, Result,
+    error::{attempt, panic_message},
+    metrics::Scores,
+};
 
 #[derive(Parser)]
 #[command(
@@ -69,9 +76,60 @@ pub const SOME_FAILED: u8 = 1;
 pub const USAGE: u8 = 2;
 
 /// Parses the process arguments and runs the subcommand.
-pub fn main() -> ExitCode {
+pub fn main() -> process::ExitCode {
+    main_with(Cli::parse()).0.into()
+}
+
+/// What the program ends with, as a number: unlike the standard library's it can be handed to another language.
+#[derive(Clone, Copy)]
+struct ExitCode(u8);
+
+impl ExitCode {
+    const SUCCESS: Self = Self(0);
+}
+
+impl From<u8> for ExitCode {
+    fn from(status: u8) -> Self {
+        Self(status)
+    }
+}
+
+/// As [`main`], with these arguments, the program's own path first: for a program that is not a process' own executable, as the
+/// command of a Python package is not.
+pub fn main_as(arguments: Vec<OsString>) -> u8 {
+    if let Some(program) = arguments.first() {
+        let _ = PROGRAM.set(program.into());
+    }
+    main_with(Cli::parse_from(arguments)).0
+}
+
+/// The program, where it is not the process' executable.
+static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+
+/// What runs `demc` when it is started.
+fn program() -> io::Result<PathBuf> {
+    PROGRAM.get().cloned().map_or_else(std::env::current_exe, Ok)
+}
+
+/// What `demc inspect --json` says about a file.
+///
+/// # Errors
+/// The file is unusable.
+pub fn inspect_json(path: &Path) -> Result<String> {
+    let report = attempt(path, || inspect::examine::examine(path, &inspect::examine::methods(), false))?;
+    Ok(serde_json::to_string(&report).expect("strings and numbers serialise"))
+}
+
+/// What `demc compare` makes of two files, by its names.
+///
+/// # Errors
+/// A file is unusable, or the images cannot be compared.
+pub fn compare_files(image: &Path, reference: &Path) -> Result<Scores> {
+    attempt(image, || compare::scores(&compare::Args::of(image, reference)).map(|(scores, _)| scores))
+}
+
+fn main_with(Cli { command }: Cli) -> ExitCode {
     crate::kernels::heap::keep_freed();
-    let command = Cli::parse().command;
     // A defect is told in one line like any other failure, not by a trace of the program.
     if std::env::var_os("RUST_BACKTRACE").is_none() {
         set_hook(Box::new(|_| {}));
@@ -102,10 +160,10 @@ fn run(command: Command) -> Result<ExitCode> {
 
 /// One line on stdout. A reader that has gone away (`demc ... | head`) is no reason to stop.
 fn print_line(line: &str) {
-    let _ = writeln!(std::io::stdout(), "{line}");
+    let _ = writeln!(io::stdout(), "{line}");
 }
 
 /// One line on stderr. Nobody who reads it is no reason to stop either.
 fn warn_line(line: &str) {
-    let _ = writeln!(std::io::stderr(), "{line}");
+    let _ = writeln!(io::stderr(), "{line}");
 }

@@ -1,7 +1,6 @@
 //! `demc models`: the methods there are, and what they cost.
 
-use std::process::ExitCode;
-
+use crate::cli::ExitCode;
 use crate::{
     Result,
     models::{

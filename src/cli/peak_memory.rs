@@ -5,12 +5,13 @@
 use std::{
     fs,
     path::{Path, PathBuf},
-    process::{Command, ExitCode},
+    process::Command,
 };
 
 use clap::Args as ClapArgs;
 
 use super::print_line;
+use crate::cli::ExitCode;
 use crate::{Error, Result, models, shot};
 
 /// Name of the subcommand.
@@ -65,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// What `demc peak-memory` says about a model and a frame; none where it cannot tell.
 pub fn in_own_process(model: &str, input: &Path, view_layer: Option<&str>, threads: usize) -> Option<f64> {
-    let mut command = Command::new(std::env::current_exe().ok()?);
+    let mut command = Command::new(super::program().ok()?);
     command.arg(COMMAND).args(["--model", model, "--threads", &threads.to_string()]);
     if let Some(view_layer) = view_layer {
         command.args(["--view-layer", view_layer]);

@@ -7,13 +7,13 @@ use std::{
     fs::{self, File},
     io::{BufRead, BufReader},
     path::{Path, PathBuf},
-    process::ExitCode,
 };
 
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 
 use super::{SOME_FAILED, inputs, print_line, warn_line};
+use crate::cli::ExitCode;
 use crate::{Error, Result};
 
 /// Arguments of `demc report`.

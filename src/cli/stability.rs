@@ -1,6 +1,8 @@
 //! `demc stability`: how much methods' results change when their inputs go wrong.
 
-use std::{path::PathBuf, process::ExitCode};
+use std::path::PathBuf;
+
+use crate::cli::ExitCode;
 
 use clap::Args as ClapArgs;
 

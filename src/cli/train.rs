@@ -5,7 +5,6 @@ use std::{
     fs,
     io::IsTerminal,
     path::{Path, PathBuf},
-    process::ExitCode,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -15,6 +14,7 @@ use std::{
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::warn_line;
+use crate::cli::ExitCode;
 use crate::{
     Error, Result,
     frame::Frame,

@@ -220,6 +220,19 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     })
 }
 
+/// Denoises passes that are in memory, by the steps by which a file is denoised: radiance that is finite, (3, H, W).
+///
+/// # Errors
+/// A pass is missing, or the model cannot denoise the frame.
+pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Planes> {
+    shot.passes.require_all(model.passes().iter().copied(), model.name())?;
+    let mut report = Report::default();
+    rayon::scope(|_| {
+        let radiance = run(shot, &mut [], model, options, &mut report)?;
+        finite(radiance, model.name(), &shot.passes.path, &mut report)
+    })
+}
+
 impl<T> Views<T> {
     /// Adds to what the user should know.
     pub(super) fn say(&mut self, note: &str) {

@@ -15,7 +15,7 @@ mod window;
 use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper, plan};
-pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, store};
+pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, shot, store};
 pub use lights::Alpha;
 pub use sequence::{follows, frame_number};
 

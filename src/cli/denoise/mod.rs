@@ -6,7 +6,9 @@
 mod frames;
 mod progress;
 
-use std::{path::PathBuf, process::ExitCode};
+use std::path::PathBuf;
+
+use crate::cli::ExitCode;
 
 use clap::{Args as ClapArgs, ValueEnum};
 use frames::Frames;

@@ -1,11 +1,13 @@
 //! `demc inspect FILE...`: what a file holds, which passes are recognised, what each model misses and
 //! how Blender turns it on, and what looks suspicious.
 
-mod examine;
+pub(super) mod examine;
 mod grain;
 mod print;
 
-use std::{path::PathBuf, process::ExitCode};
+use std::path::PathBuf;
+
+use crate::cli::ExitCode;
 
 use clap::Args as ClapArgs;
 

@@ -1,0 +1,113 @@
+"""Removes Monte Carlo noise from Blender Cycles renders.
+
+`denoise` takes numpy arrays, `denoise_file` an EXR file; `inspect` tells what a file holds, `compare` how far one
+file is from another. The command `demc` is installed beside this module and makes the same bits.
+"""
+
+import json
+import os
+
+import numpy as np
+
+from . import _demc
+from ._demc import Error, __version__
+
+__all__ = ["Error", "__version__", "compare", "denoise", "denoise_file", "inspect"]
+
+# The largest number that float16 holds.
+_HALF_MAX = float(np.finfo(np.float16).max)
+
+
+def _image(name, image, shape=None):
+    if not isinstance(image, np.ndarray):
+        raise ValueError(f"{name} is a {type(image).__name__}; give a numpy array of shape (H, W, 3)")
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{name} has shape {image.shape}; give (H, W, 3), without alpha")
+    if image.dtype not in (np.float32, np.float16):
+        raise ValueError(f"{name} is of {image.dtype}; give float32 or float16")
+    if shape is not None and image.shape != shape:
+        raise ValueError(f"{name} has shape {image.shape}, color {shape}; give arrays of one render")
+    return np.ascontiguousarray(image, dtype=np.float32)
+
+
+def _count(name, value):
+    if value is None:
+        return None
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= value < 2**16:
+        return int(value)
+    raise ValueError(f"{name} is {value!r}; give a number from 1 to 65535, or None")
+
+
+def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, threads=None):
+    """Denoised radiance, an array of the shape and dtype of `color`.
+
+    color: noisy linear radiance (Combined), shape (H, W, 3), float32 or float16.
+    albedo, normal: Cycles' Denoising Albedo (0 to 1) and Denoising Normal (-1 to 1, camera space), of the same
+        shape, float32 or float16. The built-in networks need both.
+    model: a name that `demc models` lists, or a weights file.
+    samples: samples per pixel of the render. Some models decide by it how much they trust a pixel; files tell it
+        in their metadata, arrays cannot.
+    threads: how many threads to use; None for all cores.
+
+    Rows run from top to bottom. Values that are not finite are filled in from around them. Python's lock is
+    released; after Ctrl-C the call ends at once, and the work in the background when the model has done.
+
+    ValueError: arrays that do not fit, an unknown model, or arrays that the model needs and that are missing.
+    Error: the model cannot denoise the frame.
+    """
+    radiance = _image("color", color)
+    guides = [
+        None if guide is None else _image(name, guide, color.shape)
+        for name, guide in [("albedo", albedo), ("normal", normal)]
+    ]
+    counts = _count("samples", samples), _count("threads", threads)
+    result = _demc.denoise_arrays(radiance, *guides, os.fspath(model), *counts).reshape(color.shape)
+    if color.dtype == np.float16:
+        result = result.clip(-_HALF_MAX, _HALF_MAX).astype(np.float16)
+    return result
+
+
+def denoise_file(source, out, model="demc-m", *, overwrite=False, view_layer=None, threads=None):
+    """Denoises an EXR file into another: all that it held, and the layer `Denoised`. Byte for byte what the command writes.
+
+    source, out: paths of two files; the folder of `out` must exist.
+    model: a name that `demc models` lists, or a weights file.
+    overwrite: whether a file at `out` is replaced.
+    view_layer: the view layer to denoise; None for the one with the most passes.
+    threads: how many threads to use; None for all cores.
+
+    Returns a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of values that
+    were not finite by pass; notes, a list of what is good to know.
+
+    ValueError: an unknown model, or `out` is `source`.
+    Error: a file cannot be read or written, lacks a pass, or exists without `overwrite`. `out` is whole, or not
+    there; after Ctrl-C it is not begun.
+    """
+    source, out = os.fspath(source), os.fspath(out)
+    if os.path.exists(out):
+        if os.path.exists(source) and os.path.samefile(source, out):
+            raise ValueError(f"{source}: the result would overwrite its input; choose another out")
+        if not overwrite:
+            raise Error(f"{out}: exists; overwrite=True replaces it, or choose another out")
+    threads = _count("threads", threads)
+    values = _demc.denoise_path(source, out, os.fspath(model), view_layer, threads)
+    return dict(zip(("view_layer", "width", "height", "seconds", "repaired", "notes"), values))
+
+
+def inspect(path):
+    """What an EXR file holds: the dict of `demc inspect --json` (layout, parts, layers with their passes, what each
+    model misses, warnings).
+
+    Error: the file cannot be read.
+    """
+    return json.loads(_demc.inspect_json(os.fspath(path)))
+
+
+def compare(image, reference):
+    """How far an EXR file is from its reference: a dict of the metrics of `demc compare`, by name.
+
+    Where `image` has a layer `Denoised`, that is judged, else Combined. A metric that is not defined on the two is None.
+
+    Error: a file cannot be read, or the images differ in size or place or hold values that are not finite.
+    """
+    return dict(_demc.compare_files(os.fspath(image), os.fspath(reference)))

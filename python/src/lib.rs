@@ -1,0 +1,222 @@
+//! The compiled half of the Python package `demc`: arrays and paths in, arrays and text out.
+//!
+//! `python/demc/__init__.py` is what users see: it checks arrays and documents every function. All work is done on a thread of
+//! its own without Python's lock, and the calling thread looks for Ctrl-C meanwhile.
+
+use std::{
+    collections::HashMap,
+    ffi::OsString,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::PathBuf,
+    sync::{
+        Arc, LazyLock, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+        mpsc::{RecvTimeoutError, channel},
+    },
+    thread,
+    time::Duration,
+};
+
+use demc::{
+    Error as Failure,
+    denoise::{self, Options},
+    models::{self, Denoiser},
+    passes::{Pass, PassSet},
+    planes::Planes,
+    shot::Shot,
+};
+use numpy::{PyArray1, PyReadonlyArray3, ndarray::Axis};
+use pyo3::{create_exception, exceptions, prelude::*};
+
+create_exception!(
+    demc,
+    Error,
+    exceptions::PyRuntimeError,
+    "A file or a frame cannot be worked on; says why, and what to do."
+);
+
+/// How often the calling thread looks for Ctrl-C.
+const LOOK: Duration = Duration::from_millis(50);
+
+fn to_python(failure: Failure) -> PyErr {
+    match failure {
+        Failure::Usage(why) => exceptions::PyValueError::new_err(why),
+        Failure::Interrupted => exceptions::PyKeyboardInterrupt::new_err(()),
+        other => Error::new_err(other.to_string()),
+    }
+}
+
+/// Runs `work` on a thread of its own, with so many threads if that is said; Ctrl-C ends the wait, and tells `work`.
+fn detached<T: Send + 'static>(
+    py: Python<'_>,
+    threads: Option<usize>,
+    work: impl FnOnce(&AtomicBool) -> demc::Result<T> + Send + 'static,
+) -> PyResult<T> {
+    let pool = threads.map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build());
+    let pool = pool.transpose().map_err(|e| exceptions::PyValueError::new_err(format!("threads: {e}")))?;
+    let stopped = Arc::new(AtomicBool::new(false));
+    let (done, result) = channel();
+    let asked = Arc::clone(&stopped);
+    thread::spawn(move || {
+        let guarded = AssertUnwindSafe(|| match &pool {
+            Some(pool) => {
+                // Not from within: the closure must be handed over whole.
+                pool.install(|| work(&asked))
+            }
+            None => work(&asked),
+        });
+        let outcome = catch_unwind(guarded)
+            .unwrap_or_else(|_| Err(Failure::Internal("its message is on standard error".into())));
+        let _ = done.send(outcome);
+    });
+    let result = Mutex::new(result);
+    loop {
+        let received = py.detach(|| result.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(LOOK));
+        match received {
+            Ok(outcome) => return outcome.map_err(to_python),
+            Err(RecvTimeoutError::Timeout) => py.check_signals().inspect_err(|_| {
+                stopped.store(true, Ordering::SeqCst);
+            })?,
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(Error::new_err("the thread that denoises has gone; please report it"));
+            }
+        }
+    }
+}
+
+/// A model by name or file. Built-in ones are kept: unpacking their weights takes longer than a small frame.
+fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
+    static OPENED: LazyLock<Mutex<HashMap<String, Arc<dyn Denoiser>>>> = LazyLock::new(Mutex::default);
+    if name.contains(".safetensors") {
+        return Ok(models::open(name)?.into());
+    }
+    if let Some(model) = OPENED.lock().unwrap_or_else(PoisonError::into_inner).get(name) {
+        return Ok(Arc::clone(model));
+    }
+    let model: Arc<dyn Denoiser> = models::open(name)?.into();
+    OPENED.lock().unwrap_or_else(PoisonError::into_inner).insert(name.into(), Arc::clone(&model));
+    Ok(model)
+}
+
+fn planes(image: &PyReadonlyArray3<'_, f32>) -> Planes {
+    let image = image.as_array();
+    let (height, width, _) = image.dim();
+    let channels = (0..3).flat_map(|c| image.index_axis_move(Axis(2), c).into_iter().copied());
+    Planes::from_vec(3, width, height, channels.collect())
+}
+
+/// What an array is called, of the passes that arrays are taken for.
+fn argument(pass: Pass) -> Option<&'static str> {
+    match pass {
+        Pass::Combined => Some("color"),
+        Pass::DenoisingAlbedo => Some("albedo"),
+        Pass::DenoisingNormal => Some("normal"),
+        _ => None,
+    }
+}
+
+/// Whether the arrays that are there do for the model.
+fn check_passes(model: &dyn Denoiser, set: &PassSet) -> demc::Result<()> {
+    let missing: Vec<Pass> = model.passes().iter().copied().filter(|pass| set.get(*pass).is_none()).collect();
+    let name = model.name();
+    if let Some(pass) = missing.iter().find(|pass| argument(**pass).is_none()) {
+        return Err(Failure::Usage(format!(
+            "{name} needs the pass {pass}, for which there is no array; use denoise_file"
+        )));
+    }
+    let missing: Vec<&str> = missing.into_iter().filter_map(argument).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    Err(Failure::Usage(format!(
+        "{name} needs {}: pass Cycles' denoising data, or take another model",
+        missing.join(" and ")
+    )))
+}
+
+/// Radiance (H, W, 3), flat, of float32 arrays (H, W, 3) of one size, which the caller has checked.
+#[pyfunction]
+fn denoise_arrays<'py>(
+    py: Python<'py>,
+    color: PyReadonlyArray3<'py, f32>,
+    albedo: Option<PyReadonlyArray3<'py, f32>>,
+    normal: Option<PyReadonlyArray3<'py, f32>>,
+    model: String,
+    samples: Option<u32>,
+    threads: Option<usize>,
+) -> PyResult<Bound<'py, PyArray1<f32>>> {
+    let color = planes(&color);
+    let mut set = PassSet::new("arrays", "", color.width, color.height);
+    set.samples = samples;
+    set.insert(Pass::Combined, color);
+    for (pass, image) in [(Pass::DenoisingAlbedo, albedo), (Pass::DenoisingNormal, normal)] {
+        if let Some(image) = image {
+            set.insert(pass, planes(&image));
+        }
+    }
+    let radiance = detached(py, threads, move |_| {
+        let model = open(&model)?;
+        check_passes(&*model, &set)?;
+        denoise::shot(&Shot::new(set), &*model, &Options::default())
+    })?;
+    let pixels = radiance.pixels();
+    let values = (0..3 * pixels).map(|i| radiance.data[i % 3 * pixels + i / 3]);
+    Ok(PyArray1::from_iter(py, values))
+}
+
+/// Denoises a file: (view layer, width, height, seconds, repaired values by pass, notes).
+#[pyfunction]
+fn denoise_path(
+    py: Python<'_>,
+    source: PathBuf,
+    out: PathBuf,
+    model: String,
+    view_layer: Option<String>,
+    threads: Option<usize>,
+) -> PyResult<(String, usize, usize, f64, HashMap<String, usize>, Vec<String>)> {
+    let report = detached(py, threads, move |stopped| {
+        let (model, options) = (open(&model)?, Options { view_layer, ..Options::default() });
+        let denoised = denoise::denoise(denoise::load(&source, &*model, &options)?, &*model, &options)?;
+        // Whoever pressed Ctrl-C meanwhile expects no file.
+        if stopped.load(Ordering::SeqCst) {
+            return Err(Failure::Interrupted);
+        }
+        denoise::store(denoised, &out, &options)
+    })?;
+    let repaired = report.repaired.into_iter().collect();
+    Ok((report.view_layer, report.width, report.height, report.seconds, repaired, report.notes))
+}
+
+/// What `demc inspect --json` prints.
+#[pyfunction]
+fn inspect_json(py: Python<'_>, path: PathBuf) -> PyResult<String> {
+    detached(py, None, move |_| demc::cli::inspect_json(&path))
+}
+
+/// Names and values of the metrics of one file against another.
+#[pyfunction]
+fn compare_files(
+    py: Python<'_>,
+    image: PathBuf,
+    reference: PathBuf,
+) -> PyResult<Vec<(&'static str, Option<f64>)>> {
+    let scores = detached(py, None, move |_| demc::cli::compare_files(&image, &reference))?;
+    Ok(scores.named().into())
+}
+
+/// The command, with its arguments, the program's path first; its exit status.
+#[pyfunction]
+fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
+    py.detach(|| demc::cli::main_as(arguments))
+}
+
+#[pymodule]
+fn _demc(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("Error", module.py().get_type::<Error>())?;
+    module.add_function(wrap_pyfunction!(denoise_arrays, module)?)?;
+    module.add_function(wrap_pyfunction!(denoise_path, module)?)?;
+    module.add_function(wrap_pyfunction!(inspect_json, module)?)?;
+    module.add_function(wrap_pyfunction!(compare_files, module)?)?;
+    module.add_function(wrap_pyfunction!(command, module)?)
+}

@@ -1,0 +1,167 @@
+"""The installed package against the installed command: same bits, same words."""
+
+import json
+import pathlib
+import re
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import threading
+import unittest
+
+import numpy as np
+import OpenImageIO as oiio
+
+import demc
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+ROOM = ROOT / "tests/data/s0000_room_0004spp.exr"
+REFERENCE = ROOT / "tests/data/s0000_room_ref.exr"
+COMMAND = pathlib.Path(sysconfig.get_path("scripts")) / "demc"
+
+
+def command(*arguments):
+    return subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True)
+
+
+def passes(path):
+    """Channels by name, and the header's text attributes, of all parts."""
+    source = oiio.ImageInput.open(str(path))
+    channels, samples, part = {}, None, 0
+    while source.seek_subimage(part, 0):
+        spec = source.spec()
+        pixels = source.read_image(part, 0, 0, spec.nchannels, "float")
+        channels.update((name, pixels[..., i]) for i, name in enumerate(spec.channelnames))
+        count = spec.getattribute("cycles.ViewLayer.samples")
+        samples = int(count) if count else samples
+        part += 1
+    source.close()
+    return channels, samples
+
+
+def stacked(channels, layer, components):
+    return np.stack([channels[f"ViewLayer.{layer}.{c}"] for c in components], axis=-1).astype(np.float32)
+
+
+class Package(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+    def arrays(self):
+        channels, samples = passes(ROOM)
+        color = stacked(channels, "Combined", "RGB")
+        albedo = stacked(channels, "Denoising Albedo", "RGB")
+        normal = stacked(channels, "Denoising Normal", "XYZ")
+        return color, albedo, normal, samples
+
+    def test_arrays_give_the_bits_of_the_command(self):
+        done = command("denoise", ROOM, "--out", self.folder)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        color, albedo, normal, samples = self.arrays()
+        result = demc.denoise(color, albedo, normal, samples=samples)
+        self.assertEqual((result.dtype, result.shape), (np.float32, color.shape))
+        written = stacked(passes(self.folder / ROOM.name)[0], "Denoised", "RGB")
+        # Stored as the beauty is: half floats in a file of half floats.
+        if np.array_equal(written, written.astype(np.float16)):
+            result = result.astype(np.float16).astype(np.float32)
+        np.testing.assert_array_equal(result, written)
+        self.assertFalse(np.array_equal(written, color))
+
+    def test_halves_stay_halves_and_threads_change_no_bit(self):
+        color, albedo, normal, _ = (a if i == 3 else a.astype(np.float16) for i, a in enumerate(self.arrays()))
+        half = demc.denoise(color, albedo, normal, model="demc-s")
+        self.assertEqual(half.dtype, np.float16)
+        whole = [a.astype(np.float32) for a in (color, albedo, normal)]
+        of_one = demc.denoise(*whole, model="demc-s", threads=1)
+        np.testing.assert_array_equal(half, of_one.astype(np.float16))
+        flipped = demc.denoise(*(a[:, ::-1][:, ::-1] for a in whole), model="demc-s")
+        np.testing.assert_array_equal(flipped, of_one)
+
+    def test_files_are_the_command_s_to_the_byte(self):
+        command("denoise", ROOM, "--out", self.folder)
+        out = self.folder / "module.exr"
+        report = demc.denoise_file(ROOM, out)
+        self.assertEqual((report["width"], report["view_layer"]), (128, "ViewLayer"))
+        self.assertEqual(out.read_bytes(), (self.folder / ROOM.name).read_bytes())
+        with self.assertRaisesRegex(demc.Error, "exists; overwrite=True"):
+            demc.denoise_file(ROOM, out)
+        demc.denoise_file(ROOM, out, model="demc-s", overwrite=True)
+        self.assertNotEqual(out.read_bytes(), (self.folder / ROOM.name).read_bytes())
+        with self.assertRaisesRegex(ValueError, "overwrite its input"):
+            demc.denoise_file(out, out, overwrite=True)
+
+    def test_inspect_and_compare_say_what_the_command_says(self):
+        self.assertEqual(demc.inspect(ROOM), json.loads(command("inspect", "--json", ROOM).stdout))
+        said = json.loads(command("compare", "--json", ROOM, REFERENCE).stdout)
+        self.assertEqual(demc.compare(ROOM, REFERENCE), said)
+        self.assertGreater(said["relmse"], 0)
+
+    def test_what_is_wrong_is_said(self):
+        color, albedo, normal, _ = self.arrays()
+        for words, arguments in [
+            ("without alpha", (np.zeros((4, 4, 4), np.float32),)),
+            ("float64; give float32", (color.astype(np.float64),)),
+            ("is a list", ([1.0],)),
+            ("arrays of one render", (color, albedo[:-1], normal)),
+            ("needs normal and albedo", (color,)),
+            ("no model 'nosuch'", (color, albedo, normal, "nosuch")),
+        ]:
+            with self.subTest(words), self.assertRaisesRegex(ValueError, words):
+                demc.denoise(*arguments)
+        with self.assertRaisesRegex(ValueError, "samples is 0"):
+            demc.denoise(color, albedo, normal, samples=0)
+        missing = self.folder / "missing.exr"
+        for call in (demc.inspect, lambda p: demc.compare(p, p), lambda p: demc.denoise_file(p, self.folder / "o")):
+            with self.assertRaisesRegex(demc.Error, r"missing\.exr: cannot read"):
+                call(missing)
+        self.assertEqual(command("inspect", missing).returncode, 1)
+        self.assertEqual(command("nosuch").returncode, 2)
+
+    def test_others_run_meanwhile(self):
+        color, albedo, normal, _ = (a if i == 3 else np.tile(a, (4, 4, 1)) for i, a in enumerate(self.arrays()))
+        steps, ended = 0, threading.Event()
+
+        def work():
+            demc.denoise(color, albedo, normal)
+            ended.set()
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        while not ended.wait(0.005):
+            steps += 1
+        thread.join()
+        self.assertGreater(steps, 5)
+
+    def test_ctrl_c_ends_the_call_and_writes_nothing(self):
+        # A timer stands for the keyboard.
+        code = (
+            "import demc, signal, sys\n"
+            "signal.signal(signal.SIGALRM, signal.default_int_handler)\n"
+            "signal.setitimer(signal.ITIMER_REAL, 0.01)\n"
+            "try:\n    demc.denoise_file(*sys.argv[1:], threads=1)\n"
+            "except KeyboardInterrupt:\n    print('stopped')\n"
+        )
+        out = self.folder / "o.exr"
+        done = subprocess.run([sys.executable, "-c", code, ROOM, out], capture_output=True, text=True)
+        self.assertEqual(done.stdout.strip(), "stopped", done.stderr)
+        self.assertFalse(out.exists())
+
+    def test_examples_of_the_documentation_run(self):
+        text = (ROOT / "docs/python.md").read_text()
+        examples = re.findall(r"```python\n(.*?)```", text, re.S)
+        self.assertGreater(len(examples), 1)
+        color, albedo, normal, _ = self.arrays()
+        for name, array in [("color", color), ("albedo", albedo), ("normal", normal)]:
+            np.save(self.folder / f"{name}.npy", array)
+        (self.folder / "shot.exr").write_bytes(ROOM.read_bytes())
+        (self.folder / "reference.exr").write_bytes(REFERENCE.read_bytes())
+        for example in examples:
+            done = subprocess.run([sys.executable, "-c", example], cwd=self.folder, capture_output=True, text=True)
+            self.assertEqual(done.returncode, 0, done.stderr)
+
+
+if __name__ == "__main__":
+    unittest.main()
