@@ -9,8 +9,8 @@ use crate::{
     Result,
     frame::{Frame, Window},
     models::{
-        self,
-        catalogue::{Family, METHODS},
+        Denoiser,
+        catalogue::{self, Family, Kind, METHODS},
     },
     passes::{self, Layer, POSITION_AOV, Pass},
     planes::Planes,
@@ -88,9 +88,15 @@ pub struct Method {
 
 /// The methods there are, with the passes they need: networks with weights, classical methods, peers.
 pub fn methods() -> Vec<Method> {
-    let opened = METHODS.iter().filter(|method| method.family != Family::Noisy);
-    let opened = opened.filter_map(|method| models::open(method.name).ok());
-    opened.map(|method| Method { name: method.name().into(), passes: method.passes().to_vec() }).collect()
+    let listed = METHODS.iter().filter(|method| method.family != Family::Noisy);
+    let passes = |method: &catalogue::Method| match method.kind {
+        Kind::Fixed(make) => Some(make().passes().to_vec()),
+        // Its weights are not packed, since nothing is denoised here.
+        _ => Some(method.learned().ok()?.passes().to_vec()),
+    };
+    let method =
+        |method: &catalogue::Method| Some(Method { name: method.name.into(), passes: passes(method)? });
+    listed.filter_map(method).collect()
 }
 
 /// Reads and decodes a whole file. Its noise is described if it `is_compared` with that of another.
