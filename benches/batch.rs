@@ -22,6 +22,7 @@ use demc::{
     models,
     passes::{self, Pass},
     shot,
+    sources::Sources,
 };
 use exr::prelude::*;
 use half::f16;
@@ -181,9 +182,10 @@ fn overlap(options: &Options) {
     for round in 0..=5 {
         let ((frame, shot), read) = timed(|| {
             let frame = Frame::read(&first).expect("just written");
-            let layers = passes::layers(&frame);
+            let layers = passes::layers(&frame, &passes::Mapping::default());
             let layer = passes::choose(&frame, &layers, None).expect("a render has a view layer");
-            let shot = shot::prepare_layer(&frame, layer, &wanted).expect("its passes are known");
+            let shot = shot::prepare_layer(&frame, layer, &wanted, &Sources::default())
+                .expect("its passes are known");
             (frame, shot)
         });
         let (image, denoise) = timed(|| model.denoise(&shot).expect("the passes are there"));

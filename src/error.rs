@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::passes::Pass;
+use crate::passes::{Pass, Renderer};
 
 /// Result with this crate's [`Error`].
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -37,7 +37,9 @@ pub enum Error {
         path: PathBuf,
         /// The view layer searched.
         view_layer: String,
-        /// The passes that are missing; the message says how Blender turns them on.
+        /// The renderer that wrote it; the message says how it is told to write the passes.
+        renderer: &'static Renderer,
+        /// The passes that are missing.
         passes: Vec<Pass>,
         /// The method that needs it.
         needed_by: String,
@@ -70,14 +72,14 @@ impl fmt::Display for Error {
                 write!(f, "{}: cannot {action}: {source}", path.display())
             }
             Self::Invalid { path, reason } => write!(f, "{}: {reason}", path.display()),
-            Self::MissingPass { path, view_layer, passes, needed_by } => {
+            Self::MissingPass { path, view_layer, renderer, passes, needed_by } => {
                 let names: Vec<String> = passes.iter().map(Pass::to_string).collect();
                 let noun = if passes.len() == 1 { "pass" } else { "passes" };
                 let layer = match view_layer.as_str() {
                     "" => "the file, which has no view layers,".into(),
                     name => format!("view layer '{name}'"),
                 };
-                let mut settings: Vec<&str> = passes.iter().map(|pass| pass.blender_setting()).collect();
+                let mut settings: Vec<String> = passes.iter().map(|pass| renderer.setting(*pass)).collect();
                 settings.dedup();
                 write!(
                     f,
@@ -86,7 +88,17 @@ impl fmt::Display for Error {
                     names.join(", "),
                     settings.join("; ")
                 )?;
-                if view_layer.is_empty() { f.write_str("; save as OpenEXR MultiLayer") } else { Ok(()) }
+                if !view_layer.is_empty() {
+                    return Ok(());
+                }
+                // Nothing tells of what program a file is that names nothing.
+                let multilayer = if renderer.is_blender() { "; save as OpenEXR MultiLayer" } else { "" };
+                let guides = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+                let elsewhere = match passes.iter().all(|pass| guides.contains(pass)) {
+                    true => "; or say where they are: --map albedo=NAME, --albedo FILE, --normal FILE",
+                    false => "; or say what they are called: --map PASS=NAME",
+                };
+                write!(f, "{multilayer}{elsewhere}")
             }
             Self::Usage(message) => f.write_str(message),
             Self::Interrupted => f.write_str("interrupted"),

@@ -24,7 +24,7 @@
 //! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits weights;
 //! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
 //! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
-//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given, and
+//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given, [`sources`] where it is found, and
 //! a [`companion`] a layer denoised along; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
@@ -47,6 +47,7 @@ pub mod planes;
 #[cfg(feature = "report")]
 pub mod report;
 pub mod shot;
+pub mod sources;
 #[cfg(feature = "report")]
 pub mod stability;
 #[cfg(feature = "test-sets")]

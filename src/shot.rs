@@ -14,6 +14,7 @@ use crate::{
     frame::Frame,
     passes::{self, Layer, Pass, PassSet},
     planes::Planes,
+    sources::Sources,
 };
 
 /// A frame of one view layer, ready for any method.
@@ -29,6 +30,8 @@ pub struct Shot {
     pub light_groups: BTreeMap<String, Planes>,
     /// Whether Blender had denoised Combined, and the render was taken from the pass `Noisy Image`.
     pub was_denoised: bool,
+    /// What was done to normals that Blender did not write, for the user.
+    pub normals: Option<String>,
     /// How many values of each pass were not finite and are repaired; passes that were clean are not listed.
     pub repaired: BTreeMap<Pass, usize>,
     /// The render with values that are not finite, where it had any.
@@ -43,12 +46,15 @@ pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot>
     passes::load(path, view_layer).map(Shot::new)
 }
 
-/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has.
+/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has, and those that lie
+/// elsewhere.
 ///
 /// # Errors
-/// Pixels cannot be decoded.
-pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<Shot> {
-    passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat()).map(Shot::new)
+/// Pixels cannot be decoded, or a pass is not where it is said to be.
+pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass], sources: &Sources) -> Result<Shot> {
+    let mut set = passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat())?;
+    let normals = sources.complete(frame, layer, wanted, &mut set)?;
+    Ok(Shot { normals, ..Shot::new(set) })
 }
 
 /// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to
@@ -67,8 +73,8 @@ impl Shot {
         let is_broken = |render: &&Planes| render.data.iter().any(|v| !v.is_finite());
         let unrepaired = passes.get(Pass::Combined).filter(is_broken).cloned();
         let repaired = passes.sanitize();
-        let (halves, neighbours, light_groups) = Default::default();
-        Self { passes, halves, neighbours, light_groups, was_denoised, repaired, unrepaired }
+        let (halves, neighbours, light_groups, normals) = Default::default();
+        Self { passes, halves, neighbours, light_groups, normals, was_denoised, repaired, unrepaired }
     }
 
     /// The render as it was stored, with values that are not finite where it had any.

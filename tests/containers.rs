@@ -10,59 +10,16 @@ use std::{
 
 use common::{
     demc,
-    files::{data, write_render},
+    files::{Stored, data, header, with_attributes, write_render},
 };
 use exr::prelude::*;
 use predicates::{prelude::*, str::contains};
 
-/// Name, type and value.
-type Stored = (String, String, Vec<u8>);
-
 /// The flag for names of more than 31 letters.
 const LONG_NAMES: u32 = 0x400;
 
-/// The attributes of a file's first part in their order, and where the header ends.
-fn header(bytes: &[u8]) -> (Vec<Stored>, usize) {
-    let mut at = 8;
-    let name = |at: &mut usize| {
-        let end = *at + bytes[*at..].iter().position(|b| *b == 0).unwrap();
-        let name = String::from_utf8(bytes[*at..end].to_vec()).unwrap();
-        *at = end + 1;
-        name
-    };
-    let mut attributes = Vec::new();
-    loop {
-        let called = name(&mut at);
-        if called.is_empty() {
-            return (attributes, at);
-        }
-        let kind = name(&mut at);
-        let size = u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
-        attributes.push((called, kind, bytes[at + 4..at + 4 + size].to_vec()));
-        at += 4 + size;
-    }
-}
-
 fn version(bytes: &[u8]) -> u32 {
     u32::from_le_bytes(bytes[4..8].try_into().unwrap())
-}
-
-/// Adds attributes to a file of one part, before those that it has.
-fn with_attributes(path: &Path, added: &[(&str, &str, &[u8])]) {
-    let mut bytes = fs::read(path).unwrap();
-    let mut written = Vec::new();
-    for (name, kind, value) in added {
-        written.extend([name.as_bytes(), &[0], kind.as_bytes(), &[0]].concat());
-        written.extend((value.len() as u32).to_le_bytes());
-        written.extend_from_slice(value);
-    }
-    let end = header(&bytes).1;
-    let first = u64::from_le_bytes(bytes[end..end + 8].try_into().unwrap()) as usize;
-    for offset in bytes[end..first].as_chunks_mut::<8>().0 {
-        *offset = (u64::from_le_bytes(*offset) + written.len() as u64).to_le_bytes();
-    }
-    bytes.splice(8..8, written);
-    fs::write(path, bytes).unwrap();
 }
 
 fn denoise(input: &Path, out: &Path) -> PathBuf {

@@ -14,6 +14,7 @@ mod methods;
 mod models;
 mod peak_memory;
 mod report;
+mod sources;
 mod stability;
 mod stop;
 mod train;
@@ -33,6 +34,7 @@ use crate::{
     Error, Result,
     error::{attempt, panic_message},
     metrics::Scores,
+    passes::Mapping,
 };
 
 #[derive(Parser)]
@@ -116,7 +118,9 @@ fn program() -> io::Result<PathBuf> {
 /// # Errors
 /// The file is unusable.
 pub fn inspect_json(path: &Path) -> Result<String> {
-    let report = attempt(path, || inspect::examine::examine(path, &inspect::examine::methods(), false))?;
+    let report = attempt(path, || {
+        inspect::examine::examine(path, &inspect::examine::methods(), &Mapping::default(), false)
+    })?;
     Ok(serde_json::to_string(&report).expect("strings and numbers serialise"))
 }
 

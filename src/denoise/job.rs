@@ -18,6 +18,7 @@ use crate::{
     passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
+    sources::Sources,
 };
 
 /// One file to do.
@@ -49,6 +50,8 @@ pub struct Options {
     pub temporal: Option<usize>,
     /// What becomes of alpha.
     pub alpha: Alpha,
+    /// Where passes are, where their names do not tell.
+    pub sources: Sources,
     /// Whether light passes and light groups are denoised as well, so that they add up to the denoised beauty.
     pub passes: bool,
 }
@@ -64,6 +67,7 @@ impl Default for Options {
             overwrite: false,
             temporal: None,
             alpha: Alpha::Auto,
+            sources: Sources::default(),
             passes: false,
         }
     }
@@ -115,7 +119,7 @@ pub struct Views<T> {
 pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
     let frame = Frame::read(input)?;
-    let layers = passes::layers(&frame);
+    let layers = passes::layers(&frame, &options.sources.mapping);
     let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
     let mut report = Report { view_layer: chosen.name.clone(), ..Report::default() };
     if options.view_layer.is_none() {
@@ -141,7 +145,9 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     }
     let mut views = Vec::new();
     for layer in eyes {
-        let mut shot = shot::prepare_layer(&frame, layer, &wanted)?;
+        options.sources.mapping.check(input, layer)?;
+        let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
+        report.notes.extend(shot.normals.take());
         if shot.was_denoised {
             report.notes.push(
                 "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
@@ -427,12 +433,20 @@ pub(super) fn existing(output: &Path) -> Option<Frame> {
 /// It is another: nothing is overwritten unasked. Or a preview cannot be written.
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
-    let layers = passes::layers(headers);
+    let layers = passes::layers(headers, &options.sources.mapping);
     let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
     let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
     let full_name = layer_name(chosen, name);
-    let views = passes::rgb_layers(headers, Some(chosen), name);
+    let views = match &options.layer {
+        Some(added) => passes::rgb_layers(headers, Some(chosen), added),
+        // The beauty, whatever its renderer calls it.
+        None => layers
+            .iter()
+            .filter(|l| l.name == *chosen && l.passes.contains_key(&Pass::Combined))
+            .cloned()
+            .collect(),
+    };
     let lacks = |what: &str| {
         let why = format!(
             "exists without {what} made by demc; --overwrite denoises the frame again, or choose another --out"

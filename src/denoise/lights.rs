@@ -11,7 +11,7 @@ use crate::{
     companion::{Companion, Kind},
     frame::{Frame, SampleKind},
     models::Denoiser,
-    passes::{Layer, Pass, PassChannels},
+    passes::{BLENDER, Layer, Pass, PassChannels},
     planes::Planes,
     shot::Shot,
 };
@@ -106,7 +106,7 @@ impl Along {
             let held = lights.map(|light| shot.passes.get(light).is_some());
             let Some(colours) = shot.passes.remove(colour) else {
                 if let Some(light) = lights.iter().zip(held).find_map(|(light, held)| held.then_some(light)) {
-                    let setting = colour.blender_setting();
+                    let setting = BLENDER.setting(colour);
                     notes.push(format!(
                         "{light} is not denoised: it takes {colour}, which is missing; {setting}"
                     ));

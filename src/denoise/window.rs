@@ -252,10 +252,17 @@ impl Window {
             let at = number + i64::from(step * nearer);
             let vectors = self.moment(at, view).and_then(|moment| moment.shot.passes.get(Pass::Vector));
             let Some(vectors) = vectors else {
-                let setting = Pass::Vector.blender_setting();
-                return said(format!(
-                    "frame {at} has no pass Vector; {setting}, and Render Properties > Motion Blur off"
-                ));
+                let renderer = own.shot.passes.renderer;
+                return said(match renderer.is_blender() {
+                    true => format!(
+                        "frame {at} has no pass Vector; {}, and Render Properties > Motion Blur off",
+                        renderer.setting(Pass::Vector)
+                    ),
+                    false => format!(
+                        "frame {at} has no Vector of Cycles', and {}'s motion is not followed",
+                        renderer.name
+                    ),
+                });
             };
             moves |= vectors.data.iter().any(|v| *v != 0.0);
             flow.step(vectors, direction);

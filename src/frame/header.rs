@@ -63,6 +63,13 @@ impl Attributes {
         texts
     }
 
+    /// A matrix of four rows and columns, by rows.
+    pub fn matrix(&self, name: &str) -> Option<[f32; 16]> {
+        let numbers = self.value(name, "m44f")?.as_chunks::<4>().0;
+        let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        numbers.try_into().ok()
+    }
+
     /// A rectangle of pixels by its first and last column and row.
     fn corners(&self, name: &str) -> Option<[i32; 4]> {
         let numbers = self.value(name, "box2i")?.as_chunks::<4>().0;

@@ -158,6 +158,11 @@ impl Frame {
         self.stored.iter().find_map(|stored| stored.attributes.text(name))
     }
 
+    /// The 16 numbers of a matrix attribute, by rows, of the first part that has it.
+    pub fn matrix_attribute(&self, name: &str) -> Option<[f32; 16]> {
+        self.stored.iter().find_map(|stored| stored.attributes.matrix(name))
+    }
+
     /// What viewers show, in the coordinates of the data windows.
     pub fn display_window(&self) -> Window {
         let first = &self.stored[0].attributes;

@@ -1,10 +1,14 @@
 //! Which view layers a frame holds, which passes each has and in which channels, and their decoding.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 
 use super::{
-    Pass, PassSet,
-    names::{ChannelName, POSITION_AOV, TABLE, is_pass, light_group},
+    Mapping, Pass, PassSet,
+    channels::{ByPass, LayerKey, Place, by_pass, is_component},
+    names::{
+        BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_common, light_group,
+        plain,
+    },
 };
 use crate::{
     Error, Result,
@@ -19,10 +23,14 @@ pub struct Layer {
     pub name: String,
     /// Stereo view, where the file has views.
     pub view: Option<String>,
+    /// The renderer whose names it has: Blender, where nothing tells.
+    pub renderer: &'static Renderer,
     /// The passes recognised.
     pub passes: BTreeMap<Pass, PassChannels>,
     /// The light groups, which add up to Combined, by name.
     pub light_groups: BTreeMap<String, PassChannels>,
+    /// The name of a motion pass of another renderer than Blender, which demc does not follow.
+    pub motion: Option<String>,
     /// Whether the position is averaged over samples (a shader AOV) and not Cycles' aliased pass.
     pub position_averaged: bool,
     /// Names of channels that mean nothing to demc.
@@ -40,131 +48,148 @@ pub struct PassChannels {
     pub name: String,
 }
 
-/// A channel still without meaning: where it is and its component name.
-struct Unassigned {
-    part: usize,
-    channel: usize,
-    component: String,
-    full_name: String,
-}
-
 /// What Blender calls the layer that its compositor made.
 const COMPOSITE: &str = "Composite";
 
-/// A view layer's name and stereo view.
-type LayerKey = (String, Option<String>);
-
-/// The channels of each view layer and stereo view, in file order, by the names of their passes.
-fn channels_by_pass(frame: &Frame) -> Vec<(LayerKey, BTreeMap<String, Vec<Unassigned>>)> {
-    let views = frame.views();
-    let mut found: Vec<(LayerKey, BTreeMap<String, Vec<Unassigned>>)> = Vec::new();
-    for (p, part) in frame.parts().iter().enumerate() {
-        // A single part's name is the name of the file's only image, unless it ends in that of a pass.
-        let part_name = part.name.as_deref().filter(|name| frame.is_multi_part() || ends_in_pass(name));
-        // Deep samples are no image.
-        let flat = if part.deep { &[] } else { part.channels.as_slice() };
-        for (c, channel) in flat.iter().enumerate() {
-            let name = ChannelName::parse(&channel.name, part_name, part.view.as_deref(), &views);
-            let key = (name.view_layer, name.view);
-            let at = found.iter().position(|(k, _)| *k == key).unwrap_or_else(|| {
-                found.push((key, BTreeMap::new()));
-                found.len() - 1
-            });
-            let full_name = match part_name.filter(|_| !channel.name.contains('.')) {
-                Some(part) => format!("{part}.{}", channel.name),
-                None => channel.name.clone(),
-            };
-            found[at].1.entry(name.pass).or_default().push(Unassigned {
-                part: p,
-                channel: c,
-                component: name.component,
-                full_name,
-            });
-        }
-    }
-    found
-}
-
-/// Whether a part is called `<view layer>.<pass>`.
-fn ends_in_pass(part: &str) -> bool {
-    part.rsplit_once('.').is_some_and(|(_, tail)| is_pass(tail))
-}
-
-/// The view layers of a frame, in file order, once for each stereo view.
-pub fn layers(frame: &Frame) -> Vec<Layer> {
-    let found = channels_by_pass(frame).into_iter();
-    found.map(|((name, view), channels)| assign(name, view, channels)).collect()
+/// The view layers of a frame, in file order, once for each stereo view. A mapping says what passes are called that have
+/// names of the user's own.
+pub fn layers(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
+    let found = by_pass(frame).into_iter();
+    found.map(|((name, view), channels)| assign(name, view, channels, mapping)).collect()
 }
 
 /// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised` or
 /// `ViewLayer.Denoised`: each with those as its Combined and nothing else, in file order, once for each stereo view.
 pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<Layer> {
-    let found = channels_by_pass(frame).into_iter();
+    let found = by_pass(frame).into_iter();
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
-    let as_combined = |((layer, view), channels): (LayerKey, BTreeMap<String, Vec<Unassigned>>)| {
+    let as_combined = |((layer, view), channels): (LayerKey, ByPass)| {
         let name = name.strip_prefix(&format!("{layer}.")).unwrap_or(name);
-        let at = match_components(channels.get(name)?, &["R", "G", "B"])?;
-        let passes = [(Pass::Combined, PassChannels { name: name.into(), ..at })].into();
-        let (position_averaged, light_groups, unrecognised) = Default::default();
-        Some(Layer { name: layer, view, passes, light_groups, position_averaged, unrecognised })
+        let at = find_components(name, channels.get(name)?, Pass::Combined)?;
+        Some(Layer { passes: [(Pass::Combined, at)].into(), ..Layer::empty(layer, view) })
     };
     found.filter_map(as_combined).collect()
 }
 
-fn assign(name: String, view: Option<String>, channels: BTreeMap<String, Vec<Unassigned>>) -> Layer {
-    let mut passes = BTreeMap::new();
-    let mut known = std::collections::HashSet::new();
-    for row in TABLE {
-        for pass_name in row.names {
-            let Some(candidates) = channels.get(*pass_name) else { continue };
-            let Some(found) = row.components.iter().find_map(|names| match_components(candidates, names))
-            else {
-                continue;
-            };
-            known.extend(found.channels.iter().map(|&c| (found.part, c)));
-            // Every name of the row is recognised; the first one present is the one used.
-            passes.entry(row.pass).or_insert(PassChannels { name: (*pass_name).into(), ..found });
-        }
-    }
-    let mut light_groups = BTreeMap::new();
-    for (pass_name, candidates) in &channels {
-        let Some(group) = light_group(pass_name) else { continue };
-        if let Some(found) = match_components(candidates, &["R", "G", "B"]) {
-            known.extend(found.channels.iter().map(|&c| (found.part, c)));
-            light_groups.insert(group.to_owned(), PassChannels { name: pass_name.clone(), ..found });
-        }
-    }
-    // The fourth channel of an AOV or a noisy image is part of what was recognised.
-    for (pass_name, list) in &channels {
-        if passes.values().any(|p: &PassChannels| p.name == *pass_name) {
-            known.extend(list.iter().filter(|c| c.component == "A").map(|c| (c.part, c.channel)));
-        }
-    }
-    let mut unrecognised: Vec<(usize, usize, String)> = channels
-        .into_values()
-        .flatten()
-        .filter(|c| !known.contains(&(c.part, c.channel)))
-        .map(|c| (c.part, c.channel, c.full_name))
+/// The layers of a file of its own that are a pass: those of its name, or else the pictures that it holds without a name.
+pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
+    let named: Vec<Layer> = layers(frame, &Mapping::default())
+        .into_iter()
+        .filter(|layer| layer.passes.contains_key(&pass))
         .collect();
-    unrecognised.sort();
-    Layer {
-        name,
-        view,
-        position_averaged: passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV),
-        passes,
-        light_groups,
-        unrecognised: unrecognised.into_iter().map(|(.., n)| n).collect(),
+    if !named.is_empty() {
+        return named;
     }
+    let picture = |((name, view), channels): (LayerKey, ByPass)| {
+        let at = BLENDER.names(Pass::Combined).find_map(|name| find(&channels, name, pass))?;
+        Some(Layer { passes: [(pass, at)].into(), ..Layer::empty(name, view) })
+    };
+    by_pass(frame).into_iter().filter_map(picture).collect()
 }
 
-/// The channels with these component names, all in the part of the first.
-fn match_components(candidates: &[Unassigned], names: &[&str]) -> Option<PassChannels> {
-    let part = candidates.iter().find(|c| c.component == names[0])?.part;
-    let channels = names
-        .iter()
-        .map(|n| candidates.iter().find(|c| c.part == part && c.component == *n).map(|c| c.channel))
-        .collect::<Option<Vec<_>>>()?;
-    Some(PassChannels { part, channels, name: String::new() })
+fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mapping) -> Layer {
+    let mut layer = Layer::empty(name, view);
+    let known_by = |renderer: &'static Renderer| {
+        let found = Pass::ALL.iter().filter_map(|&pass| {
+            let mut names = renderer.names(pass);
+            Some((pass, names.find_map(|name| find(&channels, name, pass))?))
+        });
+        found.collect::<BTreeMap<Pass, PassChannels>>()
+    };
+    // Bare channels are called alike by all.
+    let is_telling = |name: &str| !(layer.name.is_empty() && name == COMBINED) && name != BARE_DEPTH;
+    let told = |passes: &BTreeMap<Pass, PassChannels>| {
+        passes
+            .values()
+            .map(|at| at.name.as_str())
+            .filter(|name| is_telling(name))
+            .collect::<HashSet<_>>()
+            .len()
+    };
+    let by_all = RENDERERS.map(|renderer| (renderer, known_by(renderer)));
+    let best = by_all.iter().rev().max_by_key(|(_, passes)| told(passes)); // `max_by_key` keeps the last of equals
+    let (renderer, passes) = best.expect("there are renderers");
+    (layer.renderer, layer.passes) = (renderer, passes.clone());
+    // Compositors give names of several. What Blender itself leaves out stays out: its passes differ from others' of one name.
+    if !renderer.is_blender() {
+        for (pass, at) in by_all.iter().flat_map(|(_, passes)| passes) {
+            if is_common(&at.name) && *pass != Pass::Normal {
+                layer.passes.entry(*pass).or_insert_with(|| at.clone());
+            }
+        }
+    }
+    for (pass, name) in mapping.iter() {
+        let own = name.strip_prefix(&format!("{}.", layer.name)).unwrap_or(name);
+        if let Some(at) = find(&channels, own, pass) {
+            layer.passes.insert(pass, at);
+        }
+    }
+    for (pass_name, candidates) in &channels {
+        let Some(group) = light_group(pass_name) else { continue };
+        let found = find_components(pass_name, candidates, Pass::Combined);
+        layer.light_groups.extend(found.map(|at| (group.to_owned(), at)));
+    }
+    let motion = |name: &&String| renderer.motion.iter().any(|known| plain(known) == plain(name));
+    layer.motion = channels.keys().find(motion).cloned();
+    layer.position_averaged = layer.passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV);
+    layer.unrecognised = unrecognised(&layer, channels);
+    layer
+}
+
+/// The names of the channels that are of no pass.
+fn unrecognised(layer: &Layer, channels: ByPass) -> Vec<String> {
+    let of_pass = |pass: Pass| layer.renderer.names(pass).map(move |name| (name, pass));
+    // Every name of a pass is recognised; the first one present is the one used.
+    let named = Pass::ALL.into_iter().flat_map(of_pass);
+    let named: Vec<PassChannels> = named.filter_map(|(name, pass)| find(&channels, name, pass)).collect();
+    let used = layer.passes.values().chain(layer.light_groups.values()).chain(&named);
+    let known: HashSet<(usize, usize)> =
+        used.flat_map(|at| at.channels.iter().map(|&channel| (at.part, channel))).collect();
+    let is_used = |pass: &str| layer.passes.values().chain(&named).any(|at| at.name == pass);
+    let mut rest: Vec<Place> = Vec::new();
+    for (pass, places) in channels {
+        let is_motion = layer.motion.as_ref() == Some(&pass);
+        // The fourth channel of an AOV or a noisy image is part of what was recognised.
+        let is_known = |place: &Place| {
+            known.contains(&(place.part, place.channel))
+                || is_motion
+                || (is_used(&pass) && is_component(&place.component, "A"))
+        };
+        rest.extend(places.into_iter().filter(|place| !is_known(place)));
+    }
+    rest.sort_by_key(|place| (place.part, place.channel));
+    rest.into_iter().map(|place| place.full_name).collect()
+}
+
+/// The channels of a pass of that name: of the very name, or of one that programs make of it.
+fn find(channels: &ByPass, name: &str, pass: Pass) -> Option<PassChannels> {
+    let exact = channels.get_key_value(name);
+    let alike = || channels.iter().find(|(key, _)| plain(key) == plain(name) && !plain(name).is_empty());
+    let (key, places) = exact.or_else(alike)?;
+    find_components(key, places, pass)
+}
+
+/// The channels that make up a pass, all in the part of the first.
+fn find_components(name: &str, places: &[Place], pass: Pass) -> Option<PassChannels> {
+    components(pass).iter().find_map(|wanted| {
+        // As spelled first: files may hold `R` of the picture beside `r` of something else.
+        let of = |wanted: &str, part: Option<usize>| {
+            let mut in_part = places.iter().filter(|place| part.is_none_or(|part| place.part == part));
+            let exact = in_part.clone().find(|place| place.component == wanted);
+            exact.or_else(|| in_part.find(|place| is_component(&place.component, wanted)))
+        };
+        let part = of(wanted[0], None)?.part;
+        let channels = wanted.iter().map(|wanted| Some(of(wanted, Some(part))?.channel));
+        Some(PassChannels { part, channels: channels.collect::<Option<_>>()?, name: name.into() })
+    })
+}
+
+impl Layer {
+    fn empty(name: String, view: Option<String>) -> Self {
+        let (passes, light_groups, unrecognised) = Default::default();
+        let (position_averaged, motion, renderer) = (false, None, &BLENDER);
+        Self { name, view, renderer, passes, light_groups, motion, position_averaged, unrecognised }
+    }
 }
 
 /// The view layer named, or without a name the one with the most recognised passes among those with
@@ -187,8 +212,12 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
                 let mut subsampled =
                     frame.parts().iter().filter(|part| part.channels.iter().any(|c| c.subsampled));
                 let why = subsampled.find_map(Part::undecodable).unwrap_or_else(|| {
-                    let setting = Pass::Combined.blender_setting();
-                    format!("no layer has a Combined pass; {}; {setting}", listed(layers))
+                    let setting = BLENDER.setting(Pass::Combined);
+                    format!(
+                        "no layer has a Combined pass; {}; {setting}; in other renderers' files say which layer it is: \
+                         --map beauty=NAME",
+                        listed(layers)
+                    )
                 });
                 Error::invalid(frame.path(), why)
             }),
@@ -229,7 +258,7 @@ fn listed(layers: &[Layer]) -> String {
 /// # Errors
 /// No such view layer, or its pixels cannot be decoded.
 pub fn read(frame: &Frame, view_layer: Option<&str>) -> Result<PassSet> {
-    let layers = layers(frame);
+    let layers = layers(frame, &Mapping::default());
     read_layer(frame, choose(frame, &layers, view_layer)?, &Pass::ALL)
 }
 
@@ -250,6 +279,7 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let window = frame.parts()[anchor.part].data_window;
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
+    set.renderer = layer.renderer;
     // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had.
     let samples = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
     set.samples = samples.and_then(|count| count.trim().parse().ok());

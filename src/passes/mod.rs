@@ -4,8 +4,11 @@
 //! In: a [`Frame`](crate::frame::Frame). Out: a [`PassSet`] of f32 planes. Nothing is scaled or
 //! clamped here; `features` decides what a network sees.
 
+mod channels;
 mod layers;
+mod mapping;
 mod names;
+mod normals;
 mod sanitize;
 
 use std::{
@@ -16,9 +19,12 @@ use std::{
 };
 
 pub use layers::{
-    Layer, PassChannels, choose, choose_like, layers, read, read_layer, read_light_groups, rgb_layers,
+    Layer, PassChannels, choose, choose_like, layers, layers_of, read, read_layer, read_light_groups,
+    rgb_layers,
 };
-pub use names::{COMBINED, NOISY_IMAGE, POSITION_AOV, is_bare};
+pub use mapping::Mapping;
+pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
+pub use normals::{Change, Turn, to_camera_space};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};
 
@@ -135,12 +141,7 @@ impl Pass {
 
     /// Names under which Blender has written the pass, the current one first.
     pub fn blender_names(self) -> &'static [&'static str] {
-        names::row(self).names
-    }
-
-    /// Where Blender turns the pass on, as a sentence part.
-    pub fn blender_setting(self) -> &'static str {
-        names::row(self).setting
+        BLENDER.row(self).expect("Blender has every pass").names
     }
 }
 
@@ -149,7 +150,7 @@ impl fmt::Display for Pass {
         f.write_str(match self {
             Pass::Alpha => "Alpha",
             Pass::Position => "Position",
-            other => names::row(*other).names[0],
+            other => other.blender_names()[0],
         })
     }
 }
@@ -169,6 +170,8 @@ pub struct PassSet {
     pub origin: (i32, i32),
     /// Samples of a pixel, or the most that it may have had, where the file tells.
     pub samples: Option<u32>,
+    /// The renderer that wrote it, as far as its names tell: messages say what to do there.
+    pub renderer: &'static Renderer,
     planes: BTreeMap<Pass, Planes>,
 }
 
@@ -176,12 +179,17 @@ impl PassSet {
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
         let (path, view_layer) = (path.into(), view_layer.into());
-        Self { path, view_layer, width, height, origin: (0, 0), samples: None, planes: BTreeMap::new() }
+        let (origin, samples, renderer) = ((0, 0), None, &BLENDER);
+        Self { path, view_layer, width, height, origin, samples, renderer, planes: BTreeMap::new() }
     }
 
     /// A set of another size that is said to be of the same render.
     fn empty(&self, width: usize, height: usize) -> Self {
-        Self { samples: self.samples, ..Self::new(&self.path, &self.view_layer, width, height) }
+        Self {
+            samples: self.samples,
+            renderer: self.renderer,
+            ..Self::new(&self.path, &self.view_layer, width, height)
+        }
     }
 
     /// A rectangle of pixels of every pass, from column `x` and row `y`.
@@ -263,6 +271,7 @@ impl PassSet {
         Error::MissingPass {
             path: self.path.clone(),
             view_layer: self.view_layer.clone(),
+            renderer: self.renderer,
             passes,
             needed_by: needed_by.into(),
         }
@@ -319,6 +328,6 @@ pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet>
 /// The file is unusable, or has no such view layer.
 pub fn load_like(path: impl AsRef<Path>, view_layer: &str) -> Result<PassSet> {
     let frame = Frame::read(path)?;
-    let layers = layers(&frame);
+    let layers = layers(&frame, &Mapping::default());
     read_layer(&frame, choose_like(&frame, &layers, view_layer)?, &Pass::ALL)
 }

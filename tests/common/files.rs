@@ -1,6 +1,9 @@
 //! Small EXR files in the layouts that renderers write, made by the `exr` crate itself.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
 
 use exr::prelude::*;
 use half::f16;
@@ -72,4 +75,47 @@ pub fn write_bare_parts(path: &Path, names: &[&str]) {
     let shared = ImageAttributes::new(IntegerBounds::from_dimensions((4, 3)));
     let parts: Vec<_> = names.iter().map(part).collect();
     Image::from_layers(shared, parts).write().to_file(path).unwrap();
+}
+
+/// Name, type and value.
+pub type Stored = (String, String, Vec<u8>);
+
+/// The attributes of a file's first part in their order, and where the header ends.
+pub fn header(bytes: &[u8]) -> (Vec<Stored>, usize) {
+    let mut at = 8;
+    let name = |at: &mut usize| {
+        let end = *at + bytes[*at..].iter().position(|b| *b == 0).unwrap();
+        let name = String::from_utf8(bytes[*at..end].to_vec()).unwrap();
+        *at = end + 1;
+        name
+    };
+    let mut attributes = Vec::new();
+    loop {
+        let called = name(&mut at);
+        if called.is_empty() {
+            return (attributes, at);
+        }
+        let kind = name(&mut at);
+        let size = u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        attributes.push((called, kind, bytes[at + 4..at + 4 + size].to_vec()));
+        at += 4 + size;
+    }
+}
+
+/// Adds attributes to a file of one part, before those that it has.
+pub fn with_attributes(path: &Path, added: &[(&str, &str, &[u8])]) {
+    let mut bytes = fs::read(path).unwrap();
+    let mut written = Vec::new();
+    for (name, kind, value) in added {
+        written.extend([name.as_bytes(), &[0], kind.as_bytes(), &[0]].concat());
+        written.extend((value.len() as u32).to_le_bytes());
+        written.extend_from_slice(value);
+    }
+    let end = header(&bytes).1;
+    let first = u64::from_le_bytes(bytes[end..end + 8].try_into().unwrap()) as usize;
+    for offset in bytes[end..first].as_chunks_mut::<8>().0 {
+        *offset = (u64::from_le_bytes(*offset) + written.len() as u64).to_le_bytes();
+    }
+    bytes.splice(8..8, written);
+    fs::write(path, bytes).unwrap();
 }

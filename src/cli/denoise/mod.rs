@@ -17,6 +17,7 @@ use progress::{Progress, Style};
 use super::{
     SOME_FAILED,
     inputs::{self, Inputs},
+    sources::{Guides, Names},
     stop,
 };
 use crate::{
@@ -92,6 +93,12 @@ pub struct Args {
     #[arg(long)]
     passes: bool,
 
+    #[command(flatten)]
+    names: Names,
+
+    #[command(flatten)]
+    guides: Guides,
+
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
@@ -130,6 +137,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
+    let sources = args.guides.sources(&args.names, jobs.len())?;
     let model = models::open(&args.model)?;
     prepare_folder(&args.out)?;
 
@@ -145,6 +153,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
             AlphaChoice::Denoise => Alpha::Denoise,
             AlphaChoice::Keep => Alpha::Keep,
         },
+        sources,
         passes: args.passes,
     };
     let style = match (args.json, args.quiet) {

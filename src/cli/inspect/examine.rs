@@ -12,7 +12,7 @@ use crate::{
         Denoiser,
         catalogue::{self, Family, Kind, METHODS},
     },
-    passes::{self, Layer, POSITION_AOV, Pass},
+    passes::{self, BLENDER, Layer, Mapping, POSITION_AOV, Pass},
     planes::Planes,
 };
 
@@ -48,6 +48,10 @@ pub struct PartReport {
 pub struct LayerReport {
     pub name: String,
     pub view: Option<String>,
+    /// The renderer whose names it has: Blender, where nothing tells.
+    pub renderer: &'static str,
+    /// The name of a motion pass that demc does not follow.
+    pub motion: Option<String>,
     pub passes: Vec<PassReport>,
     /// Channels that demc has no use for.
     pub unrecognised: Vec<String>,
@@ -77,7 +81,7 @@ pub struct ModelReport {
 #[derive(Serialize, Clone)]
 pub struct Missing {
     pub pass: String,
-    pub remedy: &'static str,
+    pub remedy: String,
 }
 
 /// A method and the passes it needs.
@@ -100,7 +104,7 @@ pub fn methods() -> Vec<Method> {
 }
 
 /// Reads and decodes a whole file. Its noise is described if it `is_compared` with that of another.
-pub fn examine(path: &Path, methods: &[Method], is_compared: bool) -> Result<FileReport> {
+pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
     let frame = Frame::read(path)?;
     let parts = frame.parts().iter().map(|p| PartReport {
         name: p.name.clone(),
@@ -112,7 +116,7 @@ pub fn examine(path: &Path, methods: &[Method], is_compared: bool) -> Result<Fil
         bytes: p.stored_bytes,
         channels: p.channels.len(),
     });
-    let layers = passes::layers(&frame);
+    let layers = passes::layers(&frame, mapping);
     let mut report = FileReport {
         path: path.display().to_string(),
         bytes: frame.byte_len(),
@@ -127,7 +131,7 @@ pub fn examine(path: &Path, methods: &[Method], is_compared: bool) -> Result<Fil
     if !is_hidden && !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
         report
             .warnings
-            .push(format!("nothing to denoise: no Combined pass; {}", Pass::Combined.blender_setting()));
+            .push(format!("nothing to denoise: no Combined pass; {}", BLENDER.setting(Pass::Combined)));
     }
     for layer in &layers {
         let (layer, grain) = examine_layer(&frame, layer, methods, is_compared)?;
@@ -206,7 +210,7 @@ fn examine_layer(
         }
     }
     passes.extend(others.into_iter().map(describe));
-    if layer.passes.contains_key(&Pass::Position) && !layer.position_averaged {
+    if layer.renderer.is_blender() && layer.passes.contains_key(&Pass::Position) && !layer.position_averaged {
         warnings.push(format!(
             "Position is Cycles' own pass, one sample a pixel: aliased, and wrong under depth of field and \
              motion blur; a shader AOV named '{POSITION_AOV}' (blender_scripts/export_passes.py sets it up) \
@@ -227,12 +231,14 @@ fn examine_layer(
             .passes
             .iter()
             .filter(|p| !layer.passes.contains_key(p))
-            .map(|p| Missing { pass: p.to_string(), remedy: p.blender_setting() })
+            .map(|p| Missing { pass: p.to_string(), remedy: layer.renderer.setting(*p) })
             .collect(),
     });
     let report = LayerReport {
         name: layer.name.clone(),
         view: layer.view.clone(),
+        renderer: layer.renderer.name,
+        motion: layer.motion.clone(),
         models: models.collect(),
         passes,
         unrecognised: layer.unrecognised.clone(),

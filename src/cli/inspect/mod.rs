@@ -11,7 +11,7 @@ use crate::cli::ExitCode;
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, inputs, print_line, warn_line};
+use super::{SOME_FAILED, inputs, print_line, sources::Names, warn_line};
 use crate::{Result, denoise, error::attempt};
 use grain::Grain;
 
@@ -24,6 +24,8 @@ pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
+    #[command(flatten)]
+    names: Names,
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
@@ -35,6 +37,7 @@ pub struct Args {
 /// The inputs name nothing.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let methods = examine::methods();
+    let mapping = args.names.mapping()?;
     let inputs = inputs::expand(&args.files)?;
     let mut failed = !inputs.unusable.is_empty();
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
@@ -42,7 +45,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut before: Option<(PathBuf, Grain)> = None;
     let is_compared = inputs.files.len() > 1;
     for path in inputs.files {
-        let mut examined = attempt(&path, || examine::examine(&path, &methods, is_compared));
+        let mut examined = attempt(&path, || examine::examine(&path, &methods, &mapping, is_compared));
         let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
         if let Ok(report) = &mut examined {
             let grain = report.grain.take();

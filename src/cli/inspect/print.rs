@@ -43,8 +43,12 @@ fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
 fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
     let view = layer.view.as_ref().map(|v| format!(", view '{v}'")).unwrap_or_default();
     match layer.name.is_empty() {
-        true => writeln!(out, "  without a view layer{view}")?,
-        false => writeln!(out, "  view layer '{}'{view}", layer.name)?,
+        true => write!(out, "  without a view layer{view}")?,
+        false => write!(out, "  view layer '{}'{view}", layer.name)?,
+    }
+    match layer.renderer {
+        "Blender" => writeln!(out)?,
+        other => writeln!(out, ", as {other} names passes")?,
     }
     for pass in &layer.passes {
         let alias = match pass.stored_as == pass.pass || pass.pass == "Alpha" {

@@ -1,0 +1,134 @@
+//! Where the passes of a frame are, where their names do not tell: under names of the user's own, or in other files.
+
+use std::path::{Path, PathBuf};
+
+use crate::{
+    Error, Result,
+    frame::Frame,
+    passes::{self, Layer, Mapping, Pass, PassSet, Turn, to_camera_space},
+};
+
+/// What the user says of where passes are.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Sources {
+    /// What passes are called.
+    pub mapping: Mapping,
+    /// The file that holds the albedo, as renderers have it that write a file for each pass: see [`beside`].
+    pub albedo: Option<PathBuf>,
+    /// The file that holds the normal.
+    pub normal: Option<PathBuf>,
+}
+
+/// The guides that may lie in other files.
+const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+
+/// A frame's file by a pattern: a run of `#`, or `%04d`, stands for the frame's number, which is the digits at the end of
+/// its name. Without either the file is that of every frame.
+///
+/// # Errors
+/// The pattern wants a number, and the frame has none.
+pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
+    let text = pattern.to_string_lossy();
+    let Some((head, width, tail)) = placeholder(&text) else { return Ok(pattern.into()) };
+    let stem = frame.file_stem().unwrap_or_default().to_string_lossy();
+    let digits = &stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..];
+    if digits.is_empty() {
+        let pattern = pattern.display();
+        let why = format!("its name ends in no number to put into {pattern}; rename it, or name one file");
+        return Err(Error::invalid(frame, why));
+    }
+    let number = digits.trim_start_matches('0');
+    Ok(format!("{head}{number:0>width$}{tail}").into())
+}
+
+/// Whether a pattern names another file for each frame.
+pub fn has_number(pattern: &Path) -> bool {
+    placeholder(&pattern.to_string_lossy()).is_some()
+}
+
+/// What stands before the place of the number, its least width, and what stands behind.
+fn placeholder(pattern: &str) -> Option<(&str, usize, &str)> {
+    if let Some(start) = pattern.rfind('#') {
+        let head = pattern[..=start].trim_end_matches('#');
+        return Some((head, start + 1 - head.len(), &pattern[start + 1..]));
+    }
+    let (head, rest) = pattern.rsplit_once('%')?;
+    let (width, tail) = rest.split_once('d')?;
+    let width = if width.is_empty() { Some(1) } else { width.parse().ok().filter(|width| *width < 20) };
+    Some((head, width?, tail))
+}
+
+impl Sources {
+    /// Adds the guides that lie in other files, and makes normals those of Cycles unless Blender wrote them. Returns what the
+    /// user should know.
+    ///
+    /// # Errors
+    /// A file is unusable, holds no such pass, or is of another size.
+    pub fn complete(
+        &self,
+        frame: &Frame,
+        layer: &Layer,
+        wanted: &[Pass],
+        set: &mut PassSet,
+    ) -> Result<Option<String>> {
+        let mut matrix = frame.matrix_attribute("worldToCamera");
+        for (pass, pattern) in GUIDES.into_iter().zip([&self.albedo, &self.normal]) {
+            if let Some(pattern) = pattern.as_deref().filter(|_| wanted.contains(&pass)) {
+                let other = Frame::read(beside(frame.path(), pattern)?)?;
+                let planes = guide(&other, layer, pass, set)?;
+                set.insert(pass, planes);
+                if pass == Pass::DenoisingNormal {
+                    matrix = other.matrix_attribute("worldToCamera").or(matrix);
+                }
+            }
+        }
+        let is_cycles = layer.renderer.is_blender()
+            && !self.mapping.names(Pass::DenoisingNormal)
+            && self.normal.is_none();
+        if is_cycles {
+            return Ok(None);
+        }
+        let Some(mut normals) = set.remove(Pass::DenoisingNormal) else { return Ok(None) };
+        let change = to_camera_space(&mut normals, matrix);
+        set.insert(Pass::DenoisingNormal, normals);
+        // What was as it should be is not worth a word.
+        let change = change.filter(|change| change.was_unit_range || change.turn != Turn::None);
+        Ok(change.map(|change| change.to_string()))
+    }
+}
+
+/// A guide in a file of its own: the pass, by its name, or what the file holds without one.
+fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<crate::planes::Planes> {
+    let mut layers = passes::layers_of(frame, pass);
+    let own_view = layers.iter().position(|layer| layer.view == of.view).unwrap_or(0);
+    if layers.is_empty() {
+        let why =
+            format!("holds no {pass} and no picture to take for it; `demc inspect` lists what it holds");
+        return Err(Error::invalid(frame.path(), why));
+    }
+    let layer = layers.swap_remove(own_view);
+    let mut found = passes::read_layer(frame, &layer, &[pass])?;
+    set.check_same_pixels(&found)?;
+    Ok(found.remove(pass).expect("the layer holds it"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_take_the_number_of_the_frame() {
+        let named = |frame: &str, pattern: &str| {
+            beside(Path::new(frame), Path::new(pattern)).map(|path| path.display().to_string())
+        };
+        assert_eq!(named("in/rgb.0017.exr", "in/albedo.####.exr").unwrap(), "in/albedo.0017.exr");
+        assert_eq!(named("rgb0017.exr", "ALBEDO_#.exr").unwrap(), "ALBEDO_17.exr");
+        assert_eq!(named("rgb.17.exr", "albedo.%04d.exr").unwrap(), "albedo.0017.exr");
+        assert_eq!(named("rgb.12345.exr", "albedo.###.exr").unwrap(), "albedo.12345.exr");
+        assert_eq!(named("rgb.0000.exr", "albedo.##.exr").unwrap(), "albedo.00.exr");
+        assert_eq!(named("rgb.exr", "albedo.exr").unwrap(), "albedo.exr");
+        assert_eq!(named("rgb.exr", "100%.exr").unwrap(), "100%.exr");
+        assert!(named("rgb.exr", "albedo.####.exr").unwrap_err().to_string().contains("no number"));
+        assert!(has_number(Path::new("a.#.exr")) && !has_number(Path::new("a.exr")));
+    }
+}

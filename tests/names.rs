@@ -1,0 +1,374 @@
+//! Files as other renderers and compositors name them: each comes out as the same frame by Blender's names does.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{
+    demc,
+    files::{data, read_exr, values, with_attributes},
+};
+use exr::prelude::*;
+
+const SIDE: usize = 128;
+
+/// The channels of a render: beauty, albedo and normal, three values of each pixel, and a depth.
+struct Render([Vec<f32>; 10]);
+
+impl Render {
+    /// A frame that Cycles rendered.
+    fn new() -> Self {
+        let image = read_exr(data("s0000_room_0004spp.exr"));
+        let passes = [("Combined", "RGB"), ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")];
+        let names = passes.iter().flat_map(|(pass, components)| {
+            components.chars().map(move |component| format!("ViewLayer.{pass}.{component}"))
+        });
+        let mut planes: Vec<Vec<f32>> = names.map(|name| values(&image, &name)).collect();
+        planes.push((0..SIDE * SIDE).map(|i| i as f32).collect());
+        Self(planes.try_into().unwrap())
+    }
+
+    /// Changes every normal.
+    fn with_normals(mut self, change: impl Fn([f32; 3]) -> [f32; 3]) -> Self {
+        for i in 0..SIDE * SIDE {
+            let changed = change([6, 7, 8].map(|c| self.0[c][i]));
+            (0..3).for_each(|axis| self.0[6 + axis][i] = changed[axis]);
+        }
+        self
+    }
+
+    /// A layer of channels by the names given and the planes they are of.
+    fn layer(
+        &self,
+        channels: &[(&str, usize)],
+        attributes: LayerAttributes,
+    ) -> Layer<AnyChannels<FlatSamples>> {
+        let list = channels
+            .iter()
+            .map(|(name, plane)| AnyChannel::new(*name, FlatSamples::F32(self.0[*plane].clone())));
+        let channels = AnyChannels::sort(list.collect());
+        Layer::new((SIDE, SIDE), attributes, Encoding::SMALL_LOSSLESS, channels)
+    }
+
+    fn write(&self, path: &Path, channels: &[(&str, usize)]) {
+        Image::from_layer(self.layer(channels, LayerAttributes::default())).write().to_file(path).unwrap();
+    }
+
+    /// Parts by name, view and channels.
+    fn write_parts(&self, path: &Path, parts: &[(&str, Option<&str>, &[(&str, usize)])]) {
+        let part = |(name, view, channels): &(&str, Option<&str>, &[(&str, usize)])| {
+            let mut attributes = LayerAttributes::named(*name);
+            attributes.view_name = view.map(Text::from);
+            self.layer(channels, attributes)
+        };
+        let shared = ImageAttributes::new(IntegerBounds::from_dimensions((SIDE, SIDE)));
+        Image::from_layers(shared, parts.iter().map(part).collect::<Vec<_>>()).write().to_file(path).unwrap();
+    }
+}
+
+/// The names of colours, albedo and normal, in the order of a render's planes.
+fn channels<'a>(names: &[&'a str; 9]) -> Vec<(&'a str, usize)> {
+    names.iter().enumerate().map(|(plane, name)| (*name, plane)).collect()
+}
+
+/// Denoises a file; returns the result's path.
+#[track_caller]
+fn denoise(input: &Path, options: &[&str]) -> PathBuf {
+    let out = input.with_extension("out");
+    let mut command = demc();
+    command
+        .args(["denoise", "--model", "demc-s", "--overwrite"])
+        .args(options)
+        .arg(input)
+        .arg("--out")
+        .arg(&out);
+    command.assert().success();
+    out.join(input.file_name().unwrap())
+}
+
+/// What it says when it denoises a file, or refuses to.
+fn said(input: &Path, options: &[&str]) -> String {
+    let out = input.with_extension("out");
+    let mut command = demc();
+    command
+        .args(["denoise", "--model", "demc-s", "--overwrite"])
+        .args(options)
+        .arg(input)
+        .arg("--out")
+        .arg(&out);
+    String::from_utf8(command.output().unwrap().stderr).unwrap()
+}
+
+fn layer(path: &Path, name: &str) -> [Vec<f32>; 3] {
+    let image = read_exr(path);
+    ["R", "G", "B"].map(|component| values(&image, &format!("{name}.{component}")))
+}
+
+/// The render by Blender's names, denoised.
+fn expected(folder: &Path) -> [Vec<f32>; 3] {
+    let path = folder.join("blender.exr");
+    let names = [
+        "V.Combined.R",
+        "V.Combined.G",
+        "V.Combined.B",
+        "V.Denoising Albedo.R",
+        "V.Denoising Albedo.G",
+        "V.Denoising Albedo.B",
+        "V.Denoising Normal.X",
+        "V.Denoising Normal.Y",
+        "V.Denoising Normal.Z",
+    ];
+    Render::new().write(&path, &channels(&names));
+    layer(&denoise(&path, &[]), "V.Denoised")
+}
+
+#[test]
+fn every_renderers_names_are_known() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    // Beauty, albedo, normal; what stands before a component, or is one without.
+    let renderers: [(&str, [&str; 3], [&str; 9]); 16] = [
+        (
+            "blender file output",
+            ["Image", "Denoising Albedo", "Denoising Normal"],
+            ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"],
+        ),
+        ("arnold", ["", "denoise_albedo", "N"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
+        ("arnold of old", ["RGBA", "diffuse_albedo", "N"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
+        (
+            "v-ray for max",
+            ["", "VRayDiffuseFilter", "VRayNormals"],
+            ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"],
+        ),
+        (
+            "v-ray for maya",
+            ["", "diffuse", "bumpNormals"],
+            ["R", "G", "B", "red", "green", "blue", "X", "Y", "Z"],
+        ),
+        ("renderman", ["Ci", "albedo", "normal"], ["r", "g", "b", "r", "g", "b", "x", "y", "z"]),
+        ("redshift", ["", "DiffuseFilter", "Normals"], ["R", "G", "B", "R", "G", "B", "R", "G", "B"]),
+        ("karma", ["C", "albedo", "N"], ["r", "g", "b", "r", "g", "b", "x", "y", "z"]),
+        (
+            "octane",
+            ["Beauty", "Denoise albedo", "Denoise normal"],
+            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
+        ),
+        (
+            "octane otherwise",
+            ["", "DenoiseAlbedo", "DenoiseNormal"],
+            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
+        ),
+        (
+            "corona",
+            ["", "CShading_Albedo", "CGeometry_NormalsShading"],
+            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
+        ),
+        ("mitsuba", ["", "albedo", "nn"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
+        ("pbrt", ["", "Albedo", "Ns"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
+        ("luxcore", ["RGB", "ALBEDO", "AVG_SHADING_NORMAL"], ["R", "G", "B", "R", "G", "B", "R", "G", "B"]),
+        (
+            "unreal",
+            ["FinalImage", "FinalImageBaseColor", "FinalImageWorldNormal"],
+            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
+        ),
+        (
+            "moonray",
+            ["", "denoise_albedo", "denoise_normal"],
+            ["red", "green", "blue", "R", "G", "B", "R", "G", "B"],
+        ),
+    ];
+    for (renderer, layers, components) in renderers {
+        let path = dir.path().join(format!("{renderer}.exr"));
+        let full = |plane: usize| match layers[plane / 3] {
+            "" => components[plane].to_owned(),
+            layer => format!("{layer}.{}", components[plane]),
+        };
+        let names: Vec<String> = (0..9).map(full).collect();
+        let of_planes: Vec<(&str, usize)> =
+            names.iter().enumerate().map(|(plane, name)| (name.as_str(), plane)).collect();
+        Render::new().write(&path, &of_planes);
+        assert!(layer(&denoise(&path, &[]), "Denoised") == expected, "{renderer}");
+    }
+    // pbrt of old, without dots.
+    let path = dir.path().join("pbrt of old.exr");
+    let names = ["R", "G", "B", "Albedo.R", "Albedo.G", "Albedo.B", "Nsx", "Nsy", "Nsz"];
+    Render::new().write(&path, &channels(&names));
+    assert!(layer(&denoise(&path, &[]), "Denoised") == expected);
+}
+
+#[test]
+fn light_of_one_renderer_is_not_the_albedo_of_another() {
+    // Arnold's `diffuse` is light, V-Ray's is a colour.
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("arnold.exr");
+    let names = ["RGBA.R", "RGBA.G", "RGBA.B", "diffuse.R", "diffuse.G", "diffuse.B", "N.X", "N.Y", "N.Z"];
+    Render::new().write(&path, &channels(&names));
+    let said = said(&path, &[]);
+    assert!(said.contains("no Denoising Albedo") && said.contains("denoise_albedo"), "{said}");
+}
+
+#[test]
+fn depth_is_told_from_cie_colours() {
+    let dir = tempfile::tempdir().unwrap();
+    let inspect = |channels: &[(&str, usize)]| {
+        let path = dir.path().join("z.exr");
+        Render::new().write(&path, channels);
+        let output = demc().arg("inspect").arg(&path).output().unwrap();
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let has_depth = |text: &str| text.lines().any(|line| line.trim_start().starts_with("Depth"));
+    assert!(has_depth(&inspect(&[("R", 0), ("G", 1), ("B", 2), ("Z", 9)])));
+    assert!(has_depth(&inspect(&[("R", 0), ("G", 1), ("B", 2), ("depth.T", 9)])));
+    assert!(has_depth(&inspect(&[("Ci.r", 0), ("Ci.g", 1), ("Ci.b", 2), ("zfiltered", 9)])));
+    assert!(!has_depth(&inspect(&[("X", 0), ("Y", 1), ("Z", 2)])));
+}
+
+#[test]
+fn normals_of_any_kind_become_those_of_cycles() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let path = dir.path().join("arnold.exr");
+    let names = ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"];
+    let check = |change: &dyn Fn([f32; 3]) -> [f32; 3], word: &str| {
+        Render::new().with_normals(change).write(&path, &channels(&names));
+        let said = said(&path, &[]);
+        assert!(said.contains(word), "{word}: {said}");
+        let got = layer(&path.with_extension("out").join("arnold.exr"), "Denoised");
+        let close = got
+            .iter()
+            .flatten()
+            .zip(expected.iter().flatten())
+            .all(|(a, b)| (a - b).abs() <= 1e-3 * b.abs() + 1e-4);
+        assert!(close, "{word}");
+    };
+    check(&|n| n.map(|v| 0.5 * v + 0.5), "0..1");
+    check(&|[x, y, z]| [x, y, -z], "towards the camera");
+}
+
+#[test]
+fn a_mapping_names_what_no_table_can() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let path = dir.path().join("own.exr");
+    let names = ["pic.R", "pic.G", "pic.B", "my col.R", "my col.G", "my col.B", "dir.X", "dir.Y", "dir.Z"];
+    Render::new().write(&path, &channels(&names));
+    assert!(said(&path, &[]).contains("--map beauty=NAME"));
+    let lines = ["--map", "beauty=pic", "--map", "albedo=my col", "--map", "normal=dir"];
+    assert!(layer(&denoise(&path, &lines), "Denoised") == expected);
+    // The same by a file.
+    let file = dir.path().join("show.map");
+    std::fs::write(&file, "# our show\nbeauty = pic\nalbedo = my col\n\nnormal = dir\n").unwrap();
+    let by_file = ["--map-file", file.to_str().unwrap()];
+    assert!(layer(&denoise(&path, &by_file), "Denoised") == expected);
+    // A name that is not there, with those that are.
+    let wrong = said(&path, &["--map", "beauty=pic", "--map", "albedo=col", "--map", "normal=dir"]);
+    assert!(wrong.contains("no layer 'col'") && wrong.contains("my col"), "{wrong}");
+    std::fs::write(&file, "albedo\n").unwrap();
+    let wrong = said(&path, &by_file);
+    assert!(wrong.contains("show.map: line 1") && wrong.contains("albedo=NAME"), "{wrong}");
+}
+
+#[test]
+fn guides_come_from_files_of_their_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let render = Render::new();
+    let path = |name: &str| dir.path().join(name);
+    let of = |first: usize| [("R", first), ("G", first + 1), ("B", first + 2)];
+    render.write(&path("rgb.0007.exr"), &of(0));
+    render.write(&path("albedo.0007.exr"), &of(3));
+    render.write(&path("normal.7.exr"), &[("X", 6), ("Y", 7), ("Z", 8)]);
+    let [albedo, normal] = ["albedo.####.exr", "normal.%d.exr"].map(|name| path(name).display().to_string());
+    let frame = path("rgb.0007.exr");
+    let result = denoise(&frame, &["--albedo", &albedo, "--normal", &normal]);
+    assert!(layer(&result, "Denoised") == expected);
+    // What is missing is named, as is the way to name it.
+    assert!(said(&frame, &[]).contains("--albedo FILE"));
+    let missing = path("no.####.exr").display().to_string();
+    assert!(said(&frame, &["--albedo", &missing, "--normal", &normal]).contains("no.0007.exr: cannot read"));
+    // One file for several frames is a mistake.
+    render.write(&path("rgb.0008.exr"), &of(0));
+    let several = said(&frame, &["--albedo", "a.exr", path("rgb.0008.exr").to_str().unwrap()]);
+    assert!(several.contains("for 2 frames"), "{several}");
+    // Another size.
+    common::files::write_render(&path("albedo.0007.exr"), 8, 8, |_, _| 0.5);
+    let other = said(&frame, &["--albedo", &albedo, "--normal", &normal]);
+    assert!(other.contains("8x8") && other.contains("128x128"), "{other}");
+}
+
+#[test]
+fn names_of_parts_mean_nothing_where_channels_say_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let path = dir.path().join("parts.exr");
+    let (colour, albedo, normal): (&[_], &[_], &[_]) =
+        (&[("R", 0), ("G", 1), ("B", 2)], &[("R", 3), ("G", 4), ("B", 5)], &[("X", 6), ("Y", 7), ("Z", 8)]);
+    // Nuke's names, with its view and without.
+    for view in [Some("main"), None] {
+        let parts = [
+            ("rgba_main", view, colour),
+            ("Denoising Albedo_main", view, albedo),
+            ("Denoising Normal_main", view, normal),
+        ];
+        Render::new().write_parts(&path, &parts);
+        assert!(layer(&denoise(&path, &[]), "Denoised") == expected, "{view:?}");
+    }
+    // Any name for what holds colours and no more.
+    Render::new()
+        .write_parts(&path, &[("whatever", None, colour), ("N", None, normal), ("albedo", None, albedo)]);
+    assert!(layer(&denoise(&path, &[]), "Denoised") == expected);
+    // Channels with names of their own in a part of another.
+    let full = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    Render::new().write_parts(&path, &[("rgbleft", Some("left"), &full), ("rgbright", Some("right"), &full)]);
+    let result = read_exr(denoise(&path, &[]));
+    let added: Vec<_> = result
+        .layer_data
+        .iter()
+        .skip(2)
+        .map(|part| {
+            let view = part.attributes.view_name.as_ref().map(ToString::to_string);
+            (view, part.channel_data.list.iter().any(|channel| channel.name.eq("Denoised.R")))
+        })
+        .collect();
+    assert_eq!(added, [(Some("left".into()), true), (Some("right".into()), true)]);
+}
+
+#[test]
+fn views_are_told_by_openexrs_rules() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let path = dir.path().join("stereo.exr");
+    let guides = [
+        "Denoising Albedo.R",
+        "Denoising Albedo.G",
+        "Denoising Albedo.B",
+        "Denoising Normal.X",
+        "Denoising Normal.Y",
+        "Denoising Normal.Z",
+    ];
+    let named = |name: &str, view: &str, in_front: bool| match name.rsplit_once('.') {
+        _ if in_front => format!("{view}.{name}"),
+        Some((layer, component)) => format!("{layer}.{view}.{component}"),
+        None => format!("{view}.{name}"),
+    };
+    // The default view's colours have no view in their name; its guides have it, or have it not; views behind or in front.
+    for (guides_say, in_front) in [(true, false), (false, false), (false, true), (true, true)] {
+        let mut names = vec![];
+        for (plane, name) in ["R", "G", "B"].iter().chain(&guides).enumerate() {
+            let is_bare = plane < 3 || !guides_say;
+            names.push((if is_bare { (*name).into() } else { named(name, "left", in_front) }, plane));
+            names.push((named(name, "right", in_front), plane));
+        }
+        let channels: Vec<(&str, usize)> =
+            names.iter().map(|(name, plane)| (name.as_str(), *plane)).collect();
+        Render::new().write(&path, &channels);
+        with_attributes(&path, &[("multiView", "stringvector", b"\x04\0\0\0left\x05\0\0\0right")]);
+        let result = denoise(&path, &[]);
+        for view in ["left", "right"] {
+            assert!(
+                layer(&result, &format!("Denoised.{view}")) == expected,
+                "{view} {guides_say} {in_front}"
+            );
+        }
+    }
+}
