@@ -22,9 +22,10 @@ use demc::{
         demc::PAPER_WIDTHS,
         network::{Architecture, Batch, Config, Network},
     },
-    nn::{Precision, Rng, Stats, clear_buffers},
+    nn::{Precision, Stats, clear_buffers},
     passes::{Pass, PassSet},
     planes::Planes,
+    rng::Rng,
     shot::Shot,
     train::{Loss, Optimizer, Rule},
 };

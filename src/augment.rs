@@ -6,9 +6,9 @@
 //! about the vertical one, which gravity makes special.
 
 use crate::{
-    nn::Rng,
-    passes::{Pass, PassSet},
+    passes::{Pass, PassSet, Quantity},
     planes::Planes,
+    rng::Rng,
 };
 
 /// One drawn augmentation.
@@ -58,12 +58,15 @@ impl Augment {
     /// As [`Augment::passes`].
     pub fn pass(&self, pass: Pass, planes: &Planes) -> Planes {
         let mut planes = self.moved(planes);
-        match pass {
-            Pass::Normal | Pass::Position | Pass::DenoisingNormal => self.turn_vectors(&mut planes, 0),
-            Pass::Vector => [0, 2].into_iter().for_each(|first| self.turn_vectors(&mut planes, first)),
-            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth => {}
-            _ if self.rgb != Self::IDENTITY.rgb => planes = self.permuted(&planes),
-            _ => {}
+        match pass.quantity() {
+            Quantity::Direction | Quantity::Place => self.turn_vectors(&mut planes, 0),
+            Quantity::Motion => [0, 2].into_iter().for_each(|first| self.turn_vectors(&mut planes, first)),
+            Quantity::Share | Quantity::Distance => {}
+            Quantity::Radiance | Quantity::Colour => {
+                if self.rgb != Self::IDENTITY.rgb {
+                    planes = self.permuted(&planes);
+                }
+            }
         }
         if pass.carries_radiance() && self.exposure != 1.0 {
             planes.data.iter_mut().for_each(|v| *v *= self.exposure);

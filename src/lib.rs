@@ -46,6 +46,7 @@ pub mod passes;
 pub mod planes;
 #[cfg(feature = "report")]
 pub mod report;
+pub mod rng;
 pub mod shot;
 pub mod sources;
 #[cfg(feature = "report")]

@@ -24,7 +24,7 @@ use demc::{
         network::{Architecture, Config},
         weights_file,
     },
-    nn::Rng,
+    rng::Rng,
     testset,
 };
 use exr::prelude::*;

@@ -11,7 +11,8 @@ use demc::{
         self,
         network::{Batch, Config, Network, Taped},
     },
-    nn::{Activation, BatchNorm, Conv, Guides, Images, Init, MaxPool, Param, Rng, Stats, cross_bilateral},
+    nn::{Activation, BatchNorm, Conv, Guides, Images, Init, MaxPool, Param, Stats, cross_bilateral},
+    rng::Rng,
 };
 use dfdx::{
     shapes::HasShape,

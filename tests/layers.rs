@@ -9,7 +9,8 @@ use std::{env, process::Command};
 use demc::{
     kernels::{Shape, simd::Tier},
     models::network::Taped,
-    nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Rng, Stats},
+    nn::{Activation, BatchNorm, Conv, Field, Images, Init, MaxPool, Param, Stats},
+    rng::Rng,
 };
 use dfdx::{
     shapes::{HasShape, Rank0},

@@ -9,9 +9,10 @@ use demc::{
         network::{Architecture, Config, Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Precision, Rng, Stats},
+    nn::{Precision, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
+    rng::Rng,
 };
 
 fn parameters(network: &mut dyn Network) -> usize {

@@ -96,7 +96,7 @@ mod tests {
 
     /// Grey noise between 0.5 and 1.5 with some pixels brighter.
     fn frame(bright: &[(usize, usize, f32)]) -> Planes {
-        let mut rng = crate::nn::Rng::new(5, 0);
+        let mut rng = crate::rng::Rng::new(5, 0);
         let mut planes = Planes::new(3, W, H);
         for at in 0..W * H {
             let v = 0.5 + rng.uniform();

@@ -254,7 +254,7 @@ fn fit(moments: [Lanes; MOMENTS]) -> [Lanes; KEPT] {
 mod tests {
     use super::*;
     use crate::features::ALBEDO_FLOOR;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     const SIZE: (usize, usize) = (70, 53);
 

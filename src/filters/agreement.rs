@@ -214,7 +214,7 @@ impl Look {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{filters::motion::Direction, nn::Rng};
+    use crate::{filters::motion::Direction, rng::Rng};
 
     const SIZE: (usize, usize) = (61, 46);
 

@@ -24,7 +24,7 @@ use super::{
     squares::{self, SQUARE, between},
 };
 use crate::kernels::{
-    filter::exp,
+    exponential::exp,
     logarithm::ln,
     vectorised::{self, Vectorised},
 };

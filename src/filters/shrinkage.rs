@@ -553,7 +553,7 @@ fn is_firefly(render: &Render, x: usize, y: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     const SIZE: (usize, usize) = (93, 70);
 

@@ -191,7 +191,7 @@ fn box_mean(planes: &Planes, reach: usize) -> Planes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{filters::motion::Direction, nn::Rng};
+    use crate::{filters::motion::Direction, rng::Rng};
 
     const SIZE: (usize, usize) = (40, 30);
 

@@ -10,7 +10,8 @@ use rayon::prelude::*;
 
 use super::{
     LANES,
-    filter::{Size, exp, limited, logistic},
+    exponential::{exp, limited, logistic},
+    filter::Size,
     simd::{Kernel, Simd, Tier},
 };
 

@@ -9,7 +9,8 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{Size, each_row, exp},
+    exponential::exp,
+    filter::{Size, each_row},
     simd::{Kernel, Simd, Tier},
 };
 

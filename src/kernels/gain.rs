@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{exp, logistic},
+    exponential::{exp, logistic},
     vectorised::{self, CHUNK, Vectorised},
 };
 

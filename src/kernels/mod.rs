@@ -15,6 +15,7 @@
 pub mod blend;
 pub mod conv;
 pub mod cross_bilateral;
+pub mod exponential;
 pub mod filter;
 pub mod gain;
 pub mod heap;

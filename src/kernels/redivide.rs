@@ -6,7 +6,8 @@
 use rayon::prelude::*;
 
 use super::{
-    filter::{Size, exp, logistic},
+    exponential::{exp, logistic},
+    filter::Size,
     vectorised::{self, Vectorised},
 };
 

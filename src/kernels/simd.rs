@@ -129,7 +129,7 @@ pub trait Simd: Copy {
             [Self::load(&own), Self::load(&near)]
         }
     }
-    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See [`exp`](super::filter::exp).
+    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See [`exp`](super::exponential::exp).
     ///
     /// # Safety
     /// See [`Simd::splat`].
@@ -139,7 +139,7 @@ pub trait Simd: Copy {
         // SAFETY: the block is the function's own.
         unsafe {
             Self::store(&mut values, x);
-            values.0 = values.0.map(super::filter::exp);
+            values.0 = values.0.map(super::exponential::exp);
             Self::load(&values)
         }
     }
@@ -349,7 +349,7 @@ mod x86 {
     use std::{arch::x86_64::*, ops::Range};
 
     use super::{Block, Kernel, LANES, PAIRS, Simd};
-    use crate::kernels::filter::{EXP, LIMIT, LN_2};
+    use crate::kernels::exponential::{EXP, LIMIT, LN_2};
 
     /// # Safety
     /// The processor has AVX2 and FMA.

@@ -75,7 +75,7 @@ pub fn warning(name: impl Display, image: &Planes, reference: &Planes) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     /// A checkerboard of squares of `side` pixels, 96x96, whose pixels are `noise(value)`.
     fn checkers(side: usize, mut noise: impl FnMut(f32) -> f32) -> Planes {

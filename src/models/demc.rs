@@ -10,12 +10,13 @@ use dfdx::{
     tensor_ops::{abs, exp, ln, powf, relu},
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Design, Network, Taped, duplicate, squares};
 use crate::{
     Result,
     features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
-    nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Rng, Stats},
+    nn::{Activation, BatchNorm, Conv, Images, Init, MaxPool, Param, Stats},
     passes::{Pass, PassSet},
+    rng::Rng,
 };
 
 /// Channels at each level in the paper.
@@ -90,6 +91,31 @@ pub fn semc_widths(widths: &[usize]) -> Vec<usize> {
         }
         best = nearest;
     }
+}
+
+/// DEMC, with fusion or without.
+pub static DESIGN: Design = Design {
+    inputs: INPUTS,
+    levels: PAPER_WIDTHS.len(),
+    prefilter_levels: 0,
+    least_parameters: |config| squares(4, &config.widths),
+    build,
+};
+
+/// SEMC.
+pub static SINGLE: Design = Design {
+    inputs: INPUTS,
+    levels: PAPER_WIDTHS.len(),
+    prefilter_levels: 0,
+    least_parameters: |config| squares(2, &config.widths),
+    build,
+};
+
+/// See [`Design::inputs`].
+const INPUTS: &str = "paper/gamma/1";
+
+fn build(config: &Config, seed: u64) -> Box<dyn Network> {
+    Box::new(Demc::new(config.architecture, &config.widths, seed))
 }
 
 /// DEMC, DEMC without fusion, or SEMC.

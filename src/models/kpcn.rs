@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate};
 use crate::{
     Result,
     features::{
@@ -26,8 +26,9 @@ use crate::{
         kpcn_streams,
     },
     kernels::Shape,
-    nn::{Activation, Conv, Field, Images, Init, Param, Rng, Stats},
+    nn::{Activation, Conv, Field, Images, Init, Param, Stats},
     passes::{Pass, PassSet},
+    rng::Rng,
 };
 
 /// Channels of the hidden layers as published.
@@ -50,6 +51,33 @@ const HEAD_GAIN: f32 = 0.3;
 
 /// A frame is worked on in tiles beyond this many pixels: each has 441 kernel weights, held twice.
 const WHOLE_FRAME_PIXELS: usize = 1 << 18;
+
+/// KPCN with its two streams.
+pub static DESIGN: Design = Design {
+    inputs: "kpcn-streams/logarithm/1",
+    levels: 1,
+    prefilter_levels: 0,
+    least_parameters: |config| stream_parameters(2, config),
+    build,
+};
+
+/// KPCN with one.
+pub static COMBINED: Design = Design {
+    inputs: "kpcn-combined/logarithm/1",
+    levels: 1,
+    prefilter_levels: 0,
+    least_parameters: |config| stream_parameters(1, config),
+    build,
+};
+
+/// Parameters of the layers between a stream's first and last.
+fn stream_parameters(streams: usize, config: &Config) -> usize {
+    streams * (LAYERS - 2) * TAPS * TAPS * config.widths[0] * config.widths[0]
+}
+
+fn build(config: &Config, seed: u64) -> Box<dyn Network> {
+    Box::new(Kpcn::new(config, seed))
+}
 
 /// Both streams, or the single one over Combined.
 #[derive(Clone)]

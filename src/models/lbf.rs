@@ -19,12 +19,13 @@ use dfdx::{
     tensor_ops::{clamp, exp, ln, sigmoid},
 };
 
-use super::network::{Architecture, Batch, Config, Network, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Design, Network, Taped, duplicate};
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
-    nn::{Activation, Conv, Guides, Images, Init, Param, Rng, Stats, cross_bilateral},
+    nn::{Activation, Conv, Guides, Images, Init, Param, Stats, cross_bilateral},
     passes::{Pass, PassSet},
+    rng::Rng,
 };
 
 /// Hidden units as published.
@@ -46,6 +47,15 @@ const START: f32 = -1.5;
 
 /// Softplus is linear beyond; `exp` must not overflow.
 const SOFTPLUS_LIMIT: f32 = 30.0;
+
+/// See [`Design`].
+pub static DESIGN: Design = Design {
+    inputs: "lbf/logarithm/1",
+    levels: 1,
+    prefilter_levels: 0,
+    least_parameters: |config| config.widths[0],
+    build: |config, seed| Box::new(Lbf::new(config, seed)),
+};
 
 /// The perceptron.
 #[derive(Clone)]

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use super::{
     Denoiser,
+    denoiser::refuse_companions,
     network::{Architecture, Network},
-    refuse_companions,
     weights_file::{self, Metadata},
 };
 use crate::{

@@ -2,6 +2,7 @@
 
 pub mod catalogue;
 pub mod demc;
+mod denoiser;
 pub mod kpcn;
 pub mod lbf;
 pub mod learned;
@@ -11,109 +12,13 @@ pub mod oidn;
 pub mod pyramid;
 pub mod weights_file;
 
-use std::{path::Path, time::Instant};
+use std::path::Path;
 
-use network::{Architecture, Config, Network};
+pub use denoiser::{Denoiser, Run};
 
-use crate::{Error, Result, companion::Companion, nn::Precision, passes::Pass, planes::Planes, shot::Shot};
+use network::{Architecture, Config, Design, Network};
 
-/// One way to remove noise from a frame.
-pub trait Denoiser: Send + Sync {
-    /// The name by which `--model` and the report know it.
-    fn name(&self) -> &str;
-
-    /// The passes it needs.
-    fn passes(&self) -> &[Pass];
-
-    /// Passes it makes use of where a file holds them.
-    fn optional_passes(&self) -> &[Pass] {
-        &[]
-    }
-
-    /// Whether it makes use of half buffers, see [`Shot::read_halves`].
-    fn reads_halves(&self) -> bool {
-        false
-    }
-
-    /// What the user should know about how it treats this frame.
-    fn notes(&self, shot: &Shot) -> Option<String> {
-        let _ = shot;
-        None
-    }
-
-    /// Denoised radiance, (3, H, W).
-    ///
-    /// # Errors
-    /// A pass is missing, or the method cannot run here; the message says why.
-    fn denoise(&self, shot: &Shot) -> Result<Planes>;
-
-    /// As [`Denoiser::denoise`], working on squares of at most `tile` pixels at a time where the method
-    /// can, to bound its memory; a method that cannot ignores the hint.
-    ///
-    /// # Errors
-    /// As [`Denoiser::denoise`].
-    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
-        let _ = tile;
-        self.denoise(shot)
-    }
-
-    /// Whether it denoises layers along with the beauty.
-    fn takes_companions(&self) -> bool {
-        false
-    }
-
-    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along with the beauty,
-    /// in its place.
-    ///
-    /// # Errors
-    /// As [`Denoiser::denoise`], or there are companions and the method takes none.
-    fn denoise_along(
-        &self,
-        shot: &Shot,
-        companions: &mut [Companion],
-        tile: Option<usize>,
-    ) -> Result<Planes> {
-        refuse_companions(self.name(), companions)?;
-        self.denoise_tiled(shot, tile)
-    }
-
-    /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
-    /// reports its filter's time, without start and file traffic.
-    ///
-    /// # Errors
-    /// As [`Denoiser::denoise`].
-    fn denoise_timed(&self, shot: &Shot) -> Result<Run> {
-        let start = Instant::now();
-        let image = self.denoise(shot)?;
-        Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
-    }
-
-    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by itself, or takes
-    /// seconds.
-    fn is_warm(&self) -> bool {
-        false
-    }
-}
-
-/// Stops a method that takes no companions where there are some.
-fn refuse_companions(name: &str, companions: &[Companion]) -> Result<()> {
-    if companions.is_empty() {
-        return Ok(());
-    }
-    Err(Error::Usage(format!(
-        "{name} denoises the beauty alone; demc-s, demc-m and demc-l take other layers along"
-    )))
-}
-
-/// A denoised frame and what it cost.
-pub struct Run {
-    /// Denoised radiance, (3, H, W).
-    pub image: Planes,
-    /// Time that denoising took, without file input and output.
-    pub seconds: f64,
-    /// Memory taken outside this process, where the method runs in one of its own.
-    pub peak_mib: Option<f64>,
-}
+use crate::{Error, Result, nn::Precision, passes::Pass, planes::Planes, shot::Shot};
 
 /// The input itself: the row every report begins with.
 pub struct Noisy;
@@ -184,18 +89,13 @@ pub fn trainable() -> impl Iterator<Item = (&'static str, Config)> {
 /// # Errors
 /// Says what is wrong with it.
 pub fn check(config: &Config) -> Result<(), String> {
-    let levels = match config.architecture {
-        Architecture::Pyramid | Architecture::Prefilter => pyramid::LEVELS,
-        Architecture::Kpcn | Architecture::KpcnCombined | Architecture::Lbf => 1,
-        Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => demc::PAPER_WIDTHS.len(),
-    };
+    let Design { levels, prefilter_levels, .. } = *config.architecture.design();
     if config.widths.len() != levels {
         return Err(format!("{} widths, but the network takes {levels}", config.widths.len()));
     }
-    let of_prefilter = if config.architecture == Architecture::Pyramid { levels } else { 0 };
-    if config.prefilter.len() != of_prefilter {
+    if config.prefilter.len() != prefilter_levels {
         return Err(format!(
-            "a prefilter of {} widths, but the network takes {of_prefilter}",
+            "a prefilter of {} widths, but the network takes {prefilter_levels}",
             config.prefilter.len()
         ));
     }
@@ -211,17 +111,7 @@ pub fn check(config: &Config) -> Result<(), String> {
 /// # Panics
 /// If [`check`] finds the configuration wrong.
 pub fn least_parameters(config: &Config) -> usize {
-    let squares = |widths: &[usize]| widths.iter().map(|width| width * width).sum::<usize>();
-    // Weights of convolutions from as many channels to as many: taps times layers of a width.
-    let counted = match config.architecture {
-        Architecture::Demc | Architecture::DemcNofusion => 9 * 4 * squares(&config.widths),
-        Architecture::Semc => 9 * 2 * squares(&config.widths),
-        Architecture::Pyramid | Architecture::Prefilter => 9 * 2 * squares(&config.widths),
-        Architecture::Kpcn => 25 * 14 * squares(&config.widths),
-        Architecture::KpcnCombined => 25 * 7 * squares(&config.widths),
-        Architecture::Lbf => config.widths[0],
-    };
-    counted + 9 * 2 * squares(&config.prefilter)
+    (config.architecture.design().least_parameters)(config)
 }
 
 /// A network with fresh weights drawn from `seed`.
@@ -229,14 +119,7 @@ pub fn least_parameters(config: &Config) -> usize {
 /// # Panics
 /// If [`check`] finds the configuration wrong.
 pub fn build(config: &Config, seed: u64) -> Box<dyn Network> {
-    match config.architecture {
-        Architecture::Demc | Architecture::DemcNofusion | Architecture::Semc => {
-            Box::new(demc::Demc::new(config.architecture, &config.widths, seed))
-        }
-        Architecture::Pyramid | Architecture::Prefilter => Box::new(pyramid::Pyramid::new(config, seed)),
-        Architecture::Kpcn | Architecture::KpcnCombined => Box::new(kpcn::Kpcn::new(config, seed)),
-        Architecture::Lbf => Box::new(lbf::Lbf::new(config, seed)),
-    }
+    (config.architecture.design().build)(config, seed)
 }
 
 #[cfg(test)]

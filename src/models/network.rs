@@ -3,6 +3,8 @@
 use dfdx::tensor::{Cpu, OwnedTape};
 use serde::{Deserialize, Serialize};
 
+use super::{demc, kpcn, lbf, pyramid};
+
 use crate::{
     Result,
     companion::Companion,
@@ -68,20 +70,45 @@ pub enum Architecture {
     Lbf,
 }
 
-impl Architecture {
+/// What sets a design apart, as its own file says it.
+pub struct Design {
     /// Feature set and transfer of radiance, as weights files record them. The number goes up whenever a value that the network
     /// reads or writes comes to mean something else, as by another constant in `features`: weights from before are then
     /// refused, where they would be run on what they were not trained on.
-    pub fn inputs(self) -> &'static str {
+    pub inputs: &'static str,
+    /// How many widths it takes.
+    pub levels: usize,
+    /// How many widths its prefilter takes, 0 without one.
+    pub prefilter_levels: usize,
+    /// See [`super::least_parameters`].
+    pub least_parameters: fn(&Config) -> usize,
+    /// A network of these widths with weights drawn from a seed.
+    pub build: fn(&Config, u64) -> Box<dyn Network>,
+}
+
+impl Architecture {
+    /// What sets it apart.
+    pub fn design(self) -> &'static Design {
         match self {
-            Self::Demc | Self::DemcNofusion | Self::Semc => "paper/gamma/1",
-            // Alike, since a prefilter may be part of a pyramid, and come out of one.
-            Self::Pyramid | Self::Prefilter => "guides/logarithm/1",
-            Self::Kpcn => "kpcn-streams/logarithm/1",
-            Self::KpcnCombined => "kpcn-combined/logarithm/1",
-            Self::Lbf => "lbf/logarithm/1",
+            Self::Demc | Self::DemcNofusion => &demc::DESIGN,
+            Self::Semc => &demc::SINGLE,
+            Self::Pyramid => &pyramid::DESIGN,
+            Self::Prefilter => &pyramid::ALONE,
+            Self::Kpcn => &kpcn::DESIGN,
+            Self::KpcnCombined => &kpcn::COMBINED,
+            Self::Lbf => &lbf::DESIGN,
         }
     }
+
+    /// See [`Design::inputs`].
+    pub fn inputs(self) -> &'static str {
+        self.design().inputs
+    }
+}
+
+/// Parameters of as many 3x3 convolutions between as many channels as each level has.
+pub fn squares(convolutions: usize, widths: &[usize]) -> usize {
+    convolutions * 9 * widths.iter().map(|width| width * width).sum::<usize>()
 }
 
 /// A network input of several samples, (N, C, H, W).

@@ -24,7 +24,7 @@ mod bands;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Architecture, Batch, Config, Network, Stacked, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate, squares};
 use crate::{
     Result,
     companion::Companion,
@@ -34,9 +34,10 @@ use crate::{
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::{blend::CORNERS, memory::PlaneBuffer, narrow::Steps},
-    nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Rng, Stats},
+    nn::{Activation, Conv, Field, Images, Init, MaxPool, Param, Precision, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
+    rng::Rng,
 };
 
 /// Levels of the trunk: 1/2, 1/4, 1/8 and 1/16 of the frame.
@@ -93,6 +94,31 @@ const INPUT_STEPS: [Steps; 2] = [Steps::to(3.0), Steps::within(1.0)];
 const RADIANCE_CHANNELS: usize = 3;
 const GUIDE_CHANNELS: usize = 7;
 const NORMAL_CHANNELS: usize = 3;
+
+/// The kernel-predicting dual encoder with its prefilter.
+pub static DESIGN: Design = Design {
+    inputs: INPUTS,
+    levels: LEVELS,
+    prefilter_levels: LEVELS,
+    least_parameters: |config| squares(2, &config.widths) + squares(2, &config.prefilter),
+    build,
+};
+
+/// A prefilter by itself.
+pub static ALONE: Design = Design {
+    inputs: INPUTS,
+    levels: LEVELS,
+    prefilter_levels: 0,
+    least_parameters: |config| squares(2, &config.widths),
+    build,
+};
+
+/// See [`Design::inputs`]: alike, since a prefilter may be part of a pyramid, and come out of one.
+const INPUTS: &str = "guides/logarithm/1";
+
+fn build(config: &Config, seed: u64) -> Box<dyn Network> {
+    Box::new(Pyramid::new(config, seed))
+}
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]

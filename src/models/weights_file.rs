@@ -11,9 +11,10 @@ use super::{
 use crate::{
     Error, Result,
     nn::{
-        Arithmetic, Precision, Rng,
+        Arithmetic, Precision,
         weights::{self, Tensor},
     },
+    rng::Rng,
 };
 
 /// How a network was trained.

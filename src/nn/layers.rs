@@ -11,7 +11,7 @@ use std::sync::{
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::{
-    Activation, Field, Init, Param, Precision, Rng,
+    Activation, Field, Init, Param, Precision,
     activation::{Data, Saved},
     arithmetic::{Arithmetic, Packed},
     pool::Buffer,
@@ -23,6 +23,7 @@ use crate::kernels::{
     pool::{channel_moments, max_pool, max_pool_gradient, relu_mask, scale_shift},
     weight_grad::bias_gradient,
 };
+use crate::rng::Rng;
 
 /// A convolution of one or several sources, with bias and optional ReLU.
 #[derive(Clone, Debug)]

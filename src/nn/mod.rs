@@ -20,7 +20,7 @@ pub use cross_bilateral::{Guides, cross_bilateral};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use line::{Line, Rows};
-pub use param::{Init, Param, Rng};
+pub use param::{Init, Param};
 pub use pool::clear as clear_buffers;
 
 use dfdx::tensor::Cpu;

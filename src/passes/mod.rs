@@ -81,6 +81,25 @@ pub enum Pass {
     Vector,
 }
 
+/// What a pass is a quantity of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quantity {
+    /// Light, RGB: it scales with the light in the scene.
+    Radiance,
+    /// What a surface leaves of light, RGB, most of it in 0..1.
+    Colour,
+    /// A direction, XYZ.
+    Direction,
+    /// A place, XYZ.
+    Place,
+    /// A length.
+    Distance,
+    /// A share of a pixel, 0 to 1.
+    Share,
+    /// Motion in the picture: XY and ZW.
+    Motion,
+}
+
 impl Pass {
     /// Every pass.
     pub const ALL: [Pass; 24] = [
@@ -110,33 +129,36 @@ impl Pass {
         Pass::Vector,
     ];
 
+    /// What the pass is a quantity of: what else is true of it follows.
+    pub fn quantity(self) -> Quantity {
+        use Pass::*;
+        match self {
+            Combined | NoisyImage | DiffuseDirect | DiffuseIndirect | GlossyDirect | GlossyIndirect
+            | TransmissionDirect | TransmissionIndirect | VolumeDirect | VolumeIndirect | Emission
+            | Environment => Quantity::Radiance,
+            DiffuseColor | GlossyColor | TransmissionColor | DenoisingAlbedo | ShadowCatcher => {
+                Quantity::Colour
+            }
+            Normal | DenoisingNormal => Quantity::Direction,
+            Position => Quantity::Place,
+            Depth | DenoisingDepth => Quantity::Distance,
+            Alpha => Quantity::Share,
+            Vector => Quantity::Motion,
+        }
+    }
+
     /// Channels of the pass.
     pub fn channels(self) -> usize {
-        match self {
-            Pass::Alpha | Pass::Depth | Pass::DenoisingDepth => 1,
-            Pass::Vector => 4,
+        match self.quantity() {
+            Quantity::Share | Quantity::Distance => 1,
+            Quantity::Motion => 4,
             _ => 3,
         }
     }
 
     /// Whether the pass scales with the light in the scene.
     pub fn carries_radiance(self) -> bool {
-        use Pass::*;
-        matches!(
-            self,
-            Combined
-                | NoisyImage
-                | DiffuseDirect
-                | DiffuseIndirect
-                | GlossyDirect
-                | GlossyIndirect
-                | TransmissionDirect
-                | TransmissionIndirect
-                | VolumeDirect
-                | VolumeIndirect
-                | Emission
-                | Environment
-        )
+        self.quantity() == Quantity::Radiance
     }
 
     /// Names under which Blender has written the pass, the current one first.

@@ -5,7 +5,7 @@
 
 use std::fmt;
 
-use super::Pass;
+use super::{Pass, Quantity};
 
 /// Shader AOV in which the export script stores the world position averaged over samples.
 pub const POSITION_AOV: &str = "DEMC Position";
@@ -27,13 +27,13 @@ pub type Components = &'static [&'static [&'static str]];
 
 /// How renderers name the components of a pass: see [`super::channels::is_component`] for how they are compared.
 pub fn components(pass: Pass) -> Components {
-    match pass {
-        Pass::Normal | Pass::Position | Pass::DenoisingNormal => &[&["X", "Y", "Z"], &["R", "G", "B"]],
-        Pass::Vector => &[&["X", "Y", "Z", "W"], &["R", "G", "B", "A"]],
+    match pass.quantity() {
+        Quantity::Direction | Quantity::Place => &[&["X", "Y", "Z"], &["R", "G", "B"]],
+        Quantity::Motion => &[&["X", "Y", "Z", "W"], &["R", "G", "B", "A"]],
         // `V` in Blender's File Output node, `T` in Mitsuba, nothing where the channel is the pass.
-        Pass::Depth | Pass::DenoisingDepth => &[&["Z"], &["V"], &["T"], &["X"], &["Y"], &["R"], &[""]],
-        Pass::Alpha => &[&["A"], &[""]],
-        _ => &[&["R", "G", "B"]],
+        Quantity::Distance => &[&["Z"], &["V"], &["T"], &["X"], &["Y"], &["R"], &[""]],
+        Quantity::Share => &[&["A"], &[""]],
+        Quantity::Radiance | Quantity::Colour => &[&["R", "G", "B"]],
     }
 }
 

@@ -10,9 +10,9 @@ use crate::{
     augment::Augment,
     frame::HALF_MAX,
     metrics::pairing,
-    nn::Rng,
     passes::{self, Pass, PassSet},
     planes::Planes,
+    rng::Rng,
     shot,
     testset::Pair,
 };

@@ -270,7 +270,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     /// The loss of a flat image of `value` and its mean gradient by a pixel, against a flat clean reference of
     /// 0.5 and, if there is one, a raw one.

@@ -168,7 +168,7 @@ fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     #[test]
     fn orthogonal_keeps_directions_and_evens_their_lengths() {

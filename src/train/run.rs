@@ -27,8 +27,9 @@ use crate::{
         network::{Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Conv, Rng, Stats},
+    nn::{Conv, Stats},
     planes::Planes,
+    rng::Rng,
 };
 
 /// What the caller hears of.

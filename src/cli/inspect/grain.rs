@@ -96,7 +96,7 @@ impl Grain {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::Rng;
+    use crate::rng::Rng;
 
     /// Passes of a flat wall with noise of a seed.
     fn grain(seed: u64, amount: f32) -> Grain {

@@ -1,0 +1,103 @@
+//! What every denoising method is to those that use it.
+
+use std::time::Instant;
+
+use crate::{Error, Result, companion::Companion, passes::Pass, planes::Planes, shot::Shot};
+
+/// One way to remove noise from a frame.
+pub trait Denoiser: Send + Sync {
+    /// The name by which `--model` and the report know it.
+    fn name(&self) -> &str;
+
+    /// The passes it needs.
+    fn passes(&self) -> &[Pass];
+
+    /// Passes it makes use of where a file holds them.
+    fn optional_passes(&self) -> &[Pass] {
+        &[]
+    }
+
+    /// Whether it makes use of half buffers, see [`Shot::read_halves`].
+    fn reads_halves(&self) -> bool {
+        false
+    }
+
+    /// What the user should know about how it treats this frame.
+    fn notes(&self, shot: &Shot) -> Option<String> {
+        let _ = shot;
+        None
+    }
+
+    /// Denoised radiance, (3, H, W).
+    ///
+    /// # Errors
+    /// A pass is missing, or the method cannot run here; the message says why.
+    fn denoise(&self, shot: &Shot) -> Result<Planes>;
+
+    /// As [`Denoiser::denoise`], working on squares of at most `tile` pixels at a time where the method
+    /// can, to bound its memory; a method that cannot ignores the hint.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`].
+    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
+        let _ = tile;
+        self.denoise(shot)
+    }
+
+    /// Whether it denoises layers along with the beauty.
+    fn takes_companions(&self) -> bool {
+        false
+    }
+
+    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along with the beauty,
+    /// in its place.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`], or there are companions and the method takes none.
+    fn denoise_along(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        refuse_companions(self.name(), companions)?;
+        self.denoise_tiled(shot, tile)
+    }
+
+    /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own
+    /// reports its filter's time, without start and file traffic.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise`].
+    fn denoise_timed(&self, shot: &Shot) -> Result<Run> {
+        let start = Instant::now();
+        let image = self.denoise(shot)?;
+        Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
+    }
+
+    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by itself, or takes
+    /// seconds.
+    fn is_warm(&self) -> bool {
+        false
+    }
+}
+
+/// Stops a method that takes no companions where there are some.
+pub(super) fn refuse_companions(name: &str, companions: &[Companion]) -> Result<()> {
+    if companions.is_empty() {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "{name} denoises the beauty alone; demc-s, demc-m and demc-l take other layers along"
+    )))
+}
+
+/// A denoised frame and what it cost.
+pub struct Run {
+    /// Denoised radiance, (3, H, W).
+    pub image: Planes,
+    /// Time that denoising took, without file input and output.
+    pub seconds: f64,
+    /// Memory taken outside this process, where the method runs in one of its own.
+    pub peak_mib: Option<f64>,
+}
