@@ -11,7 +11,11 @@ use crate::cli::ExitCode;
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, inputs, print_line, warn_line};
+use super::{
+    SOME_FAILED,
+    inputs::{self, Search},
+    print_line, warn_line,
+};
 use crate::{Result, denoise, error::attempt};
 use grain::Grain;
 
@@ -24,6 +28,9 @@ pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
+    /// Search directories with all that are in them
+    #[arg(long)]
+    recursive: bool,
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
@@ -35,13 +42,13 @@ pub struct Args {
 /// The inputs name nothing.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let methods = examine::methods();
-    let inputs = inputs::expand(&args.files)?;
+    let inputs = inputs::expand(&args.files, &Search { recursive: args.recursive, except: None })?;
     let mut failed = !inputs.unusable.is_empty();
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
     // The frame before, while files are frames of one sequence in order.
     let mut before: Option<(PathBuf, Grain)> = None;
     let is_compared = inputs.files.len() > 1;
-    for path in inputs.files {
+    for path in inputs.paths() {
         let mut examined = attempt(&path, || examine::examine(&path, &methods, is_compared));
         let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
         if let Ok(report) = &mut examined {
