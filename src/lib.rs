@@ -25,7 +25,7 @@
 //! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
 //! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
 //! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given, [`sources`] where it is found, and
-//! a [`companion`] a layer denoised along; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
+//! a [`companion`] a layer denoised along; [`lint`] finds in a frame what ruins a denoise; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
@@ -39,6 +39,7 @@ pub mod features;
 pub mod filters;
 pub mod frame;
 pub mod kernels;
+pub mod lint;
 pub mod metrics;
 pub mod models;
 pub mod nn;

@@ -52,7 +52,7 @@ fn recognises_the_passes_of_both_blender_layouts() {
     for report in &reports {
         assert_eq!(report["layers"][0]["models"][0]["missing"].as_array().unwrap().len(), 0);
         // The averaged position is there: nothing to warn of.
-        assert!(report["layers"][0]["warnings"].as_array().unwrap().is_empty(), "{report}");
+        assert!(report["layers"][0]["findings"].as_array().unwrap().is_empty(), "{report}");
     }
 }
 

@@ -6,49 +6,85 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::{Error, Result, testset::is_hidden};
+use crate::{Error, Result, denoise::Input, testset::is_hidden};
 
 /// What the user's inputs name.
 #[derive(Default)]
 pub struct Inputs {
     /// Files in the order given, each once; those of a directory or glob sorted by name.
-    pub files: Vec<PathBuf>,
+    pub files: Vec<Input>,
     /// Inputs, or paths that a glob came by, that name no file; each with the reason.
     pub unusable: Vec<(PathBuf, Error)>,
+    /// Inputs that hold or match no file yet, each with the reason.
+    empty: Vec<(PathBuf, Error)>,
+}
+
+/// How directories are looked through.
+#[derive(Clone, Debug, Default)]
+pub struct Search {
+    /// Whether the directories in them are too, and those in these. Links to directories are not followed: the same files
+    /// would be found twice.
+    pub recursive: bool,
+    /// A directory that is left out, where results are written.
+    pub except: Option<PathBuf>,
+}
+
+impl Inputs {
+    /// The paths of the files.
+    pub fn paths(self) -> Vec<PathBuf> {
+        self.files.into_iter().map(|input| input.file).collect()
+    }
 }
 
 /// Expands the inputs. A plain path that does not exist is kept: reading it reports it, and the others go on.
 ///
 /// # Errors
 /// A glob is malformed, or all inputs together name no file.
-pub fn expand(inputs: &[PathBuf]) -> Result<Inputs> {
-    let mut all = Inputs::default();
-    for input in inputs {
-        let before = (all.files.len(), all.unusable.len());
-        let nothing = if input.is_dir() {
-            directory(input, &mut all);
-            "no EXR files in this directory; name the files or a glob such as '*/*.exr' in it"
-        } else if !input.exists() && has_wildcard(input) {
-            pattern(input, &mut all)?;
-            "matches no file; check the path and the pattern"
-        } else {
-            all.files.push(input.clone());
-            continue;
-        };
-        if before == (all.files.len(), all.unusable.len()) {
-            all.unusable.push((input.clone(), Error::Usage(format!("{}: {nothing}", input.display()))));
-        }
-    }
+pub fn expand(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
+    let mut all = find(inputs, search)?;
+    let empty = std::mem::take(&mut all.empty);
+    all.unusable.extend(empty);
     if all.files.is_empty() {
         let why: Vec<String> = all.unusable.iter().map(|(_, error)| error.to_string()).collect();
         return Err(Error::Usage(why.join("\n")));
     }
+    Ok(all)
+}
+
+/// As [`expand`], but inputs may name no file, as long as none has come in.
+///
+/// # Errors
+/// A glob is malformed.
+pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
+    let mut all = Inputs::default();
+    for input in inputs {
+        let before = (all.files.len(), all.unusable.len());
+        let nothing = if input.is_dir() {
+            directory(input, search, &mut all);
+            match search.recursive {
+                true => "no EXR files in this directory, nor in those below it",
+                false => {
+                    "no EXR files in this directory; add --recursive to search the directories in it, or name the files or \
+                     a glob such as '*/*.exr' in it"
+                }
+            }
+        } else if !input.exists() && has_wildcard(input) {
+            pattern(input, &mut all)?;
+            "matches no file; check the path and the pattern"
+        } else {
+            all.files.push(Input { file: input.clone(), below: PathBuf::new() });
+            continue;
+        };
+        if before == (all.files.len(), all.unusable.len()) {
+            all.empty.push((input.clone(), Error::Usage(format!("{}: {nothing}", input.display()))));
+        }
+    }
     // By name too: frames that are held are links to another.
     let mut seen = HashSet::new();
-    let identity = |f: &PathBuf| {
-        (fs::canonicalize(f).unwrap_or_else(|_| f.clone()), f.file_name().map(ToOwned::to_owned))
+    let identity = |Input { file, .. }: &Input| {
+        (fs::canonicalize(file).unwrap_or_else(|_| file.clone()), file.file_name().map(ToOwned::to_owned))
     };
-    all.files.retain(|f| seen.insert(identity(f)));
+    all.files.retain(|input| seen.insert(identity(input)));
     Ok(all)
 }
 
@@ -57,24 +93,41 @@ fn is_input(path: &Path) -> bool {
     !is_hidden(path) && (path.is_file() || (path.is_symlink() && !path.exists()))
 }
 
-fn directory(path: &Path, all: &mut Inputs) {
-    let entries = match fs::read_dir(path) {
-        Ok(entries) => entries,
-        Err(error) => return all.unusable.push((path.into(), Error::io("read", path)(error))),
-    };
-    let first = all.files.len();
-    for entry in entries {
-        match entry {
-            Ok(entry) => {
-                let file = entry.path();
-                if is_exr(&file) && is_input(&file) {
-                    all.files.push(file);
+fn directory(named: &Path, search: &Search, all: &mut Inputs) {
+    let except = search.except.as_ref().and_then(|path| fs::canonicalize(path).ok());
+    // Those that are still to be looked through, as they lie below the one named, the next one last.
+    let mut left = vec![PathBuf::new()];
+    while let Some(below) = left.pop() {
+        let path = if below.as_os_str().is_empty() { named.to_owned() } else { named.join(&below) };
+        let (mut files, mut folders) = (Vec::new(), Vec::new());
+        let unusable = |error| (path.clone(), Error::io("read", &path)(error));
+        match fs::read_dir(&path) {
+            Ok(entries) => {
+                for entry in entries {
+                    match entry {
+                        Ok(entry) => {
+                            let found = entry.path();
+                            if is_exr(&found) && is_input(&found) {
+                                files.push(Input { file: found, below: below.clone() });
+                            } else if search.recursive
+                                && entry.file_type().is_ok_and(|kind| kind.is_dir())
+                                && !is_hidden(&found)
+                                && (except.is_none() || fs::canonicalize(&found).ok() != except)
+                            {
+                                folders.push(below.join(entry.file_name()));
+                            }
+                        }
+                        Err(error) => all.unusable.push(unusable(error)),
+                    }
                 }
             }
-            Err(error) => all.unusable.push((path.into(), Error::io("read", path)(error))),
+            Err(error) => all.unusable.push(unusable(error)),
         }
+        files.sort_by(|a, b| a.file.cmp(&b.file));
+        all.files.extend(files);
+        folders.sort_by(|a, b| b.cmp(a));
+        left.extend(folders);
     }
-    all.files[first..].sort();
 }
 
 fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
@@ -83,7 +136,7 @@ fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
         .map_err(|e| Error::Usage(format!("{text}: not a valid glob ({}); quote or escape it", e.msg)))?;
     for found in matches {
         match found {
-            Ok(file) if is_input(&file) => all.files.push(file),
+            Ok(file) if is_input(&file) => all.files.push(Input { file, below: PathBuf::new() }),
             Ok(_) => {}
             Err(error) => {
                 let path = error.path().to_path_buf();

@@ -12,7 +12,11 @@ use std::{
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 
-use super::{SOME_FAILED, inputs, print_line, warn_line};
+use super::{
+    SOME_FAILED,
+    inputs::{self, Search},
+    print_line, warn_line,
+};
 use crate::cli::ExitCode;
 use crate::{Error, Result};
 
@@ -31,6 +35,10 @@ pub struct Args {
     /// killed does not
     #[arg(long, value_name = "INPUT", num_args = 1..)]
     of: Vec<PathBuf>,
+
+    /// Search the directories of --of with all that are in them
+    #[arg(long, requires = "of")]
+    recursive: bool,
 }
 
 /// What the report reads of a line.
@@ -81,7 +89,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             warn_line(&format!("demc: note: {log}: {unreadable} lines are none of `demc denoise --json`"));
         }
     }
-    let missing = missing(&args.of, &frames)?;
+    let missing = missing(&args.of, args.recursive, &frames)?;
     let count = |status| frames.values().filter(|frame| frame.status == status).count();
     for (input, frame) in frames.iter().filter(|(_, frame)| frame.status == Status::Failed) {
         // Errors name their file already.
@@ -123,14 +131,15 @@ fn add(frames: &mut BTreeMap<PathBuf, Frame>, line: Line) {
     }
 }
 
-fn missing(of: &[PathBuf], frames: &BTreeMap<PathBuf, Frame>) -> Result<Vec<PathBuf>> {
+fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Frame>) -> Result<Vec<PathBuf>> {
     if of.is_empty() {
         return Ok(Vec::new());
     }
     // Tasks may have come to the folder by other ways.
     let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     let told: Vec<PathBuf> = frames.keys().map(|input| place(input)).collect();
-    let mut files = inputs::expand(of)?.files;
+    let search = Search { recursive, ..Search::default() };
+    let mut files = inputs::expand(of, &search)?.paths();
     files.retain(|file| !told.contains(&place(file)));
     Ok(files)
 }

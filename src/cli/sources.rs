@@ -52,16 +52,16 @@ impl Names {
 }
 
 impl Guides {
-    /// With the names, where the passes of `frames` frames are.
+    /// With the names, where the passes of one frame or of several are.
     ///
     /// # Errors
     /// One file is named for several frames.
-    pub fn sources(self, names: &Names, frames: usize) -> Result<Sources> {
+    pub fn sources(self, names: &Names, is_one: bool) -> Result<Sources> {
         for (option, pattern) in [("--albedo", &self.albedo), ("--normal", &self.normal)] {
-            if let Some(pattern) = pattern.as_deref().filter(|pattern| frames > 1 && !has_number(pattern)) {
+            if let Some(pattern) = pattern.as_deref().filter(|pattern| !is_one && !has_number(pattern)) {
                 let pattern = pattern.display();
                 let why = format!(
-                    "{option} {pattern}: is one file for {frames} frames; put #### in the place of the number"
+                    "{option} {pattern}: is one file for several frames; put #### in the place of the number"
                 );
                 return Err(Error::Usage(why));
             }

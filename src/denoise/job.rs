@@ -97,6 +97,14 @@ pub struct Report {
     pub width: usize,
     /// Rows.
     pub height: usize,
+    /// The passes of the view layer that demc knows, by name.
+    pub passes: Vec<String>,
+    /// Its light groups.
+    pub light_groups: Vec<String>,
+    /// Samples of a pixel, or the most that it may have had, where the file tells.
+    pub samples: Option<u32>,
+    /// Whether Blender had denoised Combined, and what it was before was taken.
+    pub was_denoised: bool,
     /// Seconds in the model alone.
     pub seconds: f64,
     /// NaN and infinite input values repaired, by pass.
@@ -118,10 +126,24 @@ pub struct Views<T> {
 /// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is not demc's.
 pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
-    let frame = Frame::read(input)?;
+    take_apart(Frame::read(input)?, model, options)
+}
+
+/// As [`load`], of a frame that was read.
+///
+/// # Errors
+/// As [`load`], but for files that cannot be read.
+pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
+    check_options(model, options)?;
+    let input = frame.path();
     let layers = passes::layers(&frame, &options.sources.mapping);
     let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
-    let mut report = Report { view_layer: chosen.name.clone(), ..Report::default() };
+    let mut report = Report {
+        view_layer: chosen.name.clone(),
+        passes: chosen.passes.keys().map(Pass::to_string).collect(),
+        light_groups: chosen.light_groups.keys().cloned().collect(),
+        ..Report::default()
+    };
     if options.view_layer.is_none() {
         report.notes.extend(note_other_layers(&layers, chosen));
     }
@@ -148,6 +170,8 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
         options.sources.mapping.check(input, layer)?;
         let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
         report.notes.extend(shot.normals.take());
+        report.samples = shot.passes.samples;
+        report.was_denoised |= shot.was_denoised;
         if shot.was_denoised {
             report.notes.push(
                 "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
@@ -338,6 +362,17 @@ fn layer_name(view_layer: &str, name: &str) -> String {
 /// # Errors
 /// The result does not fit into the file's format, or cannot be written.
 pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<Report> {
+    let (frame, report) = insert(denoised, output, options)?;
+    // Last: an EXR that exists is a frame that is finished.
+    frame.write(output)?;
+    Ok(report)
+}
+
+/// Adds the layers, or replaces the beauty, and writes the preview: all but the file itself.
+///
+/// # Errors
+/// As [`store`].
+pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<(Frame, Report)> {
     let Views { mut frame, views, mut report } = denoised;
     for (layer, Denoised { radiance, alpha, lights }) in &views {
         let beauty = (&layer.passes[&Pass::Combined], COMBINED, radiance, alpha.as_ref());
@@ -364,9 +399,7 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
             }
         }
     }
-    // Last: an EXR that exists is a frame that is finished.
-    frame.write(output)?;
-    Ok(report)
+    Ok((frame, report))
 }
 
 /// Adds a denoised pass as a layer, or replaces it.

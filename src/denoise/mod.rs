@@ -6,18 +6,23 @@
 
 mod batch;
 mod job;
+mod lane;
 mod lights;
+mod plan;
 #[cfg(feature = "preview")]
 pub mod preview;
 mod sequence;
+mod watch;
 mod window;
 
 use std::path::Path;
 
-pub use batch::{Batch, End, Outcome, Stopper, plan};
+pub use batch::{Batch, End, Outcome, Stopper};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, shot, store};
 pub use lights::Alpha;
+pub use plan::{Input, Plan, plan, plan_tree};
 pub use sequence::{follows, frame_number};
+pub use watch::{Look, Watch};
 
 use crate::{Result, models::Denoiser};
 

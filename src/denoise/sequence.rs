@@ -8,6 +8,7 @@ use std::{
     collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
 use super::Job;
@@ -73,20 +74,37 @@ pub fn follows(file: &Path, before: &Path) -> bool {
 }
 
 /// Jobs of a sequence, by number, or a job alone.
-pub struct Sequence {
+pub struct Stretch {
     /// What lies on disk, the jobs' own files at their numbers.
-    pub files: BTreeMap<i64, PathBuf>,
-    /// Index of each job, and its number.
-    pub jobs: Vec<(usize, i64)>,
+    pub files: Arc<BTreeMap<i64, PathBuf>>,
+    /// Each job, and its number.
+    pub jobs: Vec<(Job, i64)>,
     /// Whether its files' names tell a number.
     pub is_numbered: bool,
 }
 
+impl Stretch {
+    /// The jobs in up to `count` stretches that are alike long.
+    pub fn split(self, count: usize) -> Vec<Self> {
+        let Self { files, jobs, is_numbered } = self;
+        let length = jobs.len().div_ceil(count).max(1);
+        let stretch =
+            |jobs: &[(Job, i64)]| Self { files: Arc::clone(&files), jobs: jobs.to_vec(), is_numbered };
+        jobs.chunks(length).map(stretch).collect()
+    }
+}
+
 /// The sequences that jobs belong to, in the order of their first jobs.
-pub fn group(jobs: &[Job]) -> Vec<Sequence> {
+pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
+    /// A sequence that is still growing.
+    struct Sequence {
+        files: BTreeMap<i64, PathBuf>,
+        jobs: Vec<(Job, i64)>,
+        is_numbered: bool,
+    }
     let mut sequences: Vec<Sequence> = Vec::new();
     let mut known: BTreeMap<Key, usize> = BTreeMap::new();
-    for (index, job) in jobs.iter().enumerate() {
+    for job in jobs {
         let place = Place::of(&job.input);
         let number = place.as_ref().map_or(0, |place| place.number);
         // Two files of one number, such as 7 and 0007, are frames of two sequences: neither may hide the other.
@@ -97,14 +115,17 @@ pub fn group(jobs: &[Job]) -> Vec<Sequence> {
             sequences.push(Sequence { files, jobs: Vec::new(), is_numbered: place.is_some() });
             sequences.len() - 1
         });
-        sequences[at].jobs.push((index, number));
         sequences[at].files.insert(number, job.input.clone());
+        sequences[at].jobs.push((job, number));
         if let Some(place) = place {
             known.insert(place.key, at);
         }
     }
-    sequences.iter_mut().for_each(|sequence| sequence.jobs.sort_by_key(|(_, number)| *number));
-    sequences
+    let whole = |Sequence { files, mut jobs, is_numbered }| {
+        jobs.sort_by_key(|(_, number)| *number);
+        Stretch { files: Arc::new(files), jobs, is_numbered }
+    };
+    sequences.into_iter().map(whole).collect()
 }
 
 #[cfg(test)]
@@ -142,10 +163,14 @@ mod tests {
         }
         let job = |name: &str| Job { input: dir.path().join(name), output: PathBuf::new() };
         let jobs = ["a.0012.exr", "b.0010.exr", "c.exr", "a.0009.exr", "a.012.exr"].map(job);
-        let sequences = group(&jobs);
+        let index = |job: &Job| jobs.iter().position(|other| other == job).unwrap();
+        let sequences = group(jobs.to_vec());
         let listed: Vec<_> = sequences
             .iter()
-            .map(|s| (s.jobs.clone(), s.files.keys().copied().collect::<Vec<_>>(), s.is_numbered))
+            .map(|s| {
+                let of_jobs: Vec<_> = s.jobs.iter().map(|(job, number)| (index(job), *number)).collect();
+                (of_jobs, s.files.keys().copied().collect::<Vec<_>>(), s.is_numbered)
+            })
             .collect();
         assert_eq!(
             listed,
@@ -158,6 +183,24 @@ mod tests {
         );
         assert!(sequences[0].files[&12].ends_with("a.0012.exr"));
         assert!(sequences[3].files[&12].ends_with("a.012.exr"));
+    }
+
+    #[test]
+    fn stretches_of_a_sequence_are_alike_long_and_hold_each_job_once() {
+        let jobs = |count: i64| {
+            let job = |n| (Job { input: format!("a.{n}.exr").into(), output: PathBuf::new() }, n);
+            Stretch { files: Arc::default(), jobs: (0..count).map(job).collect(), is_numbered: true }
+        };
+        let lengths = |count: i64, lanes: usize| {
+            let stretches = jobs(count).split(lanes);
+            let numbers: Vec<i64> = stretches.iter().flat_map(|s| s.jobs.iter().map(|(_, n)| *n)).collect();
+            assert_eq!(numbers, (0..count).collect::<Vec<_>>());
+            stretches.iter().map(|s| s.jobs.len()).collect::<Vec<_>>()
+        };
+        assert_eq!(lengths(7, 3), [3, 3, 1]);
+        assert_eq!(lengths(2, 3), [1, 1]);
+        assert_eq!(lengths(5, 1), [5]);
+        assert_eq!(lengths(0, 2), [0usize; 0]);
     }
 
     #[test]

@@ -3,9 +3,13 @@
 //! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the files
 //! whose names end in one of these numbers, as Blender writes them: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
 
-use std::{path::PathBuf, str::FromStr};
+use std::str::FromStr;
 
-use crate::{Error, Result, cli::warn_line, denoise::frame_number};
+use crate::{
+    Error, Result,
+    cli::warn_line,
+    denoise::{Input, frame_number},
+};
 
 /// Frames as the user lists them.
 #[derive(Clone, Debug)]
@@ -59,13 +63,17 @@ impl Frames {
         self.0.iter().any(|span| span.contains(frame))
     }
 
+    /// Whether a file is of one of these frames.
+    pub fn has(&self, input: &Input) -> bool {
+        frame_number(&input.file).is_some_and(|frame| self.contains(frame))
+    }
+
     /// The files of these frames. Single frames asked for that no file is of are told.
     ///
     /// # Errors
     /// There is no such file.
-    pub fn pick(&self, files: Vec<PathBuf>) -> Result<Vec<PathBuf>> {
-        let picked: Vec<PathBuf> =
-            files.into_iter().filter(|file| frame_number(file).is_some_and(|n| self.contains(n))).collect();
+    pub fn pick(&self, files: Vec<Input>) -> Result<Vec<Input>> {
+        let picked: Vec<Input> = files.into_iter().filter(|file| self.has(file)).collect();
         if picked.is_empty() {
             return Err(Error::Usage(
                 "--frames: none of the inputs has a name that ends in one of these numbers, as in shot.0017.exr"
@@ -73,7 +81,7 @@ impl Frames {
             ));
         }
         for single in self.0.iter().filter(|span| span.first == span.last) {
-            if !picked.iter().any(|file| frame_number(file) == Some(single.first)) {
+            if !picked.iter().any(|input| frame_number(&input.file) == Some(single.first)) {
                 warn_line(&format!("demc: note: --frames {}: no input is of this frame", single.first));
             }
         }

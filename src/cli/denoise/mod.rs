@@ -6,7 +6,11 @@
 mod frames;
 mod progress;
 
-use std::path::PathBuf;
+use std::{
+    collections::BTreeSet,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use crate::cli::ExitCode;
 
@@ -16,13 +20,13 @@ use progress::{Progress, Style};
 
 use super::{
     SOME_FAILED,
-    inputs::{self, Inputs},
+    inputs::{self, Inputs, Search},
     sources::{Guides, Names},
-    stop,
+    stop, warn_line,
 };
 use crate::{
     Error, Result,
-    denoise::{self, Alpha, Batch, End, Job, Options, Outcome, preview},
+    denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, preview},
     frame::prepare_folder,
     models,
 };
@@ -32,7 +36,9 @@ use crate::{
 #[command(after_help = "\
 Examples:
   demc denoise renders --out clean
-  demc denoise 'renders/shot_0004spp.*.exr' --out clean --frames 1-9:4,12 --model demc-s --preview")]
+  demc denoise 'renders/shot_0004spp.*.exr' --out clean --frames 1-9:4,12 --model demc-s --preview
+  demc denoise renders --recursive --out clean --jobs 2
+  demc denoise renders --out clean --watch 3  # while Blender renders")]
 pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "INPUT")]
@@ -66,6 +72,11 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 
+    /// Denoise N frames at once, each with its share of the threads: the same results, sooner where frames are small or
+    /// threads many. Each frame takes its own memory, up to three times that of a frame of its kind
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    jobs: u16,
+
     /// Work on bands of N rows, or squares of N by N pixels where a model wants those, to bound memory; the
     /// result is the same to the bit [default: the model's choice]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(16..))]
@@ -74,6 +85,17 @@ pub struct Args {
     /// Only the inputs whose names end in one of these numbers: 7, 1-9, 1-9:4 (every fourth), 1,3,7-9
     #[arg(long, value_name = "A-B[:S],...", allow_hyphen_values = true)]
     frames: Option<Frames>,
+
+    /// Search directories with all that are in them; results lie below --out as their inputs do below the directory named
+    #[arg(long)]
+    recursive: bool,
+
+    /// Go on with renders that are still coming in, each when its file is whole, until Ctrl-C, or until nothing new has come
+    /// for SECONDS; with --overwrite, a frame that is rendered again is denoised again
+    #[arg(long, value_name = "SECONDS", num_args = 0..=1, conflicts_with = "temporal",
+          value_parser = clap::value_parser!(u32).range(1..))]
+    #[allow(clippy::option_option, reason = "not at all, for ever, for some time")]
+    watch: Option<Option<u32>>,
 
     /// Take frames of a sequence (names that end in a number) together with N before and N after each, found beside them
     /// and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without a number]
@@ -124,12 +146,11 @@ enum AlphaChoice {
 pub fn run(args: Args) -> Result<ExitCode> {
     denoise::check_layer_name(&args.layer)
         .map_err(|why| Error::Usage(format!("--layer '{}': {why}", args.layer)))?;
-    let Inputs { files, unusable } = inputs::expand(&args.inputs)?;
-    let files = match &args.frames {
-        Some(frames) => frames.pick(files)?,
-        None => files,
+    let search = Search { recursive: args.recursive, except: Some(args.out.clone()) };
+    let work = match args.watch {
+        None => Work::of(&args, &search)?,
+        Some(idle) => Work::Watch(watch(&args, search, idle)?, idle),
     };
-    let jobs = denoise::plan(files, &args.out)?;
     // Before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
         rayon::ThreadPoolBuilder::new()
@@ -137,9 +158,14 @@ pub fn run(args: Args) -> Result<ExitCode> {
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
-    let sources = args.guides.sources(&args.names, jobs.len())?;
+    let is_one = matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
+    let sources = args.guides.sources(&args.names, is_one)?;
     let model = models::open(&args.model)?;
     prepare_folder(&args.out)?;
+    if let Work::List { jobs, .. } = &work {
+        let folders: BTreeSet<&Path> = jobs.iter().filter_map(|job| job.output.parent()).collect();
+        folders.into_iter().try_for_each(prepare_folder)?;
+    }
 
     let options = Options {
         view_layer: args.view_layer,
@@ -161,11 +187,28 @@ pub fn run(args: Args) -> Result<ExitCode> {
         (_, true) => Style::Quiet,
         _ => Style::Plain,
     };
-    let mut progress = Progress::new(jobs.len() + unusable.len(), style);
-    for (input, error) in unusable {
-        progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
+    let (mut progress, batch) = match work {
+        Work::List { jobs, unusable } => {
+            let mut progress = Progress::new(Some(jobs.len() + unusable.len()), style);
+            for (input, error) in unusable {
+                progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
+            }
+            (progress, Batch::new(jobs, model.into(), options))
+        }
+        Work::Watch(watch, idle) => {
+            let progress = Progress::new(None, style);
+            progress.say_watching(idle);
+            (progress, Batch::watching(watch, model.into(), options)?)
+        }
+    };
+    if usize::from(args.jobs) > rayon::current_num_threads() {
+        let threads = rayon::current_num_threads();
+        warn_line(&format!(
+            "demc: note: --jobs {}: one for each of the {threads} threads is used",
+            args.jobs
+        ));
     }
-    let batch = Batch::new(jobs, model.into(), options);
+    let batch = batch.at_once(args.jobs.into());
     let stopper = batch.stopper();
     stop::on_request(move || stopper.stop())?;
     let end = batch.run(|job, outcome| progress.report(job, outcome));
@@ -175,4 +218,64 @@ pub fn run(args: Args) -> Result<ExitCode> {
         End::Complete if failed > 0 => ExitCode::from(SOME_FAILED),
         End::Complete => ExitCode::SUCCESS,
     })
+}
+
+/// What there is to do.
+enum Work {
+    /// Files that are there, and inputs that name none.
+    List { jobs: Vec<Job>, unusable: Vec<(PathBuf, Error)> },
+    /// Files that are coming in, and for how many seconds none may before it ends.
+    Watch(Watch, Option<u32>),
+}
+
+impl Work {
+    fn of(args: &Args, search: &Search) -> Result<Self> {
+        let Inputs { files, unusable, .. } = inputs::expand(&args.inputs, search)?;
+        let files = match &args.frames {
+            Some(frames) => frames.pick(files)?,
+            None => files,
+        };
+        Ok(Self::List { jobs: denoise::plan_tree(files, &args.out)?, unusable })
+    }
+}
+
+/// A watch over the inputs, for files that are there and others that come.
+///
+/// # Errors
+/// Of what is there already, two results would have one path, or one that of its input; or a glob is malformed.
+fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
+    let (inputs, frames, out) = (args.inputs.clone(), args.frames.clone(), args.out.clone());
+    let is_wanted = move |input: &denoise::Input| frames.as_ref().is_none_or(|frames| frames.has(input));
+    let there = inputs::find(&inputs, &search)?.files;
+    denoise::plan_tree(there.into_iter().filter(&is_wanted), &out)?;
+    let mut prepared = BTreeSet::from([out.clone()]);
+    let look = move || {
+        let mut look = Look::default();
+        let found = match inputs::find(&inputs, &search) {
+            Ok(found) => found,
+            Err(error) => {
+                look.failures.push((PathBuf::new(), error));
+                return look;
+            }
+        };
+        look.failures = found.unusable;
+        let mut plan = Plan::new(&out);
+        for input in found.files.into_iter().filter(&is_wanted) {
+            let file = input.file.clone();
+            let placed = plan.place(input).and_then(|job| {
+                let folder = job.output.parent().unwrap_or(&out).to_owned();
+                if !prepared.contains(&folder) {
+                    prepare_folder(&folder)?;
+                    prepared.insert(folder);
+                }
+                Ok(job)
+            });
+            match placed {
+                Ok(job) => look.jobs.push(job),
+                Err(error) => look.failures.push((file, error)),
+            }
+        }
+        look
+    };
+    Ok(Watch::new(look, idle.map(|seconds| Duration::from_secs(seconds.into())), args.overwrite))
 }

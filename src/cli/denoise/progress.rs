@@ -27,7 +27,8 @@ pub struct Progress {
     bar: ProgressBar,
     style: Style,
     start: Instant,
-    total: usize,
+    /// Files there are; not known while they are coming in.
+    total: Option<usize>,
     done: usize,
     skipped: usize,
     failed: usize,
@@ -52,24 +53,47 @@ struct Details<'a> {
     view_layer: &'a str,
     width: usize,
     height: usize,
+    /// What the file holds of that view layer.
+    passes: &'a [String],
+    light_groups: &'a [String],
+    /// Samples of a pixel; null where the file does not tell.
+    samples: Option<u32>,
+    /// Whether Blender had denoised Combined, and its pass Noisy Image was taken.
+    was_denoised: bool,
     seconds: f64,
     non_finite: &'a std::collections::BTreeMap<String, usize>,
     notes: &'a [String],
 }
 
 impl Progress {
-    /// For a batch of `total` files. The bar shows on a terminal alone.
-    pub fn new(total: usize, style: Style) -> Self {
+    /// For a batch of `total` files, or of those that come in. The bar shows on a terminal alone.
+    pub fn new(total: Option<usize>, style: Style) -> Self {
         let target = match style {
             Style::Quiet => ProgressDrawTarget::hidden(),
             _ => ProgressDrawTarget::stderr(),
         };
-        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
-        bar.set_style(
-            ProgressStyle::with_template("{bar:30} {pos}/{len}  {elapsed} elapsed{prefix}  {msg}")
-                .expect("the template is valid"),
-        );
+        let bar = ProgressBar::with_draw_target(total.map(|total| total as u64), target);
+        let template = match total {
+            Some(_) => "{bar:30} {pos}/{len}  {elapsed} elapsed{prefix}  {msg}",
+            None => "{spinner} {pos} ended  {elapsed} elapsed  {msg}",
+        };
+        bar.set_style(ProgressStyle::with_template(template).expect("the template is valid"));
+        if total.is_none() {
+            bar.set_message("waiting for renders");
+            bar.enable_steady_tick(Duration::from_millis(250));
+        }
         Self { bar, style, start: Instant::now(), total, done: 0, skipped: 0, failed: 0 }
+    }
+
+    /// Says that files are waited for, and what ends that.
+    pub fn say_watching(&self, idle: Option<u32>) {
+        if self.style != Style::Plain {
+            return;
+        }
+        let end = idle.map_or("Ctrl-C ends it".into(), |seconds| {
+            format!("it ends when nothing new has come for {seconds} s, or on Ctrl-C")
+        });
+        self.bar.suspend(|| print_line(&format!("watching for renders; {end}")));
     }
 
     /// Prints what became of a file.
@@ -82,19 +106,37 @@ impl Progress {
         let count = self.done + self.skipped + self.failed;
         self.bar.set_message(job.input.file_name().unwrap_or_default().to_string_lossy().into_owned());
         self.bar.set_position(count as u64);
-        if let Some(speed) = self.speed() {
-            let left = Duration::from_secs_f64((self.total - count) as f64 / speed);
-            self.bar.set_prefix(format!(", {speed:.2} frames/s, {} left", HumanDuration(left)));
-        }
-        let (style, total) = (self.style, self.total);
+        let pace = self.pace(count);
+        self.bar.set_prefix(pace.clone());
+        // A terminal has it in its bar.
+        let pace = if self.bar.is_hidden() { pace } else { String::new() };
+        let place = match self.total {
+            Some(1) => String::new(),
+            Some(total) => format!("[{count}/{total}] "),
+            None => format!("[{count}] "),
+        };
+        let style = self.style;
         // Above the bar, where there is one.
         self.bar.suspend(|| match style {
             Style::Json => print_line(&json_line(job, outcome)),
-            Style::Plain => print_plain(job, outcome, count, total),
+            Style::Plain => print_plain(job, outcome, &place, &pace),
             Style::Quiet => {}
         });
         if let Outcome::Failed(error) = outcome {
             self.bar.suspend(|| warn_line(&format!("demc: {error}")));
+        }
+    }
+
+    /// How fast frames are denoised and when the last will be, as the end of a sentence; empty before there is a pace, and
+    /// after the last.
+    fn pace(&self, count: usize) -> String {
+        let left = self.total.map_or(0, |total| total - count);
+        match self.speed() {
+            Some(speed) if left > 0 => {
+                let time = HumanDuration(Duration::from_secs_f64(left as f64 / speed));
+                format!(", {speed:.2} frames/s, {time} left")
+            }
+            _ => String::new(),
         }
     }
 
@@ -106,8 +148,8 @@ impl Progress {
     /// Prints the totals; returns how many files failed.
     pub fn finish(self, stopped: bool) -> usize {
         self.bar.finish_and_clear();
-        let left = self.total - self.done - self.skipped - self.failed;
-        if self.style == Style::Plain && (self.total > 1 || stopped) {
+        let left = self.total.map_or(0, |total| total - self.done - self.skipped - self.failed);
+        if self.style == Style::Plain && (self.total != Some(1) || stopped) {
             let mut summary = format!("{} denoised", self.done);
             for (count, what) in [
                 (self.skipped, "already there (--overwrite does them again)"),
@@ -118,7 +160,8 @@ impl Progress {
                     summary += &format!(", {count} {what}");
                 }
             }
-            if let Some(speed) = self.speed() {
+            // Of a watch it would tell how fast frames come in.
+            if let (Some(speed), Some(_)) = (self.speed(), self.total) {
                 summary += &format!(" ({speed:.2} frames/s)");
             }
             print_line(&summary);
@@ -127,12 +170,11 @@ impl Progress {
     }
 }
 
-fn print_plain(job: &Job, outcome: &Outcome, count: usize, total: usize) {
-    let prefix = if total > 1 { format!("[{count}/{total}] ") } else { String::new() };
+fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
     match outcome {
         Outcome::Done(report) => {
             print_line(&format!(
-                "{prefix}{}  {}x{}  {:.2} s",
+                "{place}{}  {}x{}  {:.2} s{pace}",
                 job.output.display(),
                 report.width,
                 report.height,
@@ -150,7 +192,7 @@ fn print_plain(job: &Job, outcome: &Outcome, count: usize, total: usize) {
                 warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
-        Outcome::Skipped => print_line(&format!("{prefix}{}  is there already", job.output.display())),
+        Outcome::Skipped => print_line(&format!("{place}{}  is there already", job.output.display())),
         Outcome::Failed(_) => {}
     }
 }
@@ -170,6 +212,10 @@ fn json_line(job: &Job, outcome: &Outcome) -> String {
             view_layer: &r.view_layer,
             width: r.width,
             height: r.height,
+            passes: &r.passes,
+            light_groups: &r.light_groups,
+            samples: r.samples,
+            was_denoised: r.was_denoised,
             seconds: r.seconds,
             non_finite: &r.repaired,
             notes: &r.notes,

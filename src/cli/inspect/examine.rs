@@ -4,16 +4,15 @@ use std::{collections::HashSet, path::Path};
 
 use serde::Serialize;
 
-use super::grain::Grain;
 use crate::{
     Result,
-    frame::{Frame, Window},
+    frame::{Frame, SampleKind, Window},
+    lint::{self, About, Finding, Trace},
     models::{
         Denoiser,
         catalogue::{self, Family, Kind, METHODS},
     },
-    passes::{self, BLENDER, Layer, Mapping, POSITION_AOV, Pass},
-    planes::Planes,
+    passes::{self, BLENDER, Layer, Mapping, Pass},
 };
 
 /// What `inspect` says about one file.
@@ -25,10 +24,11 @@ pub struct FileReport {
     pub layout: &'static str,
     pub parts: Vec<PartReport>,
     pub layers: Vec<LayerReport>,
-    pub warnings: Vec<String>,
-    /// The noise of the first view layer that shows any.
+    /// What is wrong with the file, or with the shot that it belongs to.
+    pub findings: Vec<Finding>,
+    /// The first view layer with a beauty, to be held against that of the frame that follows.
     #[serde(skip)]
-    pub grain: Option<Grain>,
+    pub trace: Option<Trace>,
 }
 
 #[derive(Serialize)]
@@ -56,7 +56,8 @@ pub struct LayerReport {
     /// Channels that demc has no use for.
     pub unrecognised: Vec<String>,
     pub models: Vec<ModelReport>,
-    pub warnings: Vec<String>,
+    /// What ruins a denoise of this view layer, see [`crate::lint`].
+    pub findings: Vec<Finding>,
 }
 
 #[derive(Serialize)]
@@ -103,7 +104,10 @@ pub fn methods() -> Vec<Method> {
     listed.filter_map(method).collect()
 }
 
-/// Reads and decodes a whole file. Its noise is described if it `is_compared` with that of another.
+/// The model whose missing passes are a finding: the one that `demc denoise` uses unless told otherwise.
+const DEFAULT_MODEL: &str = "demc-m";
+
+/// Reads and decodes a whole file. It leaves a trace if it `is_compared` with another.
 pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
     let frame = Frame::read(path)?;
     let parts = frame.parts().iter().map(|p| PartReport {
@@ -123,54 +127,53 @@ pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: 
         layout: if frame.is_multi_part() { "multi-part" } else { "single-part" },
         parts: parts.collect(),
         layers: Vec::new(),
-        warnings: window_warnings(&frame),
-        grain: None,
+        findings: windows(&frame),
+        trace: None,
     };
-    report.warnings.extend(undecodable_warnings(&frame));
+    report.findings.extend(undecodable(&frame));
     let is_hidden = frame.parts().iter().any(|part| !part.deep && part.undecodable().is_some());
     if !is_hidden && !layers.iter().any(|l| l.passes.contains_key(&Pass::Combined)) {
-        report
-            .warnings
-            .push(format!("nothing to denoise: no Combined pass; {}", BLENDER.setting(Pass::Combined)));
+        let message = "nothing to denoise: no Combined pass";
+        report.findings.push(Finding::new("no-beauty", message, BLENDER.setting(Pass::Combined)));
     }
     for layer in &layers {
-        let (layer, grain) = examine_layer(&frame, layer, methods, is_compared)?;
+        let (layer, trace) = examine_layer(&frame, layer, methods, is_compared)?;
         report.layers.push(layer);
-        report.grain = report.grain.or(grain);
+        report.trace = report.trace.or(trace);
     }
     Ok(report)
 }
 
-fn window_warnings(frame: &Frame) -> Vec<String> {
+fn windows(frame: &Frame) -> Vec<Finding> {
     let display = frame.display_window();
     let mut differing: Vec<Window> =
         frame.parts().iter().map(|p| p.data_window).filter(|w| *w != display).collect();
     differing.dedup();
     let at = |w: Window| format!("{}x{} at {},{}", w.width, w.height, w.x, w.y);
     let warn = |w: Window| {
-        format!(
-            "data window {} is not the display window {}: a cropped or overscanned render; what is stored \
-             is what is denoised",
+        let message = format!(
+            "data window {} is not the display window {}: a cropped or overscanned render; what is stored is what is denoised",
             at(w),
             at(display)
-        )
+        );
+        Finding::new("data-window", message, "")
     };
     differing.into_iter().map(warn).collect()
 }
 
 /// What is listed but cannot be denoised, each kind once.
-fn undecodable_warnings(frame: &Frame) -> Vec<String> {
+fn undecodable(frame: &Frame) -> Vec<Finding> {
     let mut told = HashSet::new();
-    let mut warnings = Vec::new();
+    let mut findings = Vec::new();
     for part in frame.parts() {
         let Some(why) = part.undecodable().filter(|why| part.deep || told.insert(why.clone())) else {
             continue;
         };
         let what = part.name.as_ref().map_or("the file".into(), |name| format!("part '{name}'"));
         let why = if part.deep { "is deep: it is kept as it is, and not denoised".into() } else { why };
-        warnings.push(format!("{what} {why}"));
+        findings.push(Finding::new("undecodable", format!("{what} {why}"), ""));
     }
-    warnings
+    findings
 }
 
 fn examine_layer(
@@ -178,10 +181,10 @@ fn examine_layer(
     layer: &Layer,
     methods: &[Method],
     is_compared: bool,
-) -> Result<(LayerReport, Option<Grain>)> {
-    let mut grain = None;
+) -> Result<(LayerReport, Option<Trace>)> {
+    let mut trace = None;
     let mut passes = Vec::new();
-    let mut warnings = Vec::new();
+    let mut findings = Vec::new();
     let part_of = |pass: &Pass| &frame.parts()[layer.passes[pass].part];
     let (decodable, others): (Vec<Pass>, Vec<Pass>) =
         layer.passes.keys().partition(|pass| part_of(pass).undecodable().is_none());
@@ -198,32 +201,17 @@ fn examine_layer(
     };
     if !decodable.is_empty() {
         let set = passes::read_layer(frame, layer, &decodable)?;
-        grain = is_compared.then(|| Grain::of(&set)).flatten();
+        trace = (is_compared && set.get(Pass::Combined).is_some()).then(|| Trace::of(&set));
         for (pass, planes) in set.iter() {
-            let report = PassReport {
+            passes.push(PassReport {
                 non_finite: Some(planes.non_finite()),
                 all_zero: Some(planes.data.iter().all(|v| *v == 0.0)),
                 ..describe(pass)
-            };
-            warnings.extend(pass_warnings(pass, &report, planes));
-            passes.push(report);
+            });
         }
+        findings = lint::frame(&set, &about(frame, layer, methods));
     }
     passes.extend(others.into_iter().map(describe));
-    if layer.renderer.is_blender() && layer.passes.contains_key(&Pass::Position) && !layer.position_averaged {
-        warnings.push(format!(
-            "Position is Cycles' own pass, one sample a pixel: aliased, and wrong under depth of field and \
-             motion blur; a shader AOV named '{POSITION_AOV}' (blender_scripts/export_passes.py sets it up) \
-             is averaged over samples"
-        ));
-    }
-    if layer.passes.contains_key(&Pass::NoisyImage) {
-        warnings.push(
-            "Combined was already denoised by Blender; demc uses the Noisy Image pass instead (turn off \
-             Render Properties > Sampling > Render > Denoise to save the time)"
-                .into(),
-        );
-    }
     let has_beauty = decodable.contains(&Pass::Combined);
     let models = methods.iter().filter(|_| has_beauty).map(|m| ModelReport {
         model: m.name.clone(),
@@ -242,35 +230,27 @@ fn examine_layer(
         models: models.collect(),
         passes,
         unrecognised: layer.unrecognised.clone(),
-        warnings,
+        findings,
     };
-    Ok((report, grain))
+    Ok((report, trace))
 }
 
-fn pass_warnings(pass: Pass, report: &PassReport, planes: &Planes) -> Vec<String> {
-    let mut warnings = Vec::new();
-    if let Some(bad) = report.non_finite.filter(|bad| *bad > 0) {
-        warnings.push(format!(
-            "{pass}: {bad} of {} values are NaN or infinite; `demc denoise` works with values filled in from around them",
-            planes.data.len()
-        ));
+/// What the file says of a view layer's passes.
+fn about(frame: &Frame, layer: &Layer, methods: &[Method]) -> About {
+    let is_half = |pass: &Pass| {
+        let at = &layer.passes[pass];
+        frame.parts()[at.part].channels[at.channels[0]].kind == SampleKind::Half
+    };
+    let model = methods.iter().find(|method| method.name == DEFAULT_MODEL);
+    let needs = model.filter(|_| layer.passes.contains_key(&Pass::Combined));
+    let needs = needs.map_or(&[][..], |model| &model.passes);
+    About {
+        half: layer.passes.keys().copied().filter(is_half).collect(),
+        position_averaged: layer.position_averaged,
+        colour_space: ["colorInteropID", "oiio:ColorSpace"]
+            .iter()
+            .find_map(|name| frame.text_attribute(name)),
+        missing: needs.iter().copied().filter(|pass| !layer.passes.contains_key(pass)).collect(),
+        model: DEFAULT_MODEL.into(),
     }
-    // Other passes are rightly zero where a scene has no glass, no volume, no lamp in view.
-    let never_zero = [
-        Pass::Combined,
-        Pass::Normal,
-        Pass::Position,
-        Pass::DenoisingNormal,
-        Pass::DenoisingAlbedo,
-        Pass::NoisyImage,
-    ];
-    if report.all_zero == Some(true) && never_zero.contains(&pass) {
-        warnings.push(format!("{pass} is zero everywhere: an empty render, or a pass that was not written"));
-    }
-    let negative = planes.data.iter().filter(|v| **v < 0.0).count();
-    if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) {
-        warnings
-            .push(format!("{pass}: {negative} negative values, which no light makes; models read them as 0"));
-    }
-    warnings
 }

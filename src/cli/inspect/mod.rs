@@ -1,8 +1,7 @@
 //! `demc inspect FILE...`: what a file holds, which passes are recognised, what each model misses and
-//! how Blender turns it on, and what looks suspicious.
+//! how Blender turns it on, and what ruins a denoise, with what mends it.
 
 pub(super) mod examine;
-mod grain;
 mod print;
 
 use std::path::PathBuf;
@@ -11,21 +10,30 @@ use crate::cli::ExitCode;
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, inputs, print_line, sources::Names, warn_line};
-use crate::{Result, denoise, error::attempt};
-use grain::Grain;
+use super::{
+    SOME_FAILED,
+    inputs::{self, Search},
+    print_line,
+    sources::Names,
+    warn_line,
+};
+use crate::{Result, denoise, error::attempt, lint::Trace};
 
 /// Arguments of `demc inspect`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = "\
 Examples:
-  demc inspect renders/shot_0004spp.0001.exr")]
+  demc inspect renders/shot_0004spp.0001.exr
+  demc inspect renders --json")]
 pub struct Args {
     /// EXR files, directories of them, or quoted globs
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     #[command(flatten)]
     names: Names,
+    /// Search directories with all that are in them
+    #[arg(long)]
+    recursive: bool,
     /// Print one JSON object per file, one a line
     #[arg(long)]
     json: bool,
@@ -38,21 +46,21 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let methods = examine::methods();
     let mapping = args.names.mapping()?;
-    let inputs = inputs::expand(&args.files)?;
+    let inputs = inputs::expand(&args.files, &Search { recursive: args.recursive, except: None })?;
     let mut failed = !inputs.unusable.is_empty();
     inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
     // The frame before, while files are frames of one sequence in order.
-    let mut before: Option<(PathBuf, Grain)> = None;
+    let mut before: Option<(PathBuf, Trace)> = None;
     let is_compared = inputs.files.len() > 1;
-    for path in inputs.files {
+    for path in inputs.paths() {
         let mut examined = attempt(&path, || examine::examine(&path, &methods, &mapping, is_compared));
         let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
         if let Ok(report) = &mut examined {
-            let grain = report.grain.take();
-            if let (Some(grain), Some((earlier, of_earlier))) = (&grain, &of_before) {
-                report.warnings.extend(grain.warning(of_earlier, &earlier.display().to_string()));
+            let trace = report.trace.take();
+            if let (Some(trace), Some((earlier, of_earlier))) = (&trace, &of_before) {
+                report.findings.extend(trace.after(of_earlier, &earlier.display().to_string()));
             }
-            before = grain.map(|grain| (path, grain));
+            before = trace.map(|trace| (path, trace));
         }
         match examined {
             Ok(report) if args.json => {

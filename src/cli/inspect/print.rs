@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use super::examine::{FileReport, LayerReport, Missing};
+use crate::lint::Finding;
 
 /// The whole report; the caller ends the last line.
 pub fn text(report: &FileReport) -> String {
@@ -36,7 +37,7 @@ fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
         report.layout,
         kinds.join(" and ")
     )?;
-    write_warnings(out, "  ", &report.warnings)?;
+    write_findings(out, "  ", &report.findings)?;
     report.layers.iter().try_for_each(|layer| write_layer(out, layer))
 }
 
@@ -69,7 +70,7 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
         writeln!(out, "    kept, not read: {}", others.join(", "))?;
     }
     write_models(out, layer)?;
-    write_warnings(out, "    ", &layer.warnings)
+    write_findings(out, "    ", &layer.findings)
 }
 
 /// Models that are ready in one line, then what each of the others misses, those alike together.
@@ -98,8 +99,11 @@ fn write_models(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
     Ok(())
 }
 
-fn write_warnings(out: &mut String, indent: &str, warnings: &[String]) -> std::fmt::Result {
-    warnings.iter().try_for_each(|w| writeln!(out, "{indent}warning: {w}"))
+fn write_findings(out: &mut String, indent: &str, findings: &[Finding]) -> std::fmt::Result {
+    findings.iter().try_for_each(|Finding { code, message, remedy }| {
+        let remedy = if remedy.is_empty() { String::new() } else { format!("; {remedy}") };
+        writeln!(out, "{indent}warning ({code}): {message}{remedy}")
+    })
 }
 
 fn size(bytes: u64) -> String {

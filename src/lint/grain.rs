@@ -3,6 +3,7 @@
 //!
 //! In: passes of consecutive frames. Out: a warning that names the setting.
 
+use super::Finding;
 use crate::{
     passes::{Pass, PassSet},
     planes::Planes,
@@ -83,12 +84,16 @@ impl Grain {
     }
 
     /// What is to be said of a frame whose grain is `other`'s, the frame before it of the name given.
-    pub fn warning(&self, other: &Self, before: &str) -> Option<String> {
+    pub fn warning(&self, other: &Self, before: &str) -> Option<Finding> {
         let shared = self.shared(other).filter(|shared| *shared > SHARED)?;
-        Some(format!(
-            "its noise is that of {before} ({:.0}% the same, at the same places of the screen): frames cannot clean each other. \
-             In Blender, press the clock beside Render Properties > Sampling > Advanced > Seed (Use Animated Seed)",
-            100.0 * shared
+        Some(Finding::new(
+            "shared-noise",
+            format!(
+                "its noise is that of {before} ({:.0}% the same, at the same places of the screen): frames cannot clean each \
+                 other",
+                100.0 * shared
+            ),
+            "press the clock beside Render Properties > Sampling > Advanced > Seed (Use Animated Seed)",
         ))
     }
 }
@@ -111,7 +116,7 @@ mod tests {
     #[test]
     fn noise_that_sticks_to_the_screen_is_found() {
         let warning = grain(1, 1.0).warning(&grain(1, 0.8), "shot.0001.exr").unwrap();
-        assert!(warning.contains("shot.0001.exr") && warning.contains("Seed"), "{warning}");
+        assert!(warning.message.contains("shot.0001.exr") && warning.remedy.contains("Seed"), "{warning:?}");
         assert_eq!(grain(1, 1.0).warning(&grain(2, 1.0), "shot.0001.exr"), None);
         assert_eq!(grain(1, 0.01).warning(&grain(1, 0.01), "shot.0001.exr"), None, "too little to tell");
     }

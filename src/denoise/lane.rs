@@ -1,0 +1,218 @@
+//! A lane of a batch: one frame is denoised in it at a time, while the next is read and the last is written. A batch has one
+//! lane for each frame that it denoises at once, with threads of its own to compute with.
+
+use std::{
+    path::Path,
+    sync::{
+        Arc, PoisonError,
+        mpsc::{Receiver, Sender, SyncSender, sync_channel},
+    },
+    thread,
+};
+
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
+use super::{
+    Job, Views,
+    batch::{Message, Outcome, Shared, Work},
+    job::{self, Denoised},
+    sequence::Stretch,
+    window::Window,
+};
+use crate::{Error, Result, error::attempt, frame::Frame, shot::Shot};
+
+/// What the stages of a lane have.
+#[derive(Clone)]
+pub struct Lane {
+    shared: Arc<Shared>,
+    /// How many lanes there are.
+    lanes: usize,
+    /// Its threads; without, all that there are.
+    pool: Option<Arc<ThreadPool>>,
+    ended: Sender<Message>,
+}
+
+/// What the reading stage has for the one that denoises.
+enum Loaded {
+    /// What was read of a frame that is denoised by itself.
+    Frame(Job, Result<Views<Shot>>),
+    /// A stretch of a sequence begins: forget the one before.
+    Begin,
+    /// What was read of a frame of the sequence, by its number, and whether it is to be denoised.
+    Neighbour { number: i64, loaded: Result<Views<Shot>>, is_written: bool },
+    /// All that lies around a frame has been read.
+    Complete { job: Job, number: i64 },
+}
+
+/// Says that a lane has ended when it is dropped, whatever its stages came to.
+struct SaysEnd(Sender<Message>);
+
+impl Drop for SaysEnd {
+    fn drop(&mut self) {
+        let _ = self.0.send(Message::LaneEnded);
+    }
+}
+
+impl Lane {
+    /// Starts the lane of that number out of so many.
+    pub fn start(shared: &Arc<Shared>, (lane, lanes): (usize, usize), ended: &Sender<Message>) {
+        let threads = rayon::current_num_threads();
+        let own = threads / lanes + usize::from(lane < threads % lanes);
+        let pool = (lanes > 1).then(|| ThreadPoolBuilder::new().num_threads(own).build());
+        let pool = pool.map(|pool| Arc::new(pool.expect("the system has room for the threads of a lane")));
+        let lane = Self { shared: Arc::clone(shared), lanes, pool, ended: ended.clone() };
+        // Rendezvous channels: a stage holds its frame until the next one is free to take it.
+        let (to_denoise, loaded) = sync_channel(0);
+        let (to_store, denoised) = sync_channel(0);
+        lane.spawn("read", move |lane| {
+            let _ = lane.load_all(&to_denoise);
+        });
+        lane.spawn("denoise", move |lane| lane.denoise_all(&loaded, &to_store));
+        let says_end = SaysEnd(ended.clone());
+        lane.spawn("write", move |lane| {
+            lane.store_all(&denoised);
+            // The last to end: the channels before it are closed.
+            drop(says_end);
+        });
+    }
+
+    fn spawn(&self, name: &str, stage: impl FnOnce(&Self) + Send + 'static) {
+        let lane = self.clone();
+        thread::Builder::new()
+            .name(name.into())
+            .spawn(move || stage(&lane))
+            .expect("the system has room for three threads a lane");
+    }
+
+    /// Computes on the lane's threads.
+    fn on_own_threads<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        match &self.pool {
+            Some(pool) => pool.install(work),
+            None => work(),
+        }
+    }
+
+    fn end(&self, job: Job, outcome: Outcome) -> Option<()> {
+        self.ended.send(Message::Ended(job, Box::new(outcome))).ok()
+    }
+
+    /// Reads what the lane is given; none when there is no next stage.
+    fn load_all(&self, next: &SyncSender<Loaded>) -> Option<()> {
+        while let Some(work) = self.shared.next(self.lanes, &self.ended) {
+            match work {
+                Work::Frame(job) => {
+                    let Some(read) = self.read_new(&job) else { continue };
+                    let loaded = self.take_apart(&job.input, read);
+                    next.send(Loaded::Frame(job, loaded)).ok()?;
+                }
+                Work::Stretch(stretch) => self.load_stretch(stretch, next)?,
+            }
+        }
+        Some(())
+    }
+
+    /// Reads a job's file; none where its result is there, or it is not whole yet.
+    fn read_new(&self, job: &Job) -> Option<Result<Frame>> {
+        if self.shared.take_up_existing(job, &self.ended) { None } else { self.shared.read(&job.input) }
+    }
+
+    /// The passes that are needed of what was read of a file.
+    fn take_apart(&self, input: &Path, read: Result<Frame>) -> Result<Views<Shot>> {
+        let Shared { model, options, .. } = &*self.shared;
+        let frame = read?;
+        attempt(input, || self.on_own_threads(|| job::take_apart(frame, &**model, options)))
+    }
+
+    /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when there is no next
+    /// stage.
+    fn load_stretch(&self, stretch: Stretch, next: &SyncSender<Loaded>) -> Option<()> {
+        let load = |file: &Path| self.take_apart(file, attempt(file, || Frame::read(file)));
+        let Stretch { files, jobs, is_numbered } = stretch;
+        if !is_numbered {
+            for (job, _) in jobs {
+                let mut frame = load(&job.input);
+                if let Ok(frame) = &mut frame {
+                    frame.say("its name ends in no frame number; denoised alone");
+                }
+                next.send(Loaded::Frame(job, frame)).ok()?;
+            }
+            return Some(());
+        }
+        next.send(Loaded::Begin).ok()?;
+        let reach = self.reach() as i64;
+        let written: Vec<i64> = jobs.iter().map(|(_, number)| *number).collect();
+        let mut unread = i64::MIN;
+        for (job, number) in jobs {
+            let (first, last) = (number.saturating_sub(reach), number.saturating_add(reach));
+            for (&number, file) in files.range(first.max(unread)..=last) {
+                let is_written = written.contains(&number);
+                next.send(Loaded::Neighbour { number, loaded: load(file), is_written }).ok()?;
+            }
+            unread = last.saturating_add(1);
+            next.send(Loaded::Complete { job, number }).ok()?;
+        }
+        Some(())
+    }
+
+    /// Frames that are taken before and after one.
+    fn reach(&self) -> usize {
+        self.shared.options.temporal.unwrap_or_default()
+    }
+
+    fn denoise_all(&self, frames: &Receiver<Loaded>, next: &SyncSender<(Job, Views<Denoised>)>) {
+        let Shared { model, options, .. } = &*self.shared;
+        let (model, reach) = (&**model, self.reach());
+        let mut window = Window::new(reach);
+        for loaded in frames {
+            let (job, denoised) = match loaded {
+                Loaded::Frame(job, frame) => {
+                    let denoise = |frame| {
+                        attempt(&job.input, || self.on_own_threads(|| job::denoise(frame, model, options)))
+                    };
+                    let denoised = frame.and_then(denoise);
+                    (job, denoised)
+                }
+                Loaded::Begin => {
+                    window = Window::new(reach);
+                    continue;
+                }
+                Loaded::Neighbour { number, loaded, is_written } => {
+                    window.leave(number.saturating_sub(2 * reach as i64));
+                    self.on_own_threads(|| window.enter(number, loaded, is_written, model));
+                    continue;
+                }
+                Loaded::Complete { job, number } => {
+                    let window = &mut window;
+                    let denoised = attempt(&job.input, || {
+                        self.on_own_threads(|| window.denoise(number, model, options))
+                    });
+                    (job, denoised)
+                }
+            };
+            let sent = match denoised {
+                Ok(frame) => next.send((job, frame)).ok(),
+                Err(error) => self.end(job, Outcome::Failed(error)),
+            };
+            if sent.is_none() {
+                return;
+            }
+        }
+    }
+
+    fn store_all(&self, frames: &Receiver<(Job, Views<Denoised>)>) {
+        let options = &self.shared.options;
+        for (job, denoised) in frames {
+            let stored = {
+                let _writing = self.shared.writing.read().unwrap_or_else(PoisonError::into_inner);
+                attempt(&job.input, || {
+                    let (frame, report) =
+                        self.on_own_threads(|| job::insert(denoised, &job.output, options))?;
+                    frame.write(&job.output)?;
+                    Ok::<_, Error>(report)
+                })
+            };
+            let outcome = stored.map_or_else(Outcome::Failed, Outcome::Done);
+            let _ = self.end(job, outcome);
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! Where the result of each input is written: under the input's own name, and below `--out` as the input lies below the
+//! folder that was named.
+//!
+//! In: inputs. Out: jobs of which no two write one file, and none its own input.
+
+use std::{
+    collections::HashMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use super::Job;
+use crate::{Error, Result};
+
+/// A file to denoise.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Input {
+    /// The file.
+    pub file: PathBuf,
+    /// The folders that lead to it from the folder that was named: empty where that holds the file itself.
+    pub below: PathBuf,
+}
+
+/// The jobs that write each file's result into a folder, under the file's own name.
+///
+/// # Errors
+/// Two results would have one path, or one that of its input.
+pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
+    plan_tree(files.into_iter().map(|file| Input { file, below: PathBuf::new() }), out)
+}
+
+/// As [`plan`], and the folders below the one that was named are kept.
+///
+/// # Errors
+/// As [`plan`].
+pub fn plan_tree(inputs: impl IntoIterator<Item = Input>, out: &Path) -> Result<Vec<Job>> {
+    let mut plan = Plan::new(out);
+    inputs.into_iter().map(|input| plan.place(input)).collect()
+}
+
+/// The results that have a place so far.
+pub struct Plan {
+    out: PathBuf,
+    /// The input of each result.
+    placed: HashMap<PathBuf, PathBuf>,
+}
+
+impl Plan {
+    /// No results in a folder.
+    pub fn new(out: &Path) -> Self {
+        Self { out: out.into(), placed: HashMap::new() }
+    }
+
+    /// The job that writes a file's result.
+    ///
+    /// # Errors
+    /// The result of another file, or a file that is read, has that place.
+    pub fn place(&mut self, Input { file: input, below }: Input) -> Result<Job> {
+        let Some(name) = input.file_name() else {
+            return Err(Error::Usage(format!("{}: names no file", input.display())));
+        };
+        let output = self.out.join(below).join(name);
+        if let Some(other) = self.placed.insert(output.clone(), input.clone()) {
+            return Err(Error::Usage(format!(
+                "{} and {} would both be written to {}; give each its own --out, or name the folder that holds both and \
+                 add --recursive",
+                other.display(),
+                input.display(),
+                output.display()
+            )));
+        }
+        if is_same_file(&input, &output) {
+            return Err(Error::Usage(format!(
+                "{}: the result would overwrite its input; choose another --out",
+                input.display()
+            )));
+        }
+        Ok(Job { input, output })
+    }
+}
+
+/// Whether two paths lead to one file: folders may be mounted twice, so that where they are on the disk decides.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let place = |path| fs::metadata(path).map(|file| (file.dev(), file.ino()));
+        matches!((place(a), place(b)), (Ok(a), Ok(b)) if a == b)
+    }
+    #[cfg(not(unix))]
+    {
+        matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b)
+    }
+}

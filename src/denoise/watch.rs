@@ -1,0 +1,285 @@
+//! Files that a renderer is still writing: each is taken when it is whole.
+//!
+//! A file is whole when its size and its time of change stayed the same from one look to the next, and it then reads as a
+//! complete EXR: its offset table is filled in, which OpenEXR does last, and every block of pixels that the table tells of
+//! ends within the file. A file that does not read so far waits for its next change. Folders are looked through again and
+//! again, since no message of a change comes from a disk of another machine.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    fs,
+    path::{Path, PathBuf},
+    sync::{Mutex, MutexGuard, PoisonError},
+    thread,
+    time::{Duration, Instant, SystemTime},
+};
+
+use super::Job;
+use crate::{Error, frame::Frame};
+
+/// Time from one look to the next, at least.
+const INTERVAL: Duration = Duration::from_secs(1);
+
+/// Looking takes at most this share of the time: a large folder on a slow disk is looked through less often.
+const LOOKING: u32 = 10;
+
+/// A file that did not read as a whole one is tried again after this time even if it shows no change: on some disks the time
+/// of change counts in steps of two seconds, which hide the last write.
+const RETRY: Duration = Duration::from_secs(10);
+
+/// What lies there at one look.
+#[derive(Default)]
+pub struct Look {
+    /// What there is to do, finished or not.
+    pub jobs: Vec<Job>,
+    /// What cannot be done, by the input, with the reason; each is told once.
+    pub failures: Vec<(PathBuf, Error)>,
+}
+
+/// Looks for files until none has come for a while.
+pub struct Watch {
+    look: Mutex<Box<dyn FnMut() -> Look + Send>>,
+    /// It ends when nothing was new for so long; never without.
+    idle: Option<Duration>,
+    /// Whether a file that was taken is taken again when it has changed.
+    again: bool,
+    state: Mutex<State>,
+}
+
+struct State {
+    files: BTreeMap<PathBuf, File>,
+    ready: VecDeque<Job>,
+    /// Failures that were told, and those that are to be.
+    told: Vec<PathBuf>,
+    failures: Vec<(PathBuf, Error)>,
+    /// When a file was last new or had changed.
+    changed: Instant,
+}
+
+struct File {
+    job: Job,
+    /// None where there is no such file yet.
+    stamp: Option<Stamp>,
+    status: Status,
+}
+
+/// What changes when a file is written.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Stamp {
+    bytes: u64,
+    modified: Option<SystemTime>,
+}
+
+enum Status {
+    /// It may still be written.
+    Coming,
+    /// It was taken.
+    Taken,
+    /// It was taken and did not read as a whole file.
+    Broken(Error, Instant),
+}
+
+/// What a watch has next.
+pub(super) enum Next {
+    /// A file that stayed the same since the last look.
+    Job(Job),
+    /// What cannot be done.
+    Failure(PathBuf, Error),
+    /// Nothing was new for the time given.
+    End,
+}
+
+impl Watch {
+    /// Looks with `look` for files, and ends when none was new for the time `idle`; without that, never. A file that was
+    /// taken is taken `again` when it has changed, as one that was rendered again.
+    pub fn new(look: impl FnMut() -> Look + Send + 'static, idle: Option<Duration>, again: bool) -> Self {
+        let (files, ready, told, failures) = Default::default();
+        let state = Mutex::new(State { files, ready, told, failures, changed: Instant::now() });
+        Self { look: Mutex::new(Box::new(look)), idle, again, state }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The next file that is likely to be whole; waits for it, as long as it is not told to stop.
+    pub(super) fn next(&self, is_stopped: impl Fn() -> bool) -> Next {
+        let mut look = self.look.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pause = Duration::ZERO;
+        loop {
+            {
+                let mut state = self.state();
+                if let Some((path, error)) = state.failures.pop() {
+                    return Next::Failure(path, error);
+                }
+                if let Some(job) = state.ready.pop_front() {
+                    return Next::Job(job);
+                }
+            }
+            if !pause.is_zero() && !wait(pause, &is_stopped) {
+                return Next::End;
+            }
+            let start = Instant::now();
+            let found = look();
+            let mut state = self.state();
+            state.take_in(found, self.again);
+            pause = INTERVAL.max(LOOKING * start.elapsed());
+            let is_idle = self.idle.is_some_and(|idle| state.changed.elapsed() >= idle);
+            if is_idle && state.ready.is_empty() && state.failures.is_empty() {
+                return Next::End;
+            }
+        }
+    }
+
+    /// Takes back a file that did not read as a whole one.
+    pub(super) fn put_back(&self, input: &Path, error: Error) {
+        if let Some(file) = self.state().files.get_mut(input) {
+            file.status = Status::Broken(error, Instant::now());
+        }
+    }
+
+    /// The files that never became whole, each with what it lacks.
+    pub(super) fn leftovers(&self) -> Vec<(Job, Error)> {
+        let files = std::mem::take(&mut self.state().files).into_values();
+        let unfinished = |file: File| match file.status {
+            Status::Taken => None,
+            Status::Broken(error, _) => Some((file.job, error)),
+            Status::Coming => Frame::read(&file.job.input).err().map(|error| (file.job, error)),
+        };
+        files.filter_map(unfinished).collect()
+    }
+}
+
+impl State {
+    fn take_in(&mut self, found: Look, again: bool) {
+        for (path, error) in found.failures {
+            if !self.told.contains(&path) {
+                self.told.push(path.clone());
+                self.failures.push((path, error));
+            }
+        }
+        let mut before = std::mem::take(&mut self.files);
+        for job in found.jobs {
+            let stamp = Stamp::of(&job.input);
+            let mut file = before.remove(&job.input).unwrap_or_else(|| {
+                self.changed = Instant::now();
+                File { job: job.clone(), stamp: None, status: Status::Coming }
+            });
+            let is_same = file.stamp == stamp;
+            match file.status {
+                Status::Taken if is_same || !again => {}
+                _ if !is_same => {
+                    self.changed = Instant::now();
+                    (file.stamp, file.status) = (stamp, Status::Coming);
+                }
+                Status::Broken(_, tried) if tried.elapsed() < RETRY => {}
+                // Blender makes empty files to say that a frame is being rendered.
+                _ if stamp.is_some_and(|stamp| stamp.bytes > 0) => {
+                    file.status = Status::Taken;
+                    self.ready.push_back(job);
+                }
+                _ => {}
+            }
+            self.files.insert(file.job.input.clone(), file);
+        }
+    }
+}
+
+impl Stamp {
+    fn of(path: &Path) -> Option<Self> {
+        let file = fs::metadata(path).ok()?;
+        Some(Self { bytes: file.len(), modified: file.modified().ok() })
+    }
+}
+
+/// Waits; false when told to stop in between.
+fn wait(time: Duration, is_stopped: &impl Fn() -> bool) -> bool {
+    const STEP: Duration = Duration::from_millis(50);
+    let start = Instant::now();
+    while start.elapsed() < time {
+        if is_stopped() {
+            return false;
+        }
+        thread::sleep(STEP.min(time));
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+
+    /// A folder of one file that is not there yet, and what a watch over it says.
+    struct Scene {
+        folder: tempfile::TempDir,
+        watch: Arc<Watch>,
+    }
+
+    impl Scene {
+        fn new(again: bool) -> Self {
+            let folder = tempfile::tempdir().unwrap();
+            let job = Job { input: folder.path().join("a.exr"), output: PathBuf::new() };
+            let look = move || Look { jobs: vec![job.clone()], failures: Vec::new() };
+            let watch = Arc::new(Watch::new(look, Some(Duration::from_millis(2500)), again));
+            Self { folder, watch }
+        }
+
+        fn write(&self, bytes: &[u8]) {
+            fs::write(self.folder.path().join("a.exr"), bytes).unwrap();
+        }
+
+        fn is_taken(&self) -> bool {
+            matches!(self.watch.next(|| false), Next::Job(_))
+        }
+    }
+
+    #[test]
+    fn a_file_is_taken_when_it_stayed_the_same_and_again_when_it_changed() {
+        let scene = Scene::new(true);
+        scene.write(b"a");
+        assert!(scene.is_taken());
+        scene.write(b"ab");
+        assert!(scene.is_taken());
+        assert!(!scene.is_taken(), "nothing is new");
+        let once = Scene::new(false);
+        once.write(b"a");
+        assert!(once.is_taken());
+        once.write(b"ab");
+        assert!(!once.is_taken(), "what was taken stays taken");
+    }
+
+    #[test]
+    fn a_file_that_did_not_read_whole_waits_for_its_next_change() {
+        let scene = Scene::new(false);
+        scene.write(b"a");
+        assert!(scene.is_taken());
+        let broken = || Error::invalid("a.exr", "is truncated");
+        scene.watch.put_back(&scene.folder.path().join("a.exr"), broken());
+        scene.write(b"abc");
+        assert!(scene.is_taken());
+        scene.watch.put_back(&scene.folder.path().join("a.exr"), broken());
+        assert!(!scene.is_taken());
+        let [(job, error)] = &scene.watch.leftovers()[..] else { panic!() };
+        assert!(job.input.ends_with("a.exr") && error.to_string().contains("truncated"), "{error}");
+    }
+
+    #[test]
+    fn empty_and_missing_files_are_waited_for_and_told_of_in_the_end() {
+        let scene = Scene::new(false);
+        assert!(!scene.is_taken());
+        assert!(scene.watch.leftovers()[0].1.to_string().contains("cannot read"));
+        let scene = Scene::new(false);
+        scene.write(b"");
+        assert!(!scene.is_taken());
+        assert!(scene.watch.leftovers()[0].1.to_string().contains("is empty"));
+    }
+
+    #[test]
+    fn a_failure_is_told_once() {
+        let look = || Look { jobs: Vec::new(), failures: vec![("a".into(), Error::Usage("no".into()))] };
+        let watch = Watch::new(look, Some(INTERVAL), false);
+        assert!(matches!(watch.next(|| false), Next::Failure(path, _) if path.ends_with("a")));
+        assert!(matches!(watch.next(|| false), Next::End));
+    }
+}

@@ -1,0 +1,266 @@
+//! What edges of the guides tell: how wide the pixel filter is, whether the beauty is blurred where they are sharp, and whether
+//! its steps are as large as those of the albedo.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+
+use super::{
+    Finding,
+    light::{logarithms, median, quantile, sums},
+    render,
+    values::LINEAR,
+};
+use crate::{
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// Edges that are needed to judge by.
+const EDGES: usize = 100;
+
+/// Pixels on a side of the squares that edges are judged in: one long edge must not decide alone, as it lies on the grid of
+/// pixels in one way, and has one light.
+const SQUARE: usize = 16;
+
+/// Edges that a square needs.
+const EDGES_OF_SQUARE: usize = 8;
+
+/// What is found at pixels, by square.
+fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Vec<Vec<T>> {
+    let mut squares: BTreeMap<(usize, usize), Vec<T>> = BTreeMap::new();
+    for (place, value) in found {
+        squares.entry((place / width / SQUARE, place % width / SQUARE)).or_default().push(value);
+    }
+    squares.into_values().filter(|square| square.len() >= EDGES_OF_SQUARE).collect()
+}
+
+pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
+    let (Some(albedo), Some(normal), Some(render)) =
+        (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal), render(set))
+    else {
+        return;
+    };
+    soft(&[albedo, normal], findings);
+    let light = sums(render);
+    let logs = logarithms(&light, 0.02);
+    blurred(set, (albedo, normal), &logs, findings);
+    encoded(set, (albedo, normal), &light, findings);
+}
+
+/// The way along rows or down columns: how far apart pixels are, and how many there are in a line and lines.
+#[derive(Clone, Copy)]
+struct Way {
+    step: usize,
+    length: usize,
+    line: usize,
+    lines: usize,
+}
+
+impl Way {
+    fn both(width: usize, height: usize) -> [Self; 2] {
+        [
+            Self { step: 1, length: width, line: width, lines: height },
+            Self { step: width, length: height, line: 1, lines: width },
+        ]
+    }
+
+    /// What is found at pixels that are `margin` away from the ends of their lines, given their index.
+    fn find<T: Send>(self, margin: usize, find: impl Fn(usize) -> Option<T> + Sync) -> Vec<T> {
+        let find = &find;
+        let line = |line: usize| {
+            let places = margin..self.length.saturating_sub(margin);
+            places.filter_map(move |at| find(line * self.line + at * self.step))
+        };
+        (0..self.lines).into_par_iter().flat_map_iter(line).collect()
+    }
+
+    /// The pixel so many steps away.
+    fn at(self, place: usize, steps: isize) -> usize {
+        place.wrapping_add_signed(steps * self.step.cast_signed())
+    }
+}
+
+/// Steps of a guide that are smaller are not looked at.
+const STEP: f32 = 0.15;
+
+/// Squares that are needed to judge softness by.
+const SOFT_SQUARES: usize = 12;
+
+/// The sharpest quarter of the steps between plain sides has more than this share between two pixels, since a pixel edge cuts
+/// most of a filter in two: 0.62 to 1 in sound renders, 0.73 with a filter of 3 pixels, 0.50 to 0.53 of 6. In most of the
+/// squares the middle one must be below as well (0.5 of 6 pixels).
+const SHARP: f32 = 0.56;
+
+/// Soft guides: a filter that is wide, though its noise is independent, as that of Cycles is.
+fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
+    // Differences of pixels on each side of the largest that belong to the step, and of those beyond, which are plain.
+    const REACH: isize = 3;
+    let mut shares = Vec::new();
+    for planes in guides {
+        for way in Way::both(planes.width, planes.height) {
+            for c in 0..planes.channels {
+                let plane = planes.channel(c);
+                shares.extend(way.find(REACH as usize + 2, |place| {
+                    let difference = |n: isize| plane[way.at(place, n + 1)] - plane[way.at(place, n)];
+                    let own = difference(0).abs();
+                    if own < STEP / 4.0 {
+                        return None;
+                    }
+                    let whole: f32 = (-REACH..=REACH).map(difference).sum::<f32>().abs();
+                    let ways: f32 = (-REACH..=REACH).map(|n| difference(n).abs()).sum();
+                    let beyond =
+                        [-REACH - 1, REACH + 1].map(|n| difference(n).abs()).into_iter().fold(0.0, f32::max);
+                    let is_largest = (-REACH..=REACH).all(|n| difference(n).abs() <= own);
+                    let is_step = whole > STEP && ways < 1.1 * whole && beyond < 0.02 * whole && is_largest;
+                    is_step.then(|| (place, own / whole))
+                }));
+            }
+        }
+    }
+    let width = guides.first().map_or(1, |planes| planes.width);
+    let mut all: Vec<f32> = shares.iter().map(|(_, share)| *share).collect();
+    if quantile(&mut all, 0.75).is_none_or(|share| share > SHARP) {
+        return;
+    }
+    let mut squares: Vec<f32> =
+        by_square(width, shares).into_iter().filter_map(|mut square| median(&mut square)).collect();
+    if squares.len() < SOFT_SQUARES || quantile(&mut squares, 0.75).is_none_or(|share| share > SHARP) {
+        return;
+    }
+    findings.push(Finding::new(
+        "wide-filter",
+        "no edge of the guides is sharp: the pixel filter is wider than 3 pixels, and what it blurred stays blurred",
+        "set Render Properties > Film > Pixel Filter > Width to 1.5 px (the default)",
+    ));
+}
+
+/// A step of the guides that has plain sides of nine pixels: the pixel in its middle.
+fn is_edge((albedo, normal): (&Planes, &Planes), way: Way, place: usize) -> bool {
+    let planes = || (0..3).flat_map(|c| [(albedo.channel(c), 4.0), (normal.channel(c), 1.0)]);
+    let value = |plane: &[f32], most: f32, n: isize| plane[way.at(place, n)].min(most);
+    let is_step = planes().any(|(plane, most)| (value(plane, most, 2) - value(plane, most, -2)).abs() > 0.3);
+    is_step
+        && planes().all(|(plane, most)| {
+            [1, -1].into_iter().all(|side| {
+                let near = value(plane, most, 2 * side);
+                [3, 5, 7, 9].into_iter().all(|n| (value(plane, most, n * side) - near).abs() < 0.05)
+            })
+        })
+}
+
+/// Of the light's step across edges, the share that is there within 3 pixels on both sides: of all edges together 0.67 to 1.1
+/// in sound renders of 320x180 pixels and more, after a blur of 9 pixels across the edges 0.34 to 0.58, of 13 below 0.42.
+const NEAR: f64 = 0.6;
+
+/// Squares that are needed to judge a blur by.
+const BLURRED_SQUARES: usize = 8;
+
+/// The same share in three of four squares: 0.86 and more in sound renders, after the blur of 9 pixels 0.5 to 0.77, of 13 0.35
+/// to 0.58.
+const NEAR_IN_SQUARES: f32 = 0.65;
+
+/// A root mean square of the step, as a logarithm, below which light hides the edges.
+const LIGHT_STEP: f64 = 0.3;
+
+/// Motion from which on edges are also judged by themselves, in pixels a frame.
+const MOTION: f32 = 4.0;
+
+/// Steps of the light across an edge of the guides, as logarithms: near it, at two distances from it; and whether it moves.
+type Step = (f64, f64, f64, bool);
+
+/// A beauty that is blurred where the guides are sharp.
+fn blurred(set: &PassSet, guides: (&Planes, &Planes), logs: &[f32], findings: &mut Vec<Finding>) {
+    let vectors = set.get(Pass::Vector);
+    for (direction, way) in Way::both(set.width, set.height).into_iter().enumerate() {
+        let steps = way.find(9, |place| {
+            is_edge(guides, way, place).then(|| {
+                let mean = |places: [isize; 2]| {
+                    places.iter().map(|n| f64::from(logs[way.at(place, *n)])).sum::<f64>() / 2.0
+                };
+                let step = |a: isize, b: isize| mean([a, b]) - mean([-a, -b]);
+                let motion = vectors.map_or(0.0, |v| v.channel(direction)[place].abs());
+                // Pixels of their own each, so that noise adds nothing to products on average.
+                (place, (step(2, 3), step(6, 8), step(7, 9), motion >= MOTION))
+            })
+        });
+        for moving in [false, true] {
+            let chosen: Vec<_> = steps.iter().filter(|(_, step)| !moving || step.3).copied().collect();
+            let far = |(_, a, b, _): &Step| a * b;
+            let near = |(near, a, b, _): &Step| near * (a + b) / 2.0;
+            let judge = |steps: &[Step]| {
+                let [near, far] = [steps.iter().map(near).sum::<f64>(), steps.iter().map(far).sum::<f64>()];
+                let is_seen = far > LIGHT_STEP * LIGHT_STEP * steps.len() as f64;
+                is_seen.then(|| near / far)
+            };
+            let all: Vec<Step> = chosen.iter().map(|(_, step)| *step).collect();
+            let mut squares: Vec<f32> = by_square(set.width, chosen)
+                .into_iter()
+                .filter_map(|square| judge(&square).map(|share| share as f32))
+                .collect();
+            let is_blurred = all.len() >= EDGES
+                && judge(&all).is_some_and(|share| share < NEAR)
+                && squares.len() >= BLURRED_SQUARES
+                && quantile(&mut squares, 0.75).is_some_and(|share| share < NEAR_IN_SQUARES);
+            if !is_blurred {
+                continue;
+            }
+            let across = ["along rows", "down columns"][direction];
+            let (what, where_) =
+                if moving { ("motion blur", " that move") } else { ("motion blur or depth of field", "") };
+            findings.push(Finding::new(
+                "blur-in-beauty-alone",
+                format!(
+                    "the beauty is blurred {across} at edges{where_} where the guides are sharp: {what} is in the beauty, but \
+                     not in the guides"
+                ),
+                "render beauty and guides with the same camera and shutter, as Cycles does with Denoising Data; or turn off \
+                 Render Properties > Motion Blur, and blur in the compositor",
+            ));
+            return;
+        }
+    }
+}
+
+/// Steps of the albedo, as logarithms, that are looked at.
+const ALBEDO_STEP: f32 = 0.5;
+
+/// How large the light's steps are beside those of the albedo: 0.76 to 1.3 in linear renders, 0.38 to 0.61 in the same ones with
+/// the curve of sRGB.
+const ENCODED: std::ops::Range<f32> = 0.3..0.66;
+
+/// Pixels with the curve of a display: none is above one, and light does not follow the albedo in proportion.
+fn encoded(set: &PassSet, guides: (&Planes, &Planes), light: &[f32], findings: &mut Vec<Finding>) {
+    let Some(render) = render(set) else { return };
+    let (albedo, normal) = guides;
+    if !render.data.iter().all(|v| (0.0..=1.0).contains(v)) {
+        return;
+    }
+    let shown = |at: usize| (0..3).map(|c| albedo.channel(c)[at].max(0.0)).sum::<f32>();
+    let mut slopes: Vec<f32> = Way::both(set.width, set.height)
+        .into_iter()
+        .flat_map(|way| {
+            way.find(9, |place| {
+                let is_flat = |c: usize| {
+                    (normal.channel(c)[way.at(place, 3)] - normal.channel(c)[way.at(place, -3)]).abs() < 0.2
+                };
+                if !is_edge(guides, way, place) || !(0..3).all(is_flat) {
+                    return None;
+                }
+                let mean = |side: isize| (2..=8).map(|n| light[way.at(place, n * side)]).sum::<f32>() / 7.0;
+                let albedo = (shown(way.at(place, 4)) + 0.02).ln() - (shown(way.at(place, -4)) + 0.02).ln();
+                let step = (mean(1) + 1e-4).ln() - (mean(-1) + 1e-4).ln();
+                (albedo.abs() > ALBEDO_STEP).then(|| step / albedo)
+            })
+        })
+        .collect();
+    if slopes.len() < EDGES || !median(&mut slopes).is_some_and(|slope| ENCODED.contains(&slope)) {
+        return;
+    }
+    findings.push(Finding::new(
+        "display-pixels",
+        "no light is above 1, and steps of the albedo show in the beauty at half their size, as the curve of sRGB makes them: the \
+         pixels seem to be encoded for a display",
+        LINEAR,
+    ));
+}

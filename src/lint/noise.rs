@@ -1,0 +1,208 @@
+//! What the noise of a render tells: whether it was removed already, or smeared, or cut off.
+//!
+//! Samples of a path tracer that picks its filter by importance, as Cycles does, belong to one pixel each: their noise is
+//! independent from pixel to pixel. On a plain surface, a pixel then differs from the four next to it as much as from the
+//! four two pixels away. After a denoiser, a filter that spreads samples over pixels, or a resize, it differs less from
+//! nearer ones.
+
+use rayon::prelude::*;
+
+use super::{
+    Finding,
+    light::{lit_surfaces, median, quantile, sums, usual_logarithms},
+    render,
+};
+use crate::{passes::PassSet, planes::Planes};
+
+/// Pixels on a side of the squares that are judged one by one: much of a frame may show no noise by right.
+const SQUARE: usize = 32;
+
+/// Pixels of plain surfaces that a square needs.
+const PIXELS: usize = 100;
+
+/// Squares that a frame needs.
+const SQUARES: usize = 12;
+
+/// The share of the squares whose differences of neighbours are as small as told, so that noise that is independent anywhere
+/// clears a frame.
+const MOST: f32 = 0.75;
+
+/// Of renders with independent noise, 1 in theory, MOST of the squares have ratios below 0.96 to 1.14 (24 frames, 4 to 4096
+/// samples); denoised by Blender 0.70, spread over pixels by a Gaussian of half a pixel 0.66 to 0.88.
+const ALIKE: f32 = 0.88;
+
+/// Relative differences of neighbours below which noise was removed, and not spread: 0.001 after denoising; noise of 4 to
+/// 64 samples that is spread by half a pixel has 0.01 to 0.5.
+const REMOVED: f32 = 0.015;
+
+pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
+    let Some(render) = render(set) else { return };
+    if let Some((ratio, amplitude)) = likeness(set, render).filter(|(ratio, _)| *ratio < ALIKE) {
+        // Where Blender kept the render it is that which is judged here.
+        findings.push(if amplitude < REMOVED {
+            Finding::new(
+                "looks-denoised",
+                "the beauty has no noise of single pixels anywhere on lit surfaces: it looks denoised or filtered already, and \
+                 is only blurred by another pass",
+                "turn off Render Properties > Sampling > Render > Denoise, or turn on Denoising Data, with which Blender keeps \
+                 the render as Noisy Image",
+            )
+        } else {
+            Finding::new(
+                "spread-noise",
+                format!(
+                    "the noise of neighbouring pixels is alike ({:.0}% of independent noise): samples were spread over \
+                     pixels by a wide pixel filter, or the frame was resized; blotches will stay",
+                    100.0 * ratio
+                ),
+                "render at the final size with a box filter of one pixel, or one that samples are picked by (Cycles: Render \
+                 Properties > Film > Pixel Filter at 1.5 px)",
+            )
+        });
+    }
+    clamped(set, render, findings);
+}
+
+/// By how much less neighbours differ than pixels two apart, in most squares, and the median of their differences; none where
+/// too little shows.
+fn likeness(set: &PassSet, render: &Planes) -> Option<(f32, f32)> {
+    let surfaces = lit_surfaces(set, render)?;
+    let light = sums(render);
+    let (w, h) = (set.width, set.height);
+    let logs = usual_logarithms(&light);
+    let around = |at: usize, n: usize| [at - n * w, at - n, at + n, at + n * w];
+    let is_of_use = |at: usize| {
+        let others = || around(at, 1).into_iter().chain(around(at, 2));
+        surfaces[at] && others().all(|other| surfaces[other]) && others().any(|other| light[other] > 0.0)
+    };
+    let difference = |at: usize, n: usize| {
+        (logs[at] - around(at, n).into_iter().map(|other| logs[other]).sum::<f32>() / 4.0).abs()
+    };
+    let judge = |x0: usize, y0: usize| {
+        let rows = y0.max(2)..(y0 + SQUARE).min(h - 2);
+        let columns = || x0.max(2)..(x0 + SQUARE).min(w - 2);
+        let places = rows.flat_map(|y| columns().map(move |x| y * w + x));
+        let (mut near, mut far): (Vec<f32>, Vec<f32>) =
+            places.filter(|at| is_of_use(*at)).map(|at| (difference(at, 1), difference(at, 2))).unzip();
+        if near.len() < PIXELS {
+            return None;
+        }
+        let (near, far) = (median(&mut near)?, median(&mut far)?);
+        (far > 0.0).then(|| (near / far, near))
+    };
+    let squares: Vec<(usize, usize)> = (0..h.div_ceil(SQUARE))
+        .flat_map(|y| (0..w.div_ceil(SQUARE)).map(move |x| (x * SQUARE, y * SQUARE)))
+        .collect();
+    let judged: Vec<(f32, f32)> = squares.into_par_iter().filter_map(|(x, y)| judge(x, y)).collect();
+    if judged.len() < SQUARES {
+        return None;
+    }
+    let (mut ratios, mut amplitudes): (Vec<f32>, Vec<f32>) = judged.into_iter().unzip();
+    Some((quantile(&mut ratios, MOST)?, median(&mut amplitudes)?))
+}
+
+/// Values of Render Properties > Light Paths > Clamping that are tried.
+const CLAMPS: [f32; 13] = [0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0];
+
+/// Width of a class of light, as a logarithm.
+const CLASS: f32 = 0.02;
+
+/// By how many standard deviations of chance a class must stand out.
+const STANDS_OUT: f32 = 6.0;
+
+/// By how many times more than any other class: lamps and hard light make classes of their own, at any value.
+const ALONE: f32 = 2.0;
+
+/// Pixels that a class needs.
+const CLAMPED_PIXELS: f32 = 30.0;
+
+/// Cycles scales a sample whose channels add up to more than three times the clamp down to that. In a pixel of N samples one
+/// such sample adds three times the clamp, divided by N: many pixels stand out from those around them by just that.
+fn clamped(set: &PassSet, render: &Planes, findings: &mut Vec<Finding>) {
+    let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
+    let light = sums(render);
+    let (w, h) = (set.width, set.height);
+    let logs: Vec<f32> = (w..w * (h - 1))
+        .filter(|at| (1..w - 1).contains(&(at % w)))
+        .filter_map(|at| {
+            let rows = [at - w, at, at + w];
+            let least =
+                rows.iter().flat_map(|at| &light[at - 1..=at + 1]).fold(f32::INFINITY, |a, b| a.min(*b));
+            (light[at] > 2.0 * least && light[at] - least > LEAST_EXCESS).then(|| (light[at] - least).ln())
+        })
+        .collect();
+    let counts = Counts::of(logs);
+    // Classes begin a little below a value, which half floats round.
+    let first = |clamp: f32| (3.0 * clamp / samples as f32).ln() - 0.003;
+    let best = CLAMPS.map(|clamp| (counts.stands_out(first(clamp)), clamp));
+    let Some((most, clamp)) = best.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)) else { return };
+    if most < STANDS_OUT {
+        return;
+    }
+    // All other classes, but those where two or three samples were cut, and those that overlap.
+    let own = first(clamp);
+    let is_own = |at: f32| [1.0f32, 2.0, 3.0].iter().any(|n| (at - own - n.ln()).abs() < 6.0 * CLASS);
+    let classes = (-500..600).map(|class| class as f32 * CLASS).filter(|at| !is_own(*at));
+    let others = classes.map(|at| counts.stands_out(at)).fold(0.0, f32::max);
+    if most < ALONE * others {
+        return;
+    }
+    findings.push(Finding::new(
+        "clamped-samples",
+        format!(
+            "many pixels stand out by just what a sample leaves that was clamped to {clamp}: light is lost, more of it the \
+             more samples there are"
+        ),
+        "set Render Properties > Light Paths > Clamping > Indirect Light (and Direct Light) to 0, or higher; demc removes \
+         fireflies",
+    ));
+}
+
+/// Light below this is not looked at: half floats get coarse.
+const LEAST_EXCESS: f32 = 1e-4;
+
+/// How many pixels stand out by how much: numbers of logarithms up to each step.
+struct Counts(Vec<f32>);
+
+impl Counts {
+    /// Steps of a class.
+    const STEPS: i32 = 20;
+    /// The first step's logarithm, in steps.
+    const FIRST: i32 = -14_000;
+    /// The last one's.
+    const LAST: i32 = 16_000;
+
+    fn step(logarithm: f32) -> i32 {
+        (logarithm / CLASS * Self::STEPS as f32).round() as i32
+    }
+
+    fn of(logarithms: Vec<f32>) -> Self {
+        let mut counts = vec![0.0f32; (Self::LAST - Self::FIRST + 1) as usize];
+        for logarithm in logarithms {
+            counts[(Self::step(logarithm).clamp(Self::FIRST, Self::LAST) - Self::FIRST) as usize] += 1.0;
+        }
+        let mut sum = 0.0;
+        counts.iter_mut().for_each(|count| {
+            sum += f64::from(*count);
+            *count = sum as f32;
+        });
+        Self(counts)
+    }
+
+    /// Pixels in classes before (negative) or after one that begins at a logarithm, from the first to the second.
+    fn classes(&self, logarithm: f32, from: i32, to: i32) -> f32 {
+        let at = |class: i32| {
+            let step = Self::step(logarithm) + class * Self::STEPS - Self::FIRST - 1;
+            self.0[step.clamp(0, self.0.len() as i32 - 1) as usize]
+        };
+        at(to) - at(from)
+    }
+
+    /// By how many standard deviations of chance a class has more pixels than those on both sides let expect.
+    fn stands_out(&self, logarithm: f32) -> f32 {
+        let (left, right) = (self.classes(logarithm, -5, -1) / 4.0, self.classes(logarithm, 5, 9) / 4.0);
+        let expected = (2.0 * left + right) / 3.0;
+        let own = self.classes(logarithm, 0, 1);
+        if own >= CLAMPED_PIXELS { (own - expected) / (expected + 1.0).sqrt() } else { 0.0 }
+    }
+}

@@ -1,0 +1,64 @@
+//! What frames of a shot tell together: noise that is the same in all, guides that stand still while things move, and motion
+//! that is missing.
+
+use super::{Finding, GUIDES, grain::Grain};
+use crate::passes::{BLENDER, Pass, PassSet};
+
+/// What is kept of a frame to hold the next one against it.
+pub struct Trace {
+    grain: Option<Grain>,
+    /// Of each guide, a number that two guides share only if they are the same, bit for bit.
+    guides: Vec<(Pass, u64)>,
+    /// Share of the pixels that move; none without vectors.
+    moving: Option<f64>,
+}
+
+/// Motion that is seen, in pixels a frame.
+const MOTION: f32 = 1.0;
+
+/// More of the pixels than this must move for guides that stand still to be of another frame.
+const MOVING: f64 = 0.01;
+
+impl Trace {
+    /// Of a view layer's passes.
+    pub fn of(set: &PassSet) -> Self {
+        let hash = |data: &[f32]| {
+            data.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, v| {
+                (hash ^ u64::from(v.to_bits())).wrapping_mul(0x0100_0000_01b3)
+            })
+        };
+        let guides = GUIDES.iter().filter_map(|pass| Some((*pass, hash(&set.get(*pass)?.data))));
+        let moving = set.get(Pass::Vector).map(|vectors| {
+            let moves = |at: usize| vectors.channel(0)[at].hypot(vectors.channel(1)[at]) > MOTION;
+            (0..vectors.pixels()).filter(|at| moves(*at)).count() as f64 / vectors.pixels().max(1) as f64
+        });
+        Self { grain: Grain::of(set), guides: guides.collect(), moving }
+    }
+
+    /// What is found in a frame that follows `before`, whose file is named.
+    pub fn after(&self, before: &Self, name: &str) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        findings.extend(
+            self.grain.as_ref().zip(before.grain.as_ref()).and_then(|(own, other)| own.warning(other, name)),
+        );
+        for (pass, hash) in &self.guides {
+            if self.moving.is_some_and(|moving| moving > MOVING) && before.guides.contains(&(*pass, *hash)) {
+                findings.push(Finding::new(
+                    "frozen-guide",
+                    format!(
+                        "{pass} is that of {name}, to the bit, though things move: it is of another frame"
+                    ),
+                    "render beauty and guides in one go, or check the frame numbers of what was put together",
+                ));
+            }
+        }
+        if self.moving.is_none() && !self.guides.is_empty() {
+            findings.push(Finding::new(
+                "missing-vectors",
+                "Vector is missing, which `demc denoise --temporal` follows from frame to frame",
+                format!("{}, and turn off Render Properties > Motion Blur", BLENDER.setting(Pass::Vector)),
+            ));
+        }
+        findings
+    }
+}

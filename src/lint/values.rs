@@ -1,0 +1,185 @@
+//! What single values tell: NaN, overflow, blank guides, albedo above one, pixels encoded for a display.
+
+use super::{About, Finding, GUIDES, render};
+use crate::{
+    frame::HALF_MAX,
+    passes::{Pass, PassSet, Renderer},
+    planes::Planes,
+};
+
+/// Passes that no frame with anything in it has zero everywhere; others rightly are where a scene has no glass, no volume, no
+/// lamp in view.
+const NEVER_ZERO: [Pass; 6] = [
+    Pass::Combined,
+    Pass::Normal,
+    Pass::Position,
+    Pass::DenoisingNormal,
+    Pass::DenoisingAlbedo,
+    Pass::NoisyImage,
+];
+
+/// A guide whose values differ by no more than this is one value: half floats near 1 are 0.0005 apart.
+const CONSTANT: f32 = 0.001;
+
+/// Albedo above this is more than rounding. Cycles adds to the albedo of lamps and screens the light that they send, of which
+/// the render has at least as much: what the albedo has more than the render is the surface's own.
+const ABOVE_ONE: f32 = 1.02;
+
+/// Albedo above this is taken for a lamp's, which fog may hide.
+const LAMP: f32 = 4.0;
+
+/// Neighbours of a plain surface differ by less than this share: at the rims of lamps, albedo has any value.
+const PLAIN: f32 = 0.05;
+
+/// So many of all pixels must be above.
+const ABOVE_SHARE: f64 = 0.002;
+
+/// Of 8-bit pixels all are multiples of 1/255; of others so near to one are 2 in 7 by chance.
+const NEAR_STEP: f32 = 0.07;
+
+/// Fewer values that are neither 0 nor 1 tell nothing.
+const STEPS: usize = 1000;
+
+pub fn check(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
+    for (pass, planes) in set.iter() {
+        single_values(set.renderer, pass, planes, about, findings);
+        if GUIDES.contains(&pass) {
+            constant(pass, planes, findings);
+        }
+    }
+    albedo_above_one(set, findings);
+    if !display_space(about, findings) {
+        eight_bits(set, findings);
+    }
+}
+
+fn single_values(
+    renderer: &Renderer,
+    pass: Pass,
+    planes: &Planes,
+    about: &About,
+    findings: &mut Vec<Finding>,
+) {
+    let count = |is: &dyn Fn(f32) -> bool| planes.data.iter().filter(|v| is(**v)).count();
+    // Beyond everything there is no depth, and as a half float that is infinite.
+    let may_be_infinite = matches!(pass, Pass::Depth | Pass::DenoisingDepth);
+    let bad = count(&|v| !v.is_finite() && !(may_be_infinite && v == f32::INFINITY));
+    let of = planes.data.len();
+    if bad > 0 {
+        findings.push(Finding::new(
+            "not-finite",
+            format!("{pass}: {bad} of {of} values are NaN or infinite"),
+            "`demc denoise` works with values filled in from around them; a material or lamp that divides by zero makes NaN",
+        ));
+    }
+    let over =
+        if about.half.contains(&pass) { count(&|v| v.is_infinite() || v.abs() == HALF_MAX) } else { 0 };
+    if over > 0 && pass.carries_radiance() {
+        findings.push(Finding::new(
+            "half-overflow",
+            format!("{pass}: {over} of {of} values are beyond what a half float holds ({HALF_MAX})"),
+            "set Output Properties > Output > Color Depth to Float (Full)",
+        ));
+    }
+    if NEVER_ZERO.contains(&pass) && count(&|v| v != 0.0) == 0 {
+        findings.push(Finding::new(
+            "empty-pass",
+            format!("{pass} is zero everywhere: an empty render, or a pass that was not written"),
+            renderer.setting(pass),
+        ));
+    }
+    let negative = count(&|v| v < 0.0);
+    if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) {
+        findings.push(Finding::new(
+            "negative-light",
+            format!("{pass}: {negative} negative values, which no light makes; models read them as 0"),
+            "render without filters of negative lobes, and check materials and lamps for negative colours",
+        ));
+    }
+}
+
+fn constant(pass: Pass, planes: &Planes, findings: &mut Vec<Finding>) {
+    let is_constant = |c: usize| {
+        let (low, high) = planes
+            .channel(c)
+            .iter()
+            .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+        high - low <= CONSTANT
+    };
+    let is_blank = planes.data.iter().all(|v| *v == 0.0);
+    if planes.pixels() > 1 && !is_blank && (0..planes.channels).all(is_constant) {
+        findings.push(Finding::new(
+            "constant-guide",
+            format!("{pass} is the same everywhere: it guides nothing, and edges that it hides are blurred"),
+            "render without a material override, and store the pass as the renderer wrote it",
+        ));
+    }
+}
+
+fn albedo_above_one(set: &PassSet, findings: &mut Vec<Finding>) {
+    let (Some(albedo), Some(render)) = (set.get(Pass::DenoisingAlbedo), render(set)) else { return };
+    let width = albedo.width;
+    let is_above = |at: usize| {
+        (0..3).any(|c| {
+            let (plane, light) = (albedo.channel(c), render.channel(c)[at]);
+            let own = plane[at];
+            let is_alike = |other: usize| (plane[other] - own).abs() < PLAIN * own;
+            (ABOVE_ONE..LAMP).contains(&own)
+                && own - light.max(0.0) > ABOVE_ONE
+                && [at - width, at - 1, at + 1, at + width].into_iter().all(is_alike)
+        })
+    };
+    let pixels = albedo.pixels();
+    let above = (width..pixels.saturating_sub(width)).filter(|at| is_above(*at)).count();
+    if above as f64 > ABOVE_SHARE * pixels as f64 {
+        findings.push(Finding::new(
+            "albedo-above-one",
+            format!(
+                "Denoising Albedo is above one on surfaces that do not shine ({above} of {pixels} pixels): no surface \
+                 reflects more light than it gets"
+            ),
+            "keep colours of materials at or below 1, and their sum where shaders are added",
+        ));
+    }
+}
+
+/// Whether the file itself says that it is not linear.
+fn display_space(about: &About, findings: &mut Vec<Finding>) -> bool {
+    let Some(space) = &about.colour_space else { return false };
+    let name = space.to_ascii_lowercase();
+    let is_encoded = ["srgb", "g18_", "g22_", "g24_", "g26_", "gamma", "pq_", "hlg_"]
+        .iter()
+        .any(|beginning| name.starts_with(beginning));
+    if is_encoded {
+        findings.push(Finding::new(
+            "display-pixels",
+            format!("the file says that its pixels are encoded for a display ('{space}'); light adds up in linear ones alone"),
+            LINEAR,
+        ));
+    }
+    is_encoded
+}
+
+/// How a file comes to hold linear pixels.
+pub(super) const LINEAR: &str = "save the render as OpenEXR MultiLayer with Output Properties > Color Management > Follow \
+                                 Scene, without a Convert Colorspace node or a conversion from PNG or JPEG";
+
+/// Pixels that were stored in 8 bits before.
+fn eight_bits(set: &PassSet, findings: &mut Vec<Finding>) {
+    let Some(render) = render(set) else { return };
+    let mut steps = 0;
+    for v in render.data.iter().filter(|v| **v != 0.0 && **v != 1.0) {
+        let scaled = v * 255.0;
+        if !(0.0..255.5).contains(&scaled) || (scaled - scaled.round()).abs() > NEAR_STEP.max(scaled * 3e-4) {
+            return;
+        }
+        steps += 1;
+    }
+    if steps >= STEPS {
+        findings.push(Finding::new(
+            "eight-bit-pixels",
+            "all values of the beauty are multiples of 1/255: they went through an 8-bit file, which is not linear",
+            LINEAR,
+        ));
+    }
+}

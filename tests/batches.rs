@@ -1,0 +1,308 @@
+//! Batches: folders with all that is in them, several frames at once, and renders that are still coming in.
+//!
+//! The method is `noisy`, which returns its input, or `demc-s` where it matters how frames are computed.
+
+mod common;
+
+use std::{
+    fs,
+    io::{BufRead, BufReader},
+    path::{Path, PathBuf},
+    process::{Child, Command as Process, Stdio},
+    time::{Duration, Instant},
+};
+
+use assert_cmd::cargo::cargo_bin;
+use common::{
+    demc,
+    files::{data, read_exr, samples, write_render},
+};
+use predicates::{prelude::*, str::contains};
+use tempfile::TempDir;
+
+/// Every file below a folder, as a path from there, sorted.
+fn tree(folder: &Path) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut left = vec![folder.to_path_buf()];
+    while let Some(at) = left.pop() {
+        for entry in fs::read_dir(&at).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                left.push(path);
+            } else {
+                found.push(path.strip_prefix(folder).unwrap().to_str().unwrap().replace('\\', "/"));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+/// A folder with renders in folders of it.
+fn renders() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a.exr", "one/shot.0001.exr", "one/shot.0002.exr", "two/deep/shot.0001.exr", ".trash/b.exr"]
+    {
+        let path = folder.path().join("renders").join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let seed = name.len();
+        write_render(&path, 40, 30, |_, pixel| ((pixel * 31 + seed) % 97) as f32 / 97.0);
+    }
+    folder
+}
+
+fn denoise(folder: &Path, arguments: &str) -> assert_cmd::assert::Assert {
+    let mut command = demc();
+    command.current_dir(folder).args(["denoise", "--model", "noisy"]).args(arguments.split_whitespace());
+    command.assert()
+}
+
+#[test]
+fn recursive_keeps_the_tree_below_out_and_hidden_folders_out() {
+    let folder = renders();
+    denoise(folder.path(), "renders --out clean --recursive").success().stdout(contains("4 denoised"));
+    let expected = ["a.exr", "one/shot.0001.exr", "one/shot.0002.exr", "two/deep/shot.0001.exr"];
+    assert_eq!(tree(&folder.path().join("clean")), expected);
+    // Without it, the folder's own files alone.
+    denoise(folder.path(), "renders --out flat").success();
+    assert_eq!(tree(&folder.path().join("flat")), ["a.exr"]);
+    denoise(folder.path(), "renders/two --out none").code(2).stderr(contains("add --recursive"));
+}
+
+#[test]
+fn results_inside_the_folder_that_is_searched_are_no_inputs() {
+    let folder = renders();
+    let run = "renders --out renders/clean --recursive";
+    denoise(folder.path(), run).success().stdout(contains("4 denoised"));
+    denoise(folder.path(), run).success().stdout(contains("0 denoised, 4 already there"));
+    assert_eq!(tree(&folder.path().join("renders/clean")).len(), 4);
+}
+
+#[test]
+fn two_inputs_of_one_place_are_refused_and_sources_are_never_overwritten() {
+    let folder = renders();
+    denoise(folder.path(), "renders/one renders/two/deep --out clean --recursive")
+        .code(2)
+        .stderr(contains("would both be written to clean/shot.0001.exr").and(contains("--recursive")));
+    denoise(folder.path(), "renders --out renders --recursive")
+        .code(2)
+        .stderr(contains("would overwrite its input"));
+    denoise(folder.path(), "renders --out renders --recursive --watch 1")
+        .code(2)
+        .stderr(contains("would overwrite its input"));
+    assert!(!folder.path().join("clean").exists());
+}
+
+#[test]
+#[cfg(unix)]
+fn links_to_folders_are_not_followed() {
+    let folder = renders();
+    std::os::unix::fs::symlink("..", folder.path().join("renders/one/back")).unwrap();
+    denoise(folder.path(), "renders --out clean --recursive").success().stdout(contains("4 denoised"));
+}
+
+#[test]
+fn a_report_and_inspect_search_folders_too() {
+    let folder = renders();
+    let run = denoise(folder.path(), "renders --out clean --recursive --json --frames 1").success();
+    fs::write(folder.path().join("log.jsonl"), &run.get_output().stdout).unwrap();
+    let report = |more: &str| {
+        let mut command = demc();
+        command.current_dir(folder.path()).args(["report", "log.jsonl", "--of", "renders"]);
+        command.args(more.split_whitespace()).assert()
+    };
+    report("--recursive")
+        .code(1)
+        .stdout(contains("missing: renders/one/shot.0002.exr").and(contains("2 missing")));
+    report("").code(1).stdout(contains("1 missing"));
+    demc()
+        .current_dir(folder.path())
+        .args(["inspect", "renders", "--recursive"])
+        .assert()
+        .success()
+        .stdout(contains("renders/two/deep/shot.0001.exr"));
+}
+
+#[test]
+fn frames_at_once_come_to_the_same_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    let renders = folder.path().join("renders");
+    fs::create_dir(&renders).unwrap();
+    for frame in 1..=5 {
+        let name = if frame % 2 == 0 { "s0010_outdoor" } else { "s0000_room" };
+        fs::copy(data(&format!("{name}_0004spp.exr")), renders.join(format!("shot.{frame:04}.exr"))).unwrap();
+    }
+    let run = |out: &str, more: &str| {
+        let mut command = demc();
+        command.current_dir(folder.path()).args(["denoise", "renders", "--model", "demc-s", "--out", out]);
+        command.args(more.split_whitespace()).assert().success();
+        tree(&folder.path().join(out))
+            .iter()
+            .map(|name| fs::read(folder.path().join(out).join(name)).unwrap())
+            .collect::<Vec<_>>()
+    };
+    let alone = run("alone", "--threads 3");
+    assert_eq!(alone.len(), 5);
+    assert!(alone == run("two", "--threads 3 --jobs 2"));
+    assert!(alone == run("four", "--threads 4 --jobs 4"));
+    // A sequence is cut into stretches, each of which reads the frames around it.
+    let alone = run("sequence", "--temporal 2");
+    assert!(alone == run("stretches", "--temporal 2 --threads 3 --jobs 3"));
+    fs::remove_file(folder.path().join("stretches/shot.0002.exr")).unwrap();
+    assert!(alone == run("stretches", "--temporal 2 --threads 2 --jobs 2"), "a batch that goes on");
+}
+
+#[test]
+fn more_frames_at_once_than_threads_are_told_of() {
+    let folder = renders();
+    denoise(folder.path(), "renders --recursive --out clean --jobs 8 --threads 2")
+        .success()
+        .stderr(contains("--jobs 8: one for each of the 2 threads"))
+        .stdout(contains("4 denoised"));
+    denoise(folder.path(), "renders --out clean --jobs 0").code(2);
+}
+
+#[test]
+fn json_tells_what_was_found_in_each_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = demc()
+        .args(["denoise", "--model", "noisy", "--json", "--out"])
+        .arg(folder.path())
+        .arg(data("blender5.exr"))
+        .assert()
+        .success();
+    let line: serde_json::Value = serde_json::from_slice(&run.get_output().stdout).unwrap();
+    let passes: Vec<&str> =
+        line["passes"].as_array().unwrap().iter().map(|pass| pass.as_str().unwrap()).collect();
+    assert!(passes.contains(&"Denoising Albedo") && passes.contains(&"Vector"), "{line}");
+    assert!(line["samples"].is_u64() && line["was_denoised"] == false, "{line}");
+}
+
+#[test]
+fn without_a_terminal_each_line_tells_frames_per_second_and_the_time_left() {
+    let folder = renders();
+    let run = denoise(folder.path(), "renders --recursive --out clean").success();
+    let said = String::from_utf8(run.get_output().stdout.clone()).unwrap();
+    let lines: Vec<&str> = said.lines().collect();
+    assert!(
+        lines[0].starts_with("[1/4] ") && lines[0].contains(" frames/s, ") && lines[0].ends_with(" left")
+    );
+    assert!(lines[3].starts_with("[4/4] ") && !lines[3].contains("left"), "{said}");
+}
+
+/// A watch over the folder `renders`, as an artist starts one.
+struct Watch {
+    folder: TempDir,
+    child: Child,
+    lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
+}
+
+impl Watch {
+    fn start(arguments: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut child = Process::new(cargo_bin("demc"))
+            .current_dir(folder.path())
+            .args(["denoise", "renders", "--out", "clean", "--model", "noisy"])
+            .args(arguments.split_whitespace())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let first = lines.next().unwrap().unwrap();
+        assert!(first.starts_with("watching for renders; "), "{first}");
+        Self { folder, child, lines }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        let path = self.folder.path().join("renders").join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        path
+    }
+
+    fn next(&mut self) -> String {
+        self.lines.next().expect("it says more").unwrap()
+    }
+
+    /// The exit code, what else it said, and its errors.
+    fn end(mut self) -> (Option<i32>, String, String, TempDir) {
+        let rest: Vec<String> = self.lines.by_ref().map(Result::unwrap).collect();
+        let done = self.child.wait_with_output().unwrap();
+        (done.status.code(), rest.join("\n"), String::from_utf8(done.stderr).unwrap(), self.folder)
+    }
+}
+
+#[test]
+fn a_watch_takes_each_render_when_it_is_whole_and_ends_when_none_comes() {
+    let bytes = fs::read(data("blender5.exr")).unwrap();
+    // The folder is not there yet, as before the first frame of a render.
+    let mut watch = Watch::start("--watch 5 --recursive");
+    fs::write(watch.path("shot.0001.exr"), &bytes).unwrap();
+    assert!(watch.next().starts_with("[1] clean/shot.0001.exr"));
+    // A renderer that writes for a while: a placeholder, half a file, all of it. What came before is not done again.
+    let slow = watch.path("deep/shot.0002.exr");
+    fs::write(&slow, "").unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    fs::write(&slow, &bytes[..bytes.len() / 2]).unwrap();
+    std::thread::sleep(Duration::from_millis(3000));
+    assert!(!watch.folder.path().join("clean/deep/shot.0002.exr").exists(), "it is half written");
+    fs::write(&slow, &bytes).unwrap();
+    assert!(watch.next().starts_with("[2] clean/deep/shot.0002.exr"));
+    let (code, rest, errors, folder) = watch.end();
+    assert_eq!((code, rest.as_str(), errors.as_str()), (Some(0), "2 denoised", ""));
+    let result = read_exr(folder.path().join("clean/deep/shot.0002.exr"));
+    assert!(samples(&result, "ViewLayer.Denoised.R").is_some());
+}
+
+#[test]
+fn a_watch_names_what_never_became_whole_and_goes_on_after_a_bad_frame() {
+    let bytes = fs::read(data("blender5.exr")).unwrap();
+    let mut watch = Watch::start("--watch 3 --view-layer ViewLayer");
+    fs::write(watch.path("half.exr"), &bytes[..bytes.len() / 2]).unwrap();
+    fs::write(watch.path("placeholder.exr"), "").unwrap();
+    // Whole, but it has no such view layer.
+    fs::copy(data("s0000_room_0004spp.exr"), watch.path("other.exr")).unwrap();
+    common::files::write_bare_parts(&watch.path("bare.exr"), &["V.Combined"]);
+    assert!(watch.next().contains("clean/other.exr"));
+    let (code, rest, errors, _) = watch.end();
+    assert_eq!(code, Some(1), "{errors}");
+    assert!(rest.contains("1 denoised, 3 failed"), "{rest}");
+    for part in
+        ["half.exr: is truncated", "placeholder.exr: is empty", "bare.exr: has no view layer 'ViewLayer'"]
+    {
+        assert!(errors.contains(part), "{part}: {errors}");
+    }
+}
+
+#[test]
+fn a_render_that_is_made_again_is_denoised_again_with_overwrite() {
+    let mut watch = Watch::start("--watch 4 --overwrite");
+    let path = watch.path("shot.0001.exr");
+    write_render(&path, 8, 6, |_, _| 0.25);
+    assert!(watch.next().starts_with("[1] "));
+    write_render(&path, 12, 6, |_, _| 0.5);
+    assert!(watch.next().starts_with("[2] clean/shot.0001.exr  12x6"));
+    assert_eq!(watch.end().0, Some(0));
+}
+
+#[test]
+#[cfg(unix)]
+fn ctrl_c_ends_a_watch_soon() {
+    let mut watch = Watch::start("--watch --jobs 2");
+    write_render(&watch.path("shot.0001.exr"), 8, 6, |_, _| 0.25);
+    assert!(watch.next().starts_with("[1] "));
+    let start = Instant::now();
+    Process::new("kill").args(["-INT", &watch.child.id().to_string()]).status().unwrap();
+    let (code, rest, ..) = watch.end();
+    assert_eq!((code, rest.as_str()), (Some(130), "1 denoised"));
+    assert!(start.elapsed() < Duration::from_secs(5));
+}
+
+#[test]
+fn a_watch_takes_no_sequence_windows_and_picks_frames() {
+    let folder = renders();
+    denoise(folder.path(), "renders --out clean --watch 1 --temporal").code(2).stderr(contains("--temporal"));
+    denoise(folder.path(), "renders --recursive --out clean --watch 1 --frames 2")
+        .success()
+        .stdout(contains("[1] clean/one/shot.0002.exr").and(contains("1 denoised")));
+}
