@@ -8,7 +8,8 @@
 //! ```
 //! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
 //! repeated, each time at another brightness, until the frame is full (by default the example of this
-//! repository), so that noise and compression are those of a render.
+//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a random
+//! number, so that nothing compresses.
 
 use std::{
     fs,
@@ -32,6 +33,7 @@ struct Options {
     only: Option<String>,
     frames: usize,
     size: Option<(usize, usize)>,
+    noise: f32,
     model: String,
     source: PathBuf,
 }
@@ -43,6 +45,7 @@ fn main() {
         only: None,
         frames: 32,
         size: None,
+        noise: 0.0,
         model: "demc-m".into(),
         source: Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example/house_0004spp.exr"),
     };
@@ -57,6 +60,7 @@ fn main() {
                 let number = |text: &str| text.parse().expect("--size wants numbers");
                 options.size = Some((number(width), number(height)));
             }
+            "--noise" => options.noise = value.parse().expect("--noise wants a number"),
             "--model" => options.model = value,
             "--source" => options.source = value.into(),
             _ => panic!("{arg}: unknown; see the top of benches/batch.rs"),
@@ -71,8 +75,9 @@ fn main() {
     }
 }
 
-/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one.
-fn enlarge(source: &Path, (width, height): (usize, usize), to: &Path) {
+/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every value by up to
+/// a share `noise` of it: pixels that do not compress are the worst for memory.
+fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {
         let (w, h) = (layer.size.width(), layer.size.height());
@@ -81,7 +86,11 @@ fn enlarge(source: &Path, (width, height): (usize, usize), to: &Path) {
             // Copies look alike only to a person: the factor changes every mantissa.
             let factor = |x: usize, y: usize| 0.7 + 0.6 * (((y / h) * 131 + (x / w) * 71) % 97) as f32 / 97.0;
             let at = |i: usize| (i / width % h) * w + i % width % w;
-            let scale = |i: usize| factor(i % width, i / width);
+            let chance = |i: usize| {
+                (i as u32).wrapping_mul(0x9E37_79B9).rotate_left(13).wrapping_mul(0x85EB_CA6B) >> 8
+            };
+            let uniform = |i: usize| chance(i) as f32 / (1 << 24) as f32;
+            let scale = |i: usize| factor(i % width, i / width) * (1.0 - noise * uniform(i));
             channel.sample_data = match &channel.sample_data {
                 FlatSamples::F16(old) => FlatSamples::F16(
                     (0..width * height)
@@ -170,7 +179,7 @@ fn overlap(options: &Options) {
     let (input, out) = (folder.path().join("in"), folder.path().join("out"));
     fs::create_dir(&input).expect("the temporary folder is writable");
     let first = input.join("shot.0001.exr");
-    enlarge(&options.source, size, &first);
+    enlarge(&options.source, size, options.noise, &first);
     for i in 2..=options.frames {
         fs::copy(&first, input.join(format!("shot.{i:04}.exr"))).expect("the temporary folder has room");
     }
@@ -230,7 +239,7 @@ fn memory(options: &Options) {
     let size = options.size.unwrap_or((7680, 4320));
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let (input, out) = (folder.path().join("huge.exr"), folder.path().join("out"));
-    enlarge(&options.source, size, &input);
+    enlarge(&options.source, size, options.noise, &input);
     let bytes = fs::metadata(&input).expect("just written").len();
     let (seconds, peak) = denoise(&input, &out, &options.model);
     let file = bytes as f64 / f64::from(1 << 20);

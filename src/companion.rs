@@ -24,8 +24,10 @@ pub enum Kind {
 pub struct Companion {
     /// What becomes of it.
     pub kind: Kind,
-    /// Noisy before, denoised after, (3, H, W). A layer of one channel has it three times.
+    /// Noisy before, denoised after: (3, H, W), or (1, H, W).
     pub planes: Planes,
+    /// What it was before, once it is denoised.
+    pub rendered: Planes,
 }
 
 impl Companion {
@@ -34,15 +36,12 @@ impl Companion {
     /// # Panics
     /// If it has neither one nor three channels.
     pub fn new(kind: Kind, planes: Planes) -> Self {
-        let planes = match planes.channels {
-            1 => Planes::from_rows(3, (planes.width, planes.height), |_, y, row| {
-                row.copy_from_slice(&planes.data[y * planes.width..][..planes.width]);
-            }),
-            channels => {
-                assert_eq!(channels, 3, "layers have one channel or three");
-                planes
-            }
-        };
-        Self { kind, planes }
+        assert!([1, 3].contains(&planes.channels), "layers have one channel or three");
+        Self { kind, planes, rendered: Planes::default() }
+    }
+
+    /// Puts what was made of it in its place.
+    pub fn becomes(&mut self, denoised: Planes) {
+        self.rendered = std::mem::replace(&mut self.planes, denoised);
     }
 }

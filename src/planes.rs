@@ -56,6 +56,13 @@ impl Planes {
         self.width * self.height
     }
 
+    /// The first channel in place of every one of `channels`: that many times.
+    pub fn of_first(&self, channels: usize) -> Self {
+        Self::from_rows(channels, (self.width, self.height), |_, y, row| {
+            row.copy_from_slice(&self.channel(0)[y * self.width..][..self.width]);
+        })
+    }
+
     /// One plane, row-major.
     pub fn channel(&self, c: usize) -> &[f32] {
         &self.data[c * self.pixels()..][..self.pixels()]

@@ -54,7 +54,8 @@ pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot>
 pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass], sources: &Sources) -> Result<Shot> {
     let mut set = passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat())?;
     let normals = sources.complete(frame, layer, wanted, &mut set)?;
-    Ok(Shot { normals, ..Shot::new(set) })
+    // Nobody asks what was stored before it was repaired.
+    Ok(Shot { normals, unrepaired: None, ..Shot::new(set) })
 }
 
 /// The half buffers that belong to a noisy frame, `shot_0004spp_a.0017.exr` and `_b` to

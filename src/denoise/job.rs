@@ -245,8 +245,11 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
         let radiance = run(&shot, &mut along.companions, model, options, report)?;
-        let along = along.finish(frame, layer);
-        finish(&shot, radiance, along, model, report)
+        let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
+        // What was read is of no more use.
+        drop(shot);
+        let (denoised_alpha, lights) = along.finish(frame, layer);
+        finish(&path, radiance, (denoised_alpha.or(alpha), lights), model, report)
     })
 }
 
@@ -313,22 +316,22 @@ pub(super) fn run(
     Ok(radiance)
 }
 
-/// What is stored of a view: its alpha as rendered, unless another goes along with it, and light passes.
+/// What is stored of the view of a file: radiance, alpha, and light passes.
 ///
 /// # Errors
 /// What the model made is of no use.
 pub(super) fn finish(
-    shot: &Shot,
+    path: &Path,
     radiance: Planes,
     (alpha, lights): (Option<Planes>, Vec<(Source, Planes)>),
     model: &dyn Denoiser,
     report: &mut Report,
 ) -> Result<Denoised> {
-    let mut useful = |planes| finite(planes, model.name(), &shot.passes.path, report);
+    let mut useful = |planes| finite(planes, model.name(), path, report);
     let radiance = useful(radiance)?;
     let lights = lights.into_iter().map(|(source, light)| Ok((source, useful(light)?)));
     let lights = lights.collect::<Result<_>>()?;
-    Ok(Denoised { radiance, alpha: alpha.or_else(|| shot.passes.get(Pass::Alpha).cloned()), lights })
+    Ok(Denoised { radiance, alpha, lights })
 }
 
 /// Whatever a model returns, what is written is finite.

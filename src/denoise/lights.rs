@@ -87,8 +87,8 @@ impl Along {
                 model.takes_companions() && shot.passes.get(Pass::Alpha).is_some_and(varies)
             }
         };
-        if denoises_alpha && let Some(alpha) = shot.passes.get(Pass::Alpha) {
-            along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha.clone());
+        if denoises_alpha && let Some(alpha) = shot.passes.remove(Pass::Alpha) {
+            along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha);
         }
         if options.passes {
             along.take_lights(shot, notes);
@@ -147,9 +147,9 @@ impl Along {
         let mut done: Vec<(Source, Planes)> = self.sources.into_iter().zip(denoised).collect();
         let alpha = done.iter().position(|(source, _)| *source == Source::Pass(Pass::Alpha));
         let alpha = alpha.map(|at| {
-            let (_, alpha) = done.remove(at);
-            let first = alpha.channel(0).iter().map(|share| share.clamp(0.0, 1.0));
-            Planes::from_vec(1, alpha.width, alpha.height, first.collect())
+            let (_, mut alpha) = done.remove(at);
+            alpha.data.iter_mut().for_each(|share| *share = share.clamp(0.0, 1.0));
+            alpha
         });
         for (lights, colour) in LIT {
             divide(&mut done, lights, colour, frame, layer);

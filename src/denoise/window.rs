@@ -139,8 +139,9 @@ impl Window {
             let start = Instant::now();
             let radiance = self.view(number, &key(layer), model, options, report)?;
             report.seconds = start.elapsed().as_secs_f64();
-            let shot = &self.moment(number, &key(layer)).expect("its views have entered").shot;
-            finish(shot, radiance, Default::default(), model, report)
+            let passes = &self.moment(number, &key(layer)).expect("its views have entered").shot.passes;
+            let alpha = passes.get(Pass::Alpha).cloned();
+            finish(&passes.path, radiance, (alpha, Vec::new()), model, report)
         })
     }
 

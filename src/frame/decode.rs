@@ -66,11 +66,11 @@ impl Frame {
         let at = header
             .get_absolute_block_pixel_coordinates(stored.place)
             .map_err(|e| Self::error(&self.path, e))?;
-        bounds::check(header, &stored.bytes, at.size).map_err(|why| {
+        let bytes = self.opened.bytes(&stored.bytes)?;
+        bounds::check(header, &bytes, at.size).map_err(|why| {
             Error::invalid(&self.path, format!("damaged EXR ({why}); render it or copy it again"))
         })?;
-        let bytes = stored.bytes.clone();
-        let data = header.compression.decompress_image_section_from_le(header, bytes, at, false);
+        let data = header.compression.decompress_image_section_from_le(header, bytes.into_owned(), at, false);
         let index = BlockIndex {
             layer: stored.part,
             pixel_position: Vec2(

@@ -21,6 +21,7 @@ use rayon::prelude::*;
 
 use super::{
     Frame, SampleKind, Stored, StoredChunk,
+    bytes::Bytes,
     decode::row_bytes,
     header::{Attributes, write_tiles},
     zip,
@@ -415,7 +416,7 @@ impl<'a> Encoder<'a> {
             }
         }
         let bytes = zip::compress(UncompressedBlock { index: at, data }, header)?;
-        Ok(StoredChunk { part: self.part, index, place, bytes })
+        Ok(StoredChunk { part: self.part, index, place, bytes: Bytes::Held(bytes) })
     }
 
     /// One row of a block of new values; smaller resolution levels take the mean of what they cover.

@@ -6,6 +6,7 @@
 
 mod atomic;
 mod bounds;
+mod bytes;
 mod decode;
 mod edit;
 mod header;
@@ -29,6 +30,7 @@ pub use atomic::{atomically, prepare_folder};
 pub use edit::{HALF_MAX, NewChannel, Recoded};
 
 use crate::{Error, Result};
+use bytes::{Bytes, Opened};
 use header::{Attributes, string};
 
 /// Leading bytes of every EXR file.
@@ -48,9 +50,10 @@ mod flags {
     pub const ALL: u32 = TILED | LONG_NAMES | DEEP | MULTI_PART;
 }
 
-/// An EXR file held in memory as it was stored.
+/// An EXR file as it was stored. What is compressed stays in the file, which is kept open, until it is wanted.
 pub struct Frame {
     path: PathBuf,
+    opened: Opened,
     byte_len: u64,
     /// Whether chunks say which part they belong to.
     multi_part: bool,
@@ -73,7 +76,7 @@ struct StoredChunk {
     index: usize,
     place: TileCoordinates,
     /// What is compressed; of a deep block with its sizes before it.
-    bytes: Vec<u8>,
+    bytes: Bytes,
 }
 
 /// What a part says about itself.

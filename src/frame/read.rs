@@ -1,4 +1,4 @@
-//! From a file to a [`Frame`]: headers, then every chunk still compressed, each checked to be present
+//! From a file to a [`Frame`]: headers, then where every chunk is, each checked to be present
 //! exactly once, so that a truncated render is refused here and not half denoised.
 
 use std::{
@@ -15,7 +15,9 @@ use exr::{
 };
 
 use super::{
-    Frame, MAGIC, Stored, StoredChunk, flags,
+    Frame, MAGIC, Stored, StoredChunk,
+    bytes::{Bytes, Opened},
+    flags,
     header::{Attribute, Attributes, string},
 };
 use crate::{Error, Result};
@@ -28,7 +30,7 @@ const LONGEST_NAME: usize = 255;
 const VERSION: u32 = 2;
 
 impl Frame {
-    /// Reads a file: headers and compressed chunks; nothing is decoded yet.
+    /// Opens a file: reads its headers, and looks where its chunks are; nothing is decoded yet.
     ///
     /// # Errors
     /// The file cannot be read, is no EXR, is truncated or damaged, or holds deep data alone.
@@ -61,12 +63,15 @@ fn open(path: &Path) -> Result<(Source, Frame)> {
     if info.len() == 0 {
         return Err(Error::invalid(path, "is empty; render it or copy it again"));
     }
-    let mut source = Source { reader: BufReader::with_capacity(1 << 18, file), at: 0, len: info.len() };
+    let again = file.try_clone().map_err(Error::io("read", path))?;
+    let opened = Opened::new(again, path, &info);
+    let mut source = Source { reader: BufReader::new(file), at: 0, len: info.len() };
     if source.bytes(4).map_err(|e| e.of(path))? != MAGIC {
         return Err(Error::invalid(path, "is not an EXR file; render to OpenEXR MultiLayer"));
     }
     let mut frame = Frame {
         path: path.into(),
+        opened,
         byte_len: info.len(),
         multi_part: false,
         long_names: false,
@@ -125,7 +130,7 @@ impl From<String> for Failure {
     }
 }
 
-/// A file that is read once from beginning to end. No more memory is taken than it has bytes left.
+/// A file that is gone through once from beginning to end. No more memory is taken than it has bytes left.
 struct Source {
     reader: BufReader<File>,
     at: u64,
@@ -256,7 +261,7 @@ impl Source {
             }
             let place = self.place(&parts[part].layout)?;
             let bytes = if parts[part].layout.deep { self.deep_bytes()? } else { self.sized_bytes()? };
-            // Chunks that overlap would take more memory than the file has bytes.
+            // Chunks that overlap would make a result that is larger than the file.
             held += bytes.len() as u64;
             let index = place.and_then(|place| Some((place, *places[part].get(&place)?)));
             let Some((place, index)) = index.filter(|_| held <= self.len) else {
@@ -291,18 +296,25 @@ impl Source {
         })
     }
 
-    fn sized_bytes(&mut self) -> Result<Vec<u8>, Failure> {
+    fn sized_bytes(&mut self) -> Result<Bytes, Failure> {
         let size = u64::try_from(self.int()?).map_err(|_| Failure::Truncated)?;
-        self.bytes(size)
+        self.bytes_from(self.at, size)
+    }
+
+    /// Bytes that stay where they are, which must be there.
+    fn bytes_from(&self, at: u64, count: u64) -> Result<Bytes, Failure> {
+        if count > self.len.saturating_sub(at) {
+            return Err(Failure::Truncated);
+        }
+        Ok(Bytes::InFile { at, len: usize::try_from(count).map_err(|_| Failure::Truncated)? })
     }
 
     /// A deep block from its sizes on: those of its two packed halves, and what the second unpacks to.
-    fn deep_bytes(&mut self) -> Result<Vec<u8>, Failure> {
+    fn deep_bytes(&mut self) -> Result<Bytes, Failure> {
+        let start = self.at;
         let sizes: [u8; 24] = self.array()?;
         let [counts, samples, _] =
             [0, 8, 16].map(|at| u64::from_le_bytes(std::array::from_fn(|i| sizes[at + i])));
-        let mut bytes = sizes.to_vec();
-        bytes.extend(self.bytes(counts.saturating_add(samples))?);
-        Ok(bytes)
+        self.bytes_from(start, counts.saturating_add(samples).saturating_add(sizes.len() as u64))
     }
 }

@@ -19,11 +19,20 @@ impl Frame {
         let path = path.as_ref();
         atomically(path, |file| {
             let mut buffered = BufWriter::with_capacity(1 << 20, file);
-            self.write_to(&mut buffered).and_then(|()| buffered.flush()).map_err(Error::io("write", path))
+            let failed = |error| Error::io("write", path)(error);
+            let chunks = self.write_start(&mut buffered).map_err(failed)?;
+            for chunk in chunks {
+                let bytes = self.opened.bytes(&chunk.bytes)?;
+                buffered.write_all(&self.prefix(chunk)).map_err(failed)?;
+                buffered.write_all(&bytes).map_err(failed)?;
+            }
+            buffered.flush().map_err(failed)?;
+            self.opened.check_unchanged()
         })
     }
 
-    fn write_to(&self, out: &mut impl Write) -> io::Result<()> {
+    /// Writes all that stands before the chunks, which follow in the order returned.
+    fn write_start(&self, out: &mut impl Write) -> io::Result<&[StoredChunk]> {
         let mut start = MAGIC.to_vec();
         start.extend_from_slice(&self.version().to_le_bytes());
         for stored in &self.stored {
@@ -42,10 +51,7 @@ impl Frame {
         for offset in tables.iter().flatten() {
             out.write_all(&offset.to_le_bytes())?;
         }
-        self.chunks.iter().try_for_each(|chunk| {
-            out.write_all(&self.prefix(chunk))?;
-            out.write_all(&chunk.bytes)
-        })
+        Ok(&self.chunks)
     }
 
     /// The format's version with the flags of what the file holds.

@@ -104,7 +104,7 @@ impl Learned {
         if !companions.is_empty() {
             let (noisy, tamed) =
                 (radiance.padded_rows(0..size.1, odd), grown.require(Pass::Combined, TURNED)?);
-            for Companion { kind, planes } in &mut *companions {
+            for Companion { kind, planes, .. } in &mut *companions {
                 *planes = planes.padded_rows(0..size.1, odd);
                 if *kind == Kind::Light {
                     tame_alike(planes, &noisy, tamed);
@@ -187,7 +187,6 @@ impl Learned {
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
-        let rendered = companions.to_vec();
         let mut image = self.looks(passes, companions, tile)?;
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
@@ -199,8 +198,8 @@ impl Learned {
         }
         let mut shares = Planes::unwritten(1, image.width, image.height);
         shrink(&mut image, &render, Some(&mut shares));
-        for (denoised, rendered) in companions.iter_mut().zip(&rendered) {
-            take_back(&mut denoised.planes, &rendered.planes, &shares);
+        for companion in companions {
+            take_back(&mut companion.planes, &std::mem::take(&mut companion.rendered), &shares);
         }
         Ok(image)
     }

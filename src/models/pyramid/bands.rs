@@ -54,12 +54,16 @@ pub fn infer(
     let mut image = Planes::default();
     let kinds: Vec<Kind> = companions.iter().map(|companion| companion.kind).collect();
     let mut written: Vec<Planes> = kinds.iter().map(|_| Planes::default()).collect();
+    // Images have three channels while they are filtered; a layer of one is not held three times.
+    let channels: Vec<usize> = companions.iter().map(|companion| companion.planes.channels).collect();
     let mut write = |first: usize, mut parts: Vec<Planes>| {
         let of_companions = parts.split_off(3);
         let [part, normal, albedo] = parts.try_into().expect("radiance, normal and albedo");
         let end = first + part.height;
         append(&mut image, size, first, part);
-        written.iter_mut().zip(of_companions).for_each(|(all, part)| append(all, size, first, part));
+        for ((all, part), channels) in written.iter_mut().zip(of_companions).zip(&channels) {
+            append(all, size, first, if *channels == 1 { part.of_first(1) } else { part });
+        }
         let first = refit.done();
         let before = if kinds.contains(&Kind::Light) { end - first } else { 0 };
         let before = image.window((0, first), (size.0, before));
@@ -96,6 +100,9 @@ pub fn infer(
         };
         let divided = companions.iter().map(|companion| {
             let mut planes = companion.planes.padded_rows(seen.clone(), padded);
+            if planes.channels == 1 {
+                planes = planes.of_first(3);
+            }
             if companion.kind == Kind::Light {
                 tame_alike(&mut planes, &noisy, tamed);
             }
@@ -142,7 +149,7 @@ pub fn infer(
             Kind::Share => keep_black(&mut planes, &companion.planes, &companion.planes),
             Kind::Colour => {}
         }
-        companion.planes = planes;
+        companion.becomes(planes);
     }
     Ok(image)
 }
