@@ -6,6 +6,7 @@ use crate::{
     Error, Result,
     frame::Frame,
     passes::{self, Layer, Mapping, Pass, PassSet, Turn, to_camera_space},
+    planes::Planes,
 };
 
 /// What the user says of where passes are.
@@ -72,20 +73,19 @@ impl Sources {
         set: &mut PassSet,
     ) -> Result<Option<String>> {
         let mut matrix = frame.matrix_attribute("worldToCamera");
+        let mut of_cycles = has_cycles_normal(layer);
         for (pass, pattern) in GUIDES.into_iter().zip([&self.albedo, &self.normal]) {
             if let Some(pattern) = pattern.as_deref().filter(|_| wanted.contains(&pass)) {
                 let other = Frame::read(beside(frame.path(), pattern)?)?;
-                let planes = guide(&other, layer, pass, set)?;
+                let (own_layer, planes) = guide(&other, layer, pass, set)?;
                 set.insert(pass, planes);
                 if pass == Pass::DenoisingNormal {
+                    of_cycles = has_cycles_normal(&own_layer);
                     matrix = other.matrix_attribute("worldToCamera").or(matrix);
                 }
             }
         }
-        let is_cycles = layer.renderer.is_blender()
-            && !self.mapping.names(Pass::DenoisingNormal)
-            && self.normal.is_none();
-        if is_cycles {
+        if of_cycles {
             return Ok(None);
         }
         let Some(mut normals) = set.remove(Pass::DenoisingNormal) else { return Ok(None) };
@@ -97,8 +97,14 @@ impl Sources {
     }
 }
 
+/// Whether a layer's normal is the pass that Cycles makes for denoisers.
+fn has_cycles_normal(layer: &Layer) -> bool {
+    let names = Pass::DenoisingNormal.blender_names();
+    layer.passes.get(&Pass::DenoisingNormal).is_some_and(|at| names.contains(&at.name.as_str()))
+}
+
 /// A guide in a file of its own: the pass, by its name, or what the file holds without one.
-fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<crate::planes::Planes> {
+fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<(Layer, Planes)> {
     let mut layers = passes::layers_of(frame, pass);
     let own_view = layers.iter().position(|layer| layer.view == of.view).unwrap_or(0);
     if layers.is_empty() {
@@ -109,7 +115,8 @@ fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<crate::
     let layer = layers.swap_remove(own_view);
     let mut found = passes::read_layer(frame, &layer, &[pass])?;
     set.check_same_pixels(&found)?;
-    Ok(found.remove(pass).expect("the layer holds it"))
+    let planes = found.remove(pass).expect("the layer holds it");
+    Ok((layer, planes))
 }
 
 #[cfg(test)]

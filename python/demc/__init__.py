@@ -67,13 +67,18 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
     return result
 
 
-def denoise_file(source, out, model="demc-m", *, overwrite=False, view_layer=None, threads=None):
+def denoise_file(
+    source, out, model="demc-m", *, overwrite=False, view_layer=None, albedo=None, normal=None, names=None, threads=None
+):
     """Denoises an EXR file into another: all that it held, and the layer `Denoised`. Byte for byte what the command writes.
 
     source, out: paths of two files; the folder of `out` must exist.
     model: a name that `demc models` lists, or a weights file.
     overwrite: whether a file at `out` is replaced.
     view_layer: the view layer to denoise; None for the one with the most passes.
+    albedo, normal: paths of files that hold those alone, of renderers that write a file for each pass.
+    names: a dict of what the file calls passes, where their names do not tell: {"albedo": "my colour"}; the words are
+        those of `demc denoise --map`.
     threads: how many threads to use; None for all cores.
 
     Returns a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of values that
@@ -90,13 +95,15 @@ def denoise_file(source, out, model="demc-m", *, overwrite=False, view_layer=Non
         if not overwrite:
             raise Error(f"{out}: exists; overwrite=True replaces it, or choose another out")
     threads = _count("threads", threads)
-    values = _demc.denoise_path(source, out, os.fspath(model), view_layer, threads)
+    guides = tuple(None if path is None else os.fspath(path) for path in (albedo, normal))
+    lines = [f"{word}={name}" for word, name in (names or {}).items()]
+    values = _demc.denoise_path(source, out, os.fspath(model), view_layer, guides, lines, threads)
     return dict(zip(("view_layer", "width", "height", "seconds", "repaired", "notes"), values))
 
 
 def inspect(path):
     """What an EXR file holds: the dict of `demc inspect --json` (layout, parts, layers with their passes, what each
-    model misses, warnings).
+    model misses, findings).
 
     Error: the file cannot be read.
     """

@@ -33,6 +33,9 @@ def denoise_file(
     *,
     overwrite: bool = False,
     view_layer: str | None = None,
+    albedo: str | PathLike[str] | None = None,
+    normal: str | PathLike[str] | None = None,
+    names: dict[str, str] | None = None,
     threads: int | None = None,
 ) -> Report: ...
 def inspect(path: str | PathLike[str]) -> dict[str, Any]: ...

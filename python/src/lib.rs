@@ -21,9 +21,10 @@ use demc::{
     Error as Failure,
     denoise::{self, Options},
     models::{self, Denoiser},
-    passes::{Pass, PassSet},
+    passes::{Mapping, Pass, PassSet},
     planes::Planes,
     shot::Shot,
+    sources::Sources,
 };
 use numpy::{PyArray1, PyReadonlyArray3, ndarray::Axis};
 use pyo3::{create_exception, exceptions, prelude::*};
@@ -172,10 +173,17 @@ fn denoise_path(
     out: PathBuf,
     model: String,
     view_layer: Option<String>,
+    (albedo, normal): (Option<PathBuf>, Option<PathBuf>),
+    names: Vec<String>,
     threads: Option<usize>,
 ) -> PyResult<(String, usize, usize, f64, HashMap<String, usize>, Vec<String>)> {
     let report = detached(py, threads, move |stopped| {
-        let (model, options) = (open(&model)?, Options { view_layer, ..Options::default() });
+        let mut mapping = Mapping::default();
+        for line in names {
+            mapping.add(&line).map_err(|why| Failure::Usage(format!("names: {why}")))?;
+        }
+        let sources = Sources { mapping, albedo, normal };
+        let (model, options) = (open(&model)?, Options { view_layer, sources, ..Options::default() });
         let denoised = denoise::denoise(denoise::load(&source, &*model, &options)?, &*model, &options)?;
         // Whoever pressed Ctrl-C meanwhile expects no file.
         if stopped.load(Ordering::SeqCst) {

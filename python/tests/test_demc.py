@@ -120,6 +120,18 @@ class Package(unittest.TestCase):
         self.assertEqual(command("inspect", missing).returncode, 1)
         self.assertEqual(command("nosuch").returncode, 2)
 
+    def test_passes_are_found_under_names_and_in_files_of_their_own(self):
+        names = {"albedo": "Denoising Albedo", "normal": "Denoising Normal"}
+        demc.denoise_file(ROOM, self.folder / "plain.exr")
+        demc.denoise_file(ROOM, self.folder / "named.exr", names=names)
+        demc.denoise_file(ROOM, self.folder / "beside.exr", albedo=ROOM, normal=ROOM)
+        bits = [(self.folder / f"{name}.exr").read_bytes() for name in ("plain", "named", "beside")]
+        self.assertEqual(bits, [bits[0]] * 3)
+        with self.assertRaisesRegex(demc.Error, "no layer 'nothing'"):
+            demc.denoise_file(ROOM, self.folder / "wrong.exr", names={"albedo": "nothing"})
+        with self.assertRaisesRegex(ValueError, "is no pass"):
+            demc.denoise_file(ROOM, self.folder / "wrong.exr", names={"colour": "Denoising Albedo"})
+
     def test_others_run_meanwhile(self):
         color, albedo, normal, _ = (a if i == 3 else np.tile(a, (4, 4, 1)) for i, a in enumerate(self.arrays()))
         steps, ended = 0, threading.Event()
