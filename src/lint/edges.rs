@@ -35,13 +35,17 @@ fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Ve
     squares.into_values().filter(|square| square.len() >= EDGES_OF_SQUARE).collect()
 }
 
-pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
+/// Judges edges, against those of the beauty only where the guides lie as it does: `is_aligned`.
+pub fn check(set: &PassSet, is_aligned: bool, findings: &mut Vec<Finding>) {
     let (Some(albedo), Some(normal), Some(render)) =
         (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal), render(set))
     else {
         return;
     };
     soft(&[albedo, normal], findings);
+    if !is_aligned {
+        return;
+    }
     let light = sums(render);
     let logs = logarithms(&light, 0.02);
     blurred(set, (albedo, normal), &logs, findings);
@@ -130,7 +134,7 @@ fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
     }
     findings.push(Finding::new(
         "wide-filter",
-        "no edge of the guides is sharp: the pixel filter is wider than 3 pixels, and what it blurred stays blurred",
+        "no edge of the guides is sharp: the pixel filter is 3 pixels wide or more, and what it blurred stays blurred",
         "set Render Properties > Film > Pixel Filter > Width to 1.5 px (the default)",
     ));
 }

@@ -68,8 +68,10 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
         return findings;
     }
     noise::check(set, &mut findings);
-    edges::check(set, &mut findings);
-    shift::check(set, &mut findings);
+    // What lies elsewhere tells nothing of the beauty's edges.
+    let is_shifted = shift::check(set, &mut findings);
+    edges::check(set, !is_shifted, &mut findings);
+    noise::clamped(set, &mut findings);
     findings
 }
 

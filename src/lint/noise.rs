@@ -60,7 +60,6 @@ pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
             )
         });
     }
-    clamped(set, render, findings);
 }
 
 /// By how much less neighbours differ than pixels two apart, in most squares, and the median of their differences; none where
@@ -118,8 +117,14 @@ const CLAMPED_PIXELS: f32 = 30.0;
 
 /// Cycles scales a sample whose channels add up to more than three times the clamp down to that. In a pixel of N samples one
 /// such sample adds three times the clamp, divided by N: many pixels stand out from those around them by just that.
-fn clamped(set: &PassSet, render: &Planes, findings: &mut Vec<Finding>) {
+///
+/// To be asked last: what is cut off at 1 was encoded for a display, which is another fault.
+pub fn clamped(set: &PassSet, findings: &mut Vec<Finding>) {
+    let Some(render) = render(set) else { return };
     let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
+    if findings.iter().any(|finding| finding.code == "display-pixels") {
+        return;
+    }
     let light = sums(render);
     let (w, h) = (set.width, set.height);
     let logs: Vec<f32> = (w..w * (h - 1))
@@ -134,14 +139,17 @@ fn clamped(set: &PassSet, render: &Planes, findings: &mut Vec<Finding>) {
     let counts = Counts::of(logs);
     // Classes begin a little below a value, which half floats round.
     let first = |clamp: f32| (3.0 * clamp / samples as f32).ln() - 0.003;
-    let best = CLAMPS.map(|clamp| (counts.stands_out(first(clamp)), clamp));
-    let Some((most, clamp)) = best.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)) else { return };
+    let tried = CLAMPS.map(|clamp| (counts.stands_out(first(clamp)), clamp));
+    let best = tried.iter().map(|(much, _)| *much).fold(0.0, f32::max);
+    // Two samples of one clamp add as much as one of twice the clamp.
+    let lowest = tried.into_iter().find(|(much, _)| *much >= 0.5 * best);
+    let (most, clamp) = lowest.expect("the best is one of them");
     if most < STANDS_OUT {
         return;
     }
-    // All other classes, but those where two or three samples were cut, and those that overlap.
+    // All other classes, but those where several samples were cut, and those that overlap.
     let own = first(clamp);
-    let is_own = |at: f32| [1.0f32, 2.0, 3.0].iter().any(|n| (at - own - n.ln()).abs() < 6.0 * CLASS);
+    let is_own = |at: f32| (1..=6).any(|n| (at - own - (n as f32).ln()).abs() < 6.0 * CLASS);
     let classes = (-500..600).map(|class| class as f32 * CLASS).filter(|at| !is_own(*at));
     let others = classes.map(|at| counts.stands_out(at)).fold(0.0, f32::max);
     if most < ALONE * others {

@@ -28,8 +28,10 @@ const BETTER: f64 = 1.2;
 /// Rows that are held against each other: those of larger frames are picked evenly.
 const ROWS: usize = 400;
 
-pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
-    let Some(render) = render(set) else { return };
+/// Whether a guide lies elsewhere.
+pub fn check(set: &PassSet, findings: &mut Vec<Finding>) -> bool {
+    let Some(render) = render(set) else { return false };
+    let before = findings.len();
     let (w, h) = (set.width, set.height);
     let blurred = blur(&sums(render), w, h);
     let beauty = edges(&[&logarithms(&blurred, 0.05)], w, h, 1.0);
@@ -55,6 +57,7 @@ pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
             "render beauty and guides in one go, or take the guides of the same frame, size and region",
         ));
     }
+    findings.len() > before
 }
 
 fn clean(v: f32) -> f32 {
