@@ -5,7 +5,7 @@
 mod common;
 
 use std::{
-    env, fs,
+    fs,
     path::{Path, PathBuf},
     process::{Command, Output},
     time::Duration,
@@ -27,15 +27,6 @@ fn scripts() -> PathBuf {
 
 fn snippet(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data").join(name)
-}
-
-/// The Pythons whose bpy all must hold on.
-fn blenders() -> Vec<PathBuf> {
-    let older = env::var_os("DEMC_BPY45").map(PathBuf::from);
-    if older.is_none() {
-        eprintln!("DEMC_BPY45 is not set: tried on bpy 5.0 alone (see tests/README.md)");
-    }
-    [python::python()].into_iter().chain(older).collect()
 }
 
 /// A scene of `make_hard_scene.py` and the folder that it is exported to.
@@ -120,7 +111,7 @@ fn size(set: &PassSet) -> (usize, usize) {
 
 #[test]
 fn pixels_need_not_be_square() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "aspect");
         shot.export("");
         let set = shot.passes("shot_0001spp.exr");
@@ -143,7 +134,7 @@ fn what_blender_says_of_a_failure_is_passed_on() {
 
 #[test]
 fn stereo_scenes_give_both_views_in_one_file() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "stereo");
         shot.export("");
         assert_eq!(shot.files(), ["shot_0001spp.exr", "shot_ref.exr"]);
@@ -170,7 +161,7 @@ fn a_file_of_two_scenes_says_which_is_rendered() {
 
 #[test]
 fn a_render_border_is_kept_and_told() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "border");
         let said = shot.export("");
         assert!(said.contains("render border") && said.contains("--region 0,0,64,36 for all"), "{said}");
@@ -211,7 +202,7 @@ fn frames_come_in_lists_and_steps_and_keep_to_the_scenes_step() {
 
 #[test]
 fn a_rerun_knows_what_files_were_made_with() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "");
         shot.export("");
         let said = shot.export("");
@@ -241,7 +232,7 @@ fn a_rerun_knows_what_files_were_made_with() {
 
 #[test]
 fn missing_files_are_named() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "texture library");
         let said = shot.export("");
         for lost in ["lost_paint.png", "lost_library.blend"] {
@@ -254,7 +245,7 @@ fn missing_files_are_named() {
 
 #[test]
 fn motion_vectors_come_with_sequences_and_are_usable_or_absent() {
-    for python in blenders() {
+    for python in python::blenders() {
         let shot = Shot::new(&python, "");
         shot.export("--frames 4 --ref-spp 0");
         let set = shot.passes("shot_0001spp.0004.exr");

@@ -16,6 +16,7 @@ _MAGIC = 20000630
 _TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 _LINES = {0: 1, 2: 1, 3: 16}
 _ZIP = 3
+_LEVEL = 6  # of zlib, its own default
 
 
 def read(path):
@@ -81,12 +82,12 @@ def write_half(path, channels):
     _write(path, {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}, 1)
 
 
-def write_float(path, channels):
-    """The same as 32-bit floats."""
-    _write(path, {name: plane.astype("<f4") for name, plane in channels.items()}, 2)
+def write_float(path, channels, level=_LEVEL):
+    """The same as 32-bit floats, with zlib at this level: 1 takes a third of the time of 6."""
+    _write(path, {name: plane.astype("<f4") for name, plane in channels.items()}, 2, level)
 
 
-def _write(path, channels, kind):
+def _write(path, channels, kind, level=_LEVEL):
     names = sorted(channels)
     planes = [channels[name] for name in names]
     height, width = planes[0].shape
@@ -106,7 +107,7 @@ def _write(path, channels, kind):
     for top in range(0, height, _LINES[_ZIP]):
         rows = range(top, min(top + _LINES[_ZIP], height))
         raw = b"".join(plane[y].tobytes() for y in rows for plane in planes)
-        packed = _compress(raw)
+        packed = _compress(raw, level)
         chunks.append(struct.pack("<ii", top, len(packed)) + packed)
     offset = len(header) + 8 * len(chunks)
     table = b""
@@ -214,9 +215,9 @@ def _decompress(block):
     return out.tobytes()
 
 
-def _compress(raw):
+def _compress(raw, level):
     bytes_ = np.frombuffer(raw, np.uint8)
     split = np.concatenate([bytes_[0::2], bytes_[1::2]]).astype(np.int64)
     split[1:] = split[1:] - split[:-1] + 128
-    packed = zlib.compress((split & 255).astype(np.uint8).tobytes(), 6)
+    packed = zlib.compress((split & 255).astype(np.uint8).tobytes(), level)
     return packed if len(packed) < len(raw) else raw

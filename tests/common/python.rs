@@ -56,6 +56,15 @@ pub fn python() -> PathBuf {
     environment().python()
 }
 
+/// The Pythons whose bpy all must hold on.
+pub fn blenders() -> Vec<PathBuf> {
+    let older = std::env::var_os("DEMC_BPY45").map(PathBuf::from);
+    if older.is_none() {
+        eprintln!("DEMC_BPY45 is not set: tried on bpy 5.0 alone (see tests/README.md)");
+    }
+    [python()].into_iter().chain(older).collect()
+}
+
 /// One of its programs: `idiff`, `oiiotool`.
 pub fn program(name: &str) -> PathBuf {
     environment().program(name)

@@ -1,0 +1,46 @@
+"""The result beside the noisy picture in the compositor, with a wipe between both."""
+
+import bpy
+
+_MARK = "demc"
+
+
+def wire(scene, picture):
+    """Adds an image node with the result, a Split node and a viewer. Nodes of the user's stay as they are; those that
+    an earlier result brought make room for the new ones. Returns the tree."""
+    tree = _tree(scene)
+    for node in [node for node in tree.nodes if node.get(_MARK)]:
+        tree.nodes.remove(node)
+    noisy = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
+    left = min((node.location.x for node in tree.nodes), default=0.0)
+    bottom = min((node.location.y - 400 for node in tree.nodes), default=0.0)
+    if noisy is None:
+        noisy = _add(tree, "CompositorNodeRLayers", "Noisy", (left, bottom - 320))
+        noisy.scene = scene
+    result = _add(tree, "CompositorNodeImage", "Denoised by demc", (left, bottom))
+    result.image = picture
+    split = _add(tree, "CompositorNodeSplit", "Noisy | denoised", (left + 320, bottom))
+    viewer = _add(tree, "CompositorNodeViewer", "Wipe", (left + 560, bottom))
+    images = [socket for socket in split.inputs if socket.type == "RGBA"]
+    tree.links.new(noisy.outputs["Image"], images[0])
+    tree.links.new(result.outputs["Image"], images[1])
+    tree.links.new(split.outputs[0], viewer.inputs["Image"])
+    return tree
+
+
+def _tree(scene):
+    # Blender 5 keeps it as a node group that scenes share; before, each scene had one of its own.
+    if hasattr(scene, "compositing_node_group"):
+        if scene.compositing_node_group is None:
+            scene.compositing_node_group = bpy.data.node_groups.new("Compositor Nodes", "CompositorNodeTree")
+        return scene.compositing_node_group
+    if not scene.use_nodes:
+        scene.use_nodes = True
+    return scene.node_tree
+
+
+def _add(tree, kind, label, location):
+    node = tree.nodes.new(kind)
+    node.label, node.location = label, location
+    node[_MARK] = True
+    return node

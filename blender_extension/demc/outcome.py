@@ -1,0 +1,29 @@
+"""What is done with a job that has ended: its picture comes into Blender."""
+
+import os
+
+import bpy
+
+from . import compositor
+from .jobs import DONE
+
+
+def take(job):
+    """Loads the picture that a job made, if it made one, and wires it into the compositor where that is wanted. Returns
+    the image, or None."""
+    if job.state != DONE or not job.picture or not os.path.isfile(job.picture):
+        return None
+    scene = bpy.data.scenes.get(job.scene or "")
+    name = f"Denoised {job.scene}"
+    image = bpy.data.images.get(name)
+    if image is None:
+        image = bpy.data.images.load(job.picture)
+        image.name = name
+    else:
+        image.filepath = job.picture
+        image.reload()
+    # Radiance, as the render: without this, Blender would show it as if it were data.
+    image.colorspace_settings.is_data = False
+    if scene is not None and scene.demc.use_compositor:
+        compositor.wire(scene, image)
+    return image

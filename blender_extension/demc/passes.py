@@ -1,0 +1,126 @@
+"""What demc needs of a scene: which of it is missing, in words, and turning it on.
+
+Only properties of scenes and view layers are set, so Blender's own undo takes all of it back.
+"""
+
+from collections import namedtuple
+
+# Compressions of OpenEXR that lose nothing; the others blur the passes that guide demc.
+_LOSSLESS = ("NONE", "ZIP", "ZIPS", "RLE", "PIZ")
+
+# text: what is wrong and where it is set. prepared: whether Prepare Passes can set it.
+Lack = namedtuple("Lack", "text prepared")
+
+
+def rendered_layers(scene):
+    """The view layers that a render makes."""
+    return [layer for layer in scene.view_layers if layer.use]
+
+
+def is_multilayer(scene):
+    """Whether frames are written with all their passes."""
+    return scene.render.image_settings.file_format == "OPEN_EXR_MULTILAYER"
+
+
+def missing(scene, frames=False):
+    """What a render of the scene would lack for demc, most important first. `frames` asks for what frames in
+    files need as well."""
+    lacks = _of_scene(scene)
+    if hasattr(scene, "cycles"):
+        for layer in rendered_layers(scene):
+            lacks += _of_layer(scene, layer)
+    if scene.demc.use_temporal:
+        lacks += _of_sequence(scene)
+    if frames or scene.demc.use_temporal:
+        lacks += _of_output(scene)
+    return lacks
+
+
+def prepare(scene):
+    """Sets what is missing. Returns what was done, in words."""
+    done = []
+    if not hasattr(scene, "cycles"):
+        return done
+
+    def put(owner, name, value, words):
+        if getattr(owner, name) != value:
+            setattr(owner, name, value)
+            if words not in done:
+                done.append(words)
+
+    put(scene.render, "engine", "CYCLES", "Cycles renders")
+    put(scene.cycles, "use_denoising", False, "Blender's own denoising is off")
+    for layer in rendered_layers(scene):
+        put(layer, "use_pass_combined", True, "Combined is on")
+        put(layer.cycles, "denoising_store_passes", True, "Denoising Data is on")
+        if scene.demc.use_temporal:
+            put(layer, "use_pass_vector", True, "Vector is on")
+    if scene.demc.use_temporal:
+        put(scene.cycles, "use_animated_seed", True, "the seed changes from frame to frame")
+    _prepare_output(scene, put)
+    return done
+
+
+def _prepare_output(scene, put):
+    settings = scene.render.image_settings
+    if not is_multilayer(scene):
+        # Blender 5 offers the format for this media type alone.
+        if hasattr(settings, "media_type"):
+            settings.media_type = "MULTI_LAYER_IMAGE"
+        put(settings, "file_format", "OPEN_EXR_MULTILAYER", "frames are saved as OpenEXR MultiLayer")
+    if settings.exr_codec not in _LOSSLESS:
+        put(settings, "exr_codec", "ZIP", "files are compressed without loss (ZIP)")
+
+
+def _of_scene(scene):
+    if not hasattr(scene, "cycles"):
+        return [Lack("Cycles is not enabled: turn on Preferences > Add-ons > Cycles Render Engine", False)]
+    lacks = []
+    if scene.render.engine != "CYCLES":
+        lacks.append(Lack("demc denoises Cycles renders: set Render Engine to Cycles", True))
+    if scene.camera is None:
+        lacks.append(Lack("The scene has no camera: Add > Camera, and View > Cameras > Set Active", False))
+    if not rendered_layers(scene):
+        lacks.append(Lack("No view layer is rendered: turn on View Layer > Use for Rendering", False))
+    if scene.render.use_sequencer and _has_strips(scene):
+        lacks.append(Lack("The Sequencer makes the frames, which then have no passes: turn off Output Properties > "
+                          "Post Processing > Sequencer", False))
+    return lacks
+
+
+def _has_strips(scene):
+    editor = scene.sequence_editor
+    # Blender 4.4 renamed sequences to strips.
+    return editor is not None and len(getattr(editor, "strips", None) or getattr(editor, "sequences", ())) > 0
+
+
+def _of_layer(scene, layer):
+    lacks = []
+    if not layer.use_pass_combined:
+        lacks.append(Lack(f"{layer.name} lacks Combined: turn on View Layer > Passes > Data > Combined", True))
+    if not layer.cycles.denoising_store_passes:
+        lacks.append(Lack(f"{layer.name} lacks albedo and normals: turn on View Layer > Passes > Data > Denoising "
+                          "Data", True))
+    if scene.demc.use_temporal and not layer.use_pass_vector:
+        lacks.append(Lack(f"{layer.name} lacks motion: turn on View Layer > Passes > Data > Vector", True))
+    return lacks
+
+
+def _of_sequence(scene):
+    lacks = []
+    if scene.render.use_motion_blur:
+        lacks.append(Lack("Motion Blur leaves the Vector pass empty: turn it off and blur in the compositor, or turn "
+                          "off Temporal", False))
+    if hasattr(scene, "cycles") and not scene.cycles.use_animated_seed:
+        lacks.append(Lack("All frames have the same noise: turn on the clock beside Sampling > Advanced > Seed", True))
+    return lacks
+
+
+def _of_output(scene):
+    settings = scene.render.image_settings
+    if not is_multilayer(scene):
+        return [Lack(f"{settings.file_format} keeps no passes in files: set Output > File Format to OpenEXR MultiLayer",
+                     True)]
+    if settings.exr_codec not in _LOSSLESS:
+        return [Lack(f"{settings.exr_codec} compression loses detail of the passes: set Output > Codec to ZIP", True)]
+    return []

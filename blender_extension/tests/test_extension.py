@@ -1,0 +1,165 @@
+"""The extension in Blender's Python module, as a user has it: installed from its archive, enabled, used, disabled.
+
+    python test_extension.py ARCHIVE.zip      with bpy 4.5 or 5.0 from PyPI
+"""
+
+import os
+import pathlib
+import sys
+import tempfile
+import unittest
+
+ARCHIVE = pathlib.Path(sys.argv.pop(1)).resolve()
+_home = tempfile.TemporaryDirectory()
+os.environ["BLENDER_USER_RESOURCES"] = _home.name
+
+import bpy  # noqa: E402  (reads the environment when it is loaded)
+
+MODULE = "bl_ext.user_default.demc"
+
+
+def handlers():
+    """All handlers there are, by name."""
+    return {name: list(getattr(bpy.app.handlers, name)) for name in ("render_init", "render_write", "render_complete")}
+
+
+def classes():
+    """Names of what is registered."""
+    return {name for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.PropertyGroup)
+            for name in (cls.__name__ for cls in kind.__subclasses__() if cls.is_registered) if "demc" in name.lower()}
+
+
+def install():
+    """Installs and enables the archive as Preferences > Get Extensions > Install from Disk does."""
+    bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
+
+
+def scene(folder, size=32):
+    """A cube under a lamp before a camera, to be rendered in a moment."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    made = bpy.context.scene
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.object.light_add(type="SUN", rotation=(0.5, 0.3, 0))
+    bpy.ops.object.camera_add(location=(4, -4, 3), rotation=(1.1, 0, 0.785))
+    made.camera = bpy.context.object
+    made.render.engine = "CYCLES"
+    made.cycles.samples, made.cycles.device = 2, "CPU"
+    made.render.resolution_x = made.render.resolution_y = size
+    made.render.filepath = os.path.join(folder, "shot_")
+    made.frame_start, made.frame_end = 1, 2
+    made.demc.output = os.path.join(folder, "clean")
+    made.demc.model = "demc-s"
+    return made
+
+
+class Extension(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.before = handlers()
+        install()
+
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = folder.name
+        self.scene = scene(self.folder)
+
+    def prepared(self):
+        self.assertEqual(bpy.ops.demc.prepare(), {"FINISHED"})
+        self.assertEqual(sys.modules[f"{MODULE}.passes"].missing(self.scene, frames=True), [])
+
+    def clean(self):
+        folder = pathlib.Path(self.folder, "clean")
+        return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+    def refused(self, operator, words):
+        with self.assertRaisesRegex(RuntimeError, words):
+            operator()
+
+    def test_this_render_becomes_a_picture_beside_the_noisy_one(self):
+        self.prepared()
+        bpy.ops.render.render()
+        settings = self.scene.render.image_settings
+        settings.file_format = "OPEN_EXR_MULTILAYER"
+        kept = (settings.file_format, settings.color_depth, settings.exr_codec)
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.assertEqual((settings.file_format, settings.color_depth, settings.exr_codec), kept)
+        picture = bpy.data.images[f"Denoised {self.scene.name}"]
+        self.assertEqual(tuple(picture.size), (32, 32))
+        self.assertTrue(max(picture.pixels[:]) > 0.0)
+        tree = getattr(self.scene, "compositing_node_group", None) or self.scene.node_tree
+        mine = [node for node in tree.nodes if node.get("demc")]
+        split = next(node for node in mine if node.bl_idname == "CompositorNodeSplit")
+        sides = [link.from_node.bl_idname for socket in split.inputs for link in socket.links]
+        self.assertEqual(sorted(sides), ["CompositorNodeImage", "CompositorNodeRLayers"])
+        # Again: the picture is the same one, and the nodes are not doubled.
+        count = len(tree.nodes)
+        bpy.ops.demc.denoise_render()
+        self.assertEqual(len(tree.nodes), count)
+
+    def test_frames_of_a_range_and_of_a_folder(self):
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        self.assertEqual(self.clean(), ["shot_0001.exr", "shot_0002.exr"])
+        self.scene.demc.folder = self.folder
+        self.scene.demc.output = os.path.join(self.folder, "other")
+        self.assertEqual(bpy.ops.demc.denoise_folder(), {"FINISHED"})
+        self.assertEqual(sorted(os.listdir(self.scene.demc.output)), ["shot_0001.exr", "shot_0002.exr"])
+
+    def test_renders_are_denoised_when_they_are_done(self):
+        self.prepared()
+        self.scene.demc.after_render = True
+        bpy.ops.render.render()
+        self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
+        bpy.ops.render.render(animation=True)
+        self.assertEqual([name for name in self.clean() if name.startswith("shot_")], ["shot_0001.exr", "shot_0002.exr"])
+
+    def test_undo_takes_back_what_was_prepared(self):
+        def state():
+            settings, layer = bpy.context.scene.render.image_settings, bpy.context.scene.view_layers[0]
+            return settings.file_format, layer.cycles.denoising_store_passes
+
+        before = state()
+        bpy.ops.ed.undo_push(message="before")
+        bpy.ops.demc.prepare()
+        self.assertNotEqual(state(), before)
+        bpy.ops.ed.undo_push(message="prepared")
+        bpy.ops.ed.undo()
+        self.assertEqual(state(), before)
+
+    def test_what_is_missing_is_said_with_its_remedy(self):
+        self.refused(bpy.ops.demc.denoise_folder, "Choose the folder")
+        self.refused(bpy.ops.demc.denoise_range, "render the animation first")
+        bpy.ops.render.render()
+        self.refused(bpy.ops.demc.denoise_render, "Denoising Data.*Prepare Passes sets it")
+        self.prepared()
+        self.scene.demc.model, self.scene.demc.weights = "FILE", ""
+        self.refused(bpy.ops.demc.denoise_render, "Choose the weights file")
+
+    def test_a_job_is_cancelled_and_leaves_no_half_file(self):
+        jobs, plans = sys.modules[f"{MODULE}.jobs"], sys.modules[f"{MODULE}.plans"]
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        job = plans.of_range(self.scene)
+        jobs.begin(job)
+        self.assertTrue(jobs.is_running() and not bpy.ops.demc.denoise_range.poll())
+        job.stop()
+        job.wait()
+        self.assertIn(job.state, (jobs.CANCELLED, jobs.DONE))
+        self.assertFalse([name for name in self.clean() if name.endswith(".tmp")])
+
+    def test_a_worker_that_fails_is_told_in_words(self):
+        self.prepared()
+        pathlib.Path(self.folder, "shot_0001.exr").write_bytes(b"no EXR at all")
+        self.refused(bpy.ops.demc.denoise_range, "shot_0001.exr.*not an EXR")
+
+    def test_zz_nothing_stays_when_it_is_disabled(self):
+        bpy.ops.preferences.addon_disable(module=MODULE)
+        self.assertFalse(hasattr(bpy.types.Scene, "demc"))
+        self.assertEqual(handlers(), self.before)
+        self.assertFalse(classes())
+
+
+if __name__ == "__main__":
+    unittest.main(verbosity=2)
