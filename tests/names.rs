@@ -12,6 +12,9 @@ use exr::prelude::*;
 
 const SIDE: usize = 128;
 
+/// A part's name, its view, and its channels by name with the planes they are of.
+type Part<'a> = (&'a str, Option<&'a str>, &'a [(&'a str, usize)]);
+
 /// The channels of a render: beauty, albedo and normal, three values of each pixel, and a depth.
 struct Render([Vec<f32>; 10]);
 
@@ -55,8 +58,8 @@ impl Render {
     }
 
     /// Parts by name, view and channels.
-    fn write_parts(&self, path: &Path, parts: &[(&str, Option<&str>, &[(&str, usize)])]) {
-        let part = |(name, view, channels): &(&str, Option<&str>, &[(&str, usize)])| {
+    fn write_parts(&self, path: &Path, parts: &[Part<'_>]) {
+        let part = |(name, view, channels): &Part<'_>| {
             let mut attributes = LayerAttributes::named(*name);
             attributes.view_name = view.map(Text::from);
             self.layer(channels, attributes)

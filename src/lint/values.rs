@@ -63,7 +63,8 @@ fn single_values(
     let count = |is: &dyn Fn(f32) -> bool| planes.data.iter().filter(|v| is(**v)).count();
     // Beyond everything there is no depth, and as a half float that is infinite.
     let may_be_infinite = matches!(pass, Pass::Depth | Pass::DenoisingDepth);
-    let bad = count(&|v| !v.is_finite() && !(may_be_infinite && v == f32::INFINITY));
+    let is_well = |v: f32| v.is_finite() || (may_be_infinite && v == f32::INFINITY);
+    let bad = count(&|v| !is_well(v));
     let of = planes.data.len();
     if bad > 0 {
         findings.push(Finding::new(

@@ -220,11 +220,8 @@ fn join_default_view(found: &mut Vec<(LayerKey, ByPass)>, default: &str) {
             continue;
         };
         for (pass, places) in std::mem::take(&mut found[at].1) {
-            if found[target].1.contains_key(&pass) {
-                found[at].1.insert(pass, places);
-            } else {
-                found[target].1.insert(pass, places);
-            }
+            let keeper = if found[target].1.contains_key(&pass) { at } else { target };
+            found[keeper].1.insert(pass, places);
         }
         // The default view keeps the place of what it took in: it comes first.
         if found[at].1.is_empty() {
