@@ -1,6 +1,6 @@
 //! The denoise engine: files in, each of them out again with a layer more.
 //!
-//! [`file`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`]
+//! [`file()`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`], [`denoise`]
 //! and [`store`] are the steps of which both are made. With [`Options::temporal`], a batch does frames of a sequence
 //! with their neighbours. Nothing is printed: what the user should know is in each frame's [`Report`].
 

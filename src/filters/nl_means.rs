@@ -93,7 +93,7 @@ impl Weights {
     }
 
     /// The weight that each pixel p of the tile at (x, y) gives to `p + (dx, dy)`, into
-    /// [`TILE_H`] rows of [`TILE_W`]; 0 where one of them is outside the frame.
+    /// `TILE_H` rows of `TILE_W`; 0 where one of them is outside the frame.
     #[inline(always)]
     pub fn of_tile(
         &self,

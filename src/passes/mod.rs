@@ -1,7 +1,7 @@
 //! What a render pass means: the one table from renderer channel names to passes, and the decoded
 //! passes of one view layer.
 //!
-//! In: a [`Frame`](crate::frame::Frame). Out: a [`PassSet`] of f32 planes. Nothing is scaled or
+//! In: a [`Frame`]. Out: a [`PassSet`] of f32 planes. Nothing is scaled or
 //! clamped here; `features` decides what a network sees.
 
 mod channels;

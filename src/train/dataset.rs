@@ -17,7 +17,7 @@ use crate::{
     testset::Pair,
 };
 
-/// Frames and references, decoded once and held in the precision that they mostly come in, see [`Values`].
+/// Frames and references, decoded once and held in the precision that they mostly come in, see `Values`.
 pub struct Dataset {
     frames: Vec<Stored>,
     /// Pixels of all frames up to and with each.

@@ -2,7 +2,7 @@
 //!
 //! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for a
 //! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
-//! then taps. Where squares of outputs are computed together, they are as [`winograd::pack`] says.
+//! then taps. Where squares of outputs are computed together, they are as `winograd::pack` says.
 
 use std::ops::Range;
 

@@ -106,7 +106,7 @@ pub const ACTIVATION_STEPS: f32 = 255.0;
 const CHUNK: usize = 32;
 
 /// Sixty-four bytes, a row of a matrix tile: the channels of one pixel, or the weights of 16 outputs for the
-/// channels of one [`WORD`], output by output.
+/// channels of one `WORD`, output by output.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(C, align(64))]
 pub struct Wide([u8; BYTES]);
