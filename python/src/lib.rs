@@ -173,7 +173,7 @@ fn denoise_path(
     out: PathBuf,
     model: String,
     view_layer: Option<String>,
-    (albedo, normal): (Option<PathBuf>, Option<PathBuf>),
+    guides: (Option<PathBuf>, Option<PathBuf>),
     names: Vec<String>,
     threads: Option<usize>,
 ) -> PyResult<(String, usize, usize, f64, HashMap<String, usize>, Vec<String>)> {
@@ -182,6 +182,7 @@ fn denoise_path(
         for line in names {
             mapping.add(&line).map_err(|why| Failure::Usage(format!("names: {why}")))?;
         }
+        let (albedo, normal) = guides;
         let sources = Sources { mapping, albedo, normal };
         let (model, options) = (open(&model)?, Options { view_layer, sources, ..Options::default() });
         let denoised = denoise::denoise(denoise::load(&source, &*model, &options)?, &*model, &options)?;
