@@ -191,7 +191,7 @@ fn overlap(options: &Options) {
     for round in 0..=5 {
         let ((frame, shot), read) = timed(|| {
             let frame = Frame::read(&first).expect("just written");
-            let layers = passes::layers(&frame, &passes::Mapping::default());
+            let layers = passes::layers(&frame);
             let layer = passes::choose(&frame, &layers, None).expect("a render has a view layer");
             let shot = shot::prepare_layer(&frame, layer, &wanted, &Sources::default())
                 .expect("its passes are known");

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::{
     Error, Result,
     frame::Frame,
+    frame_number::frame_number,
     passes::{self, Layer, Mapping, Pass, PassSet, Turn, to_camera_space},
     planes::Planes,
 };
@@ -31,15 +32,14 @@ const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
     let text = pattern.to_string_lossy();
     let Some((head, width, tail)) = placeholder(&text) else { return Ok(pattern.into()) };
-    let stem = frame.file_stem().unwrap_or_default().to_string_lossy();
-    let digits = &stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..];
-    if digits.is_empty() {
+    let Some(number) = frame_number(frame) else {
         let pattern = pattern.display();
         let why = format!("its name ends in no number to put into {pattern}; rename it, or name one file");
         return Err(Error::invalid(frame, why));
-    }
-    let number = digits.trim_start_matches('0');
-    Ok(format!("{head}{number:0>width$}{tail}").into())
+    };
+    // As Blender writes it: the width is that of the digits, whatever the sign.
+    let sign = if number < 0 { "-" } else { "" };
+    Ok(format!("{head}{sign}{:0width$}{tail}", number.unsigned_abs()).into())
 }
 
 /// Whether a pattern names another file for each frame.
@@ -133,6 +133,7 @@ mod tests {
         assert_eq!(named("rgb.17.exr", "albedo.%04d.exr").unwrap(), "albedo.0017.exr");
         assert_eq!(named("rgb.12345.exr", "albedo.###.exr").unwrap(), "albedo.12345.exr");
         assert_eq!(named("rgb.0000.exr", "albedo.##.exr").unwrap(), "albedo.00.exr");
+        assert_eq!(named("rgb.-0003.exr", "albedo.####.exr").unwrap(), "albedo.-0003.exr");
         assert_eq!(named("rgb.exr", "albedo.exr").unwrap(), "albedo.exr");
         assert_eq!(named("rgb.exr", "100%.exr").unwrap(), "100%.exr");
         assert!(named("rgb.exr", "albedo.####.exr").unwrap_err().to_string().contains("no number"));

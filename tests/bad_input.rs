@@ -226,7 +226,7 @@ fn originals() -> &'static [Vec<u8>] {
 fn consume(bytes: &[u8]) -> demc::Result<()> {
     let (_dir, path) = file(bytes);
     let frame = Frame::read(&path)?;
-    for layer in passes::layers(&frame, &passes::Mapping::default()) {
+    for layer in passes::layers(&frame) {
         if !layer.passes.is_empty() {
             passes::read_layer(&frame, &layer, &passes::Pass::ALL)?.sanitize();
         }

@@ -98,10 +98,7 @@ impl Shot {
 
     fn views(&self, name: &str) -> Vec<String> {
         let frame = Frame::read(self.out().join(name)).unwrap();
-        passes::layers(&frame, &passes::Mapping::default())
-            .into_iter()
-            .filter_map(|layer| layer.view)
-            .collect()
+        passes::layers(&frame).into_iter().filter_map(|layer| layer.view).collect()
     }
 }
 

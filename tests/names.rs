@@ -74,9 +74,8 @@ fn channels<'a>(names: &[&'a str; 9]) -> Vec<(&'a str, usize)> {
     names.iter().enumerate().map(|(plane, name)| (*name, plane)).collect()
 }
 
-/// Denoises a file; returns the result's path.
-#[track_caller]
-fn denoise(input: &Path, options: &[&str]) -> PathBuf {
+/// The command that denoises a file, and the folder of its result.
+fn command(input: &Path, options: &[&str]) -> (assert_cmd::Command, PathBuf) {
     let out = input.with_extension("out");
     let mut command = demc();
     command
@@ -85,21 +84,20 @@ fn denoise(input: &Path, options: &[&str]) -> PathBuf {
         .arg(input)
         .arg("--out")
         .arg(&out);
+    (command, out)
+}
+
+/// Denoises a file; returns the result's path.
+#[track_caller]
+fn denoise(input: &Path, options: &[&str]) -> PathBuf {
+    let (mut command, out) = command(input, options);
     command.assert().success();
     out.join(input.file_name().unwrap())
 }
 
 /// What it says when it denoises a file, or refuses to.
 fn said(input: &Path, options: &[&str]) -> String {
-    let out = input.with_extension("out");
-    let mut command = demc();
-    command
-        .args(["denoise", "--model", "demc-s", "--overwrite"])
-        .args(options)
-        .arg(input)
-        .arg("--out")
-        .arg(&out);
-    String::from_utf8(command.output().unwrap().stderr).unwrap()
+    String::from_utf8(command(input, options).0.output().unwrap().stderr).unwrap()
 }
 
 fn layer(path: &Path, name: &str) -> [Vec<f32>; 3] {
@@ -129,62 +127,32 @@ fn expected(folder: &Path) -> [Vec<f32>; 3] {
 fn every_renderers_names_are_known() {
     let dir = tempfile::tempdir().unwrap();
     let expected = expected(dir.path());
-    // Beauty, albedo, normal; what stands before a component, or is one without.
-    let renderers: [(&str, [&str; 3], [&str; 9]); 16] = [
-        (
-            "blender file output",
-            ["Image", "Denoising Albedo", "Denoising Normal"],
-            ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"],
-        ),
-        ("arnold", ["", "denoise_albedo", "N"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
-        ("arnold of old", ["RGBA", "diffuse_albedo", "N"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
-        (
-            "v-ray for max",
-            ["", "VRayDiffuseFilter", "VRayNormals"],
-            ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"],
-        ),
-        (
-            "v-ray for maya",
-            ["", "diffuse", "bumpNormals"],
-            ["R", "G", "B", "red", "green", "blue", "X", "Y", "Z"],
-        ),
-        ("renderman", ["Ci", "albedo", "normal"], ["r", "g", "b", "r", "g", "b", "x", "y", "z"]),
-        ("redshift", ["", "DiffuseFilter", "Normals"], ["R", "G", "B", "R", "G", "B", "R", "G", "B"]),
-        ("karma", ["C", "albedo", "N"], ["r", "g", "b", "r", "g", "b", "x", "y", "z"]),
-        (
-            "octane",
-            ["Beauty", "Denoise albedo", "Denoise normal"],
-            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
-        ),
-        (
-            "octane otherwise",
-            ["", "DenoiseAlbedo", "DenoiseNormal"],
-            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
-        ),
-        (
-            "corona",
-            ["", "CShading_Albedo", "CGeometry_NormalsShading"],
-            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
-        ),
-        ("mitsuba", ["", "albedo", "nn"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
-        ("pbrt", ["", "Albedo", "Ns"], ["R", "G", "B", "R", "G", "B", "X", "Y", "Z"]),
-        ("luxcore", ["RGB", "ALBEDO", "AVG_SHADING_NORMAL"], ["R", "G", "B", "R", "G", "B", "R", "G", "B"]),
-        (
-            "unreal",
-            ["FinalImage", "FinalImageBaseColor", "FinalImageWorldNormal"],
-            ["R", "G", "B", "R", "G", "B", "R", "G", "B"],
-        ),
-        (
-            "moonray",
-            ["", "denoise_albedo", "denoise_normal"],
-            ["red", "green", "blue", "R", "G", "B", "R", "G", "B"],
-        ),
+    let (rgb, xyz, words) = (["R", "G", "B"], ["X", "Y", "Z"], ["red", "green", "blue"]);
+    let (low_rgb, low_xyz) = (["r", "g", "b"], ["x", "y", "z"]);
+    // Beauty, albedo and normal: what stands before their components, which may be nothing, and those.
+    let renderers: [(&str, [&str; 3], [[&str; 3]; 3]); 16] = [
+        ("blender file output", ["Image", "Denoising Albedo", "Denoising Normal"], [rgb, rgb, xyz]),
+        ("arnold", ["", "denoise_albedo", "N"], [rgb, rgb, xyz]),
+        ("arnold of old", ["RGBA", "diffuse_albedo", "N"], [rgb, rgb, xyz]),
+        ("v-ray for max", ["", "VRayDiffuseFilter", "VRayNormals"], [rgb, rgb, xyz]),
+        ("v-ray for maya", ["", "diffuse", "bumpNormals"], [rgb, words, xyz]),
+        ("renderman", ["Ci", "albedo", "normal"], [low_rgb, low_rgb, low_xyz]),
+        ("redshift", ["", "DiffuseFilter", "Normals"], [rgb, rgb, rgb]),
+        ("karma", ["C", "albedo", "N"], [low_rgb, low_rgb, low_xyz]),
+        ("octane", ["Beauty", "Denoise albedo", "Denoise normal"], [rgb, rgb, rgb]),
+        ("octane otherwise", ["", "DenoiseAlbedo", "DenoiseNormal"], [rgb, rgb, rgb]),
+        ("corona", ["", "CShading_Albedo", "CGeometry_NormalsShading"], [rgb, rgb, rgb]),
+        ("mitsuba", ["", "albedo", "nn"], [rgb, rgb, xyz]),
+        ("pbrt", ["", "Albedo", "Ns"], [rgb, rgb, xyz]),
+        ("luxcore", ["RGB", "ALBEDO", "AVG_SHADING_NORMAL"], [rgb, rgb, rgb]),
+        ("unreal", ["FinalImage", "FinalImageBaseColor", "FinalImageWorldNormal"], [rgb, rgb, rgb]),
+        ("moonray", ["", "denoise_albedo", "denoise_normal"], [words, rgb, rgb]),
     ];
     for (renderer, layers, components) in renderers {
         let path = dir.path().join(format!("{renderer}.exr"));
         let full = |plane: usize| match layers[plane / 3] {
-            "" => components[plane].to_owned(),
-            layer => format!("{layer}.{}", components[plane]),
+            "" => components[plane / 3][plane % 3].to_owned(),
+            layer => format!("{layer}.{}", components[plane / 3][plane % 3]),
         };
         let names: Vec<String> = (0..9).map(full).collect();
         let of_planes: Vec<(&str, usize)> =

@@ -135,7 +135,6 @@ def _save(render, scene, path):
             raise JobError(_NOTHING) from None
         raise JobError(f"The render cannot be saved to {path}: {' '.join(str(error).split())}") from None
     finally:
-        # The media type first: it decides which formats there are.
-        for name in ("media_type", "file_format", "color_depth", "exr_codec"):
-            if name in kept:
-                setattr(settings, name, kept[name])
+        # In the order in which they were set: the media type decides which formats there are.
+        for name, value in kept.items():
+            setattr(settings, name, value)

@@ -10,7 +10,7 @@ use crate::{
     Error, Result,
     frame::Frame,
     metrics::{self, Scores},
-    passes::{self, COMBINED, Layer, Mapping, Pass, PassSet},
+    passes::{self, COMBINED, Layer, Pass, PassSet},
     planes::Planes,
     report::number,
 };
@@ -113,7 +113,7 @@ fn judged(args: &Args) -> Result<PassSet> {
     };
     let layer = match layer {
         Some(layer) => layer,
-        None => passes::choose(&frame, &passes::layers(&frame, &Mapping::default()), view_layer)?.clone(),
+        None => passes::choose(&frame, &passes::layers(&frame), view_layer)?.clone(),
     };
     combined(&frame, &layer)
 }
@@ -121,7 +121,7 @@ fn judged(args: &Args) -> Result<PassSet> {
 /// What it is judged by, of the view layer of that name if there is one.
 fn reference(args: &Args, view_layer: &str) -> Result<PassSet> {
     let frame = Frame::read(&args.reference)?;
-    let layers = passes::layers(&frame, &Mapping::default());
+    let layers = passes::layers(&frame);
     let layer = match args.reference_layer.as_str() {
         COMBINED => passes::choose_like(&frame, &layers, view_layer)?.clone(),
         name => {

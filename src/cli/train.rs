@@ -20,7 +20,7 @@ use crate::{
     frame::Frame,
     models::{self, learned::TURNED, network::Architecture, weights_file},
     nn::Precision,
-    passes::{self, Mapping, Pass},
+    passes::{self, Pass},
     report,
     testset::{self, Pair},
     train::{self, Event, Loss, Options, Rule},
@@ -192,7 +192,7 @@ fn from_anywhere(mut pairs: Vec<Pair>) -> Result<Vec<Pair>> {
 /// Whether the noisy frame of a pair holds what KPCN's two streams read.
 fn has_light_passes(pair: &Pair) -> Result<bool> {
     let frame = Frame::read(&pair.noisy)?;
-    let layers = passes::layers(&frame, &Mapping::default());
+    let layers = passes::layers(&frame);
     let layer = passes::choose(&frame, &layers, None)?;
     let light = [Pass::DiffuseDirect, Pass::DiffuseIndirect, Pass::DiffuseColor];
     Ok(light.iter().all(|pass| layer.passes.contains_key(pass)))

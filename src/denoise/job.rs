@@ -136,7 +136,7 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
 pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
     let input = frame.path();
-    let layers = passes::layers(&frame, &options.sources.mapping);
+    let layers = passes::layers_by(&frame, &options.sources.mapping);
     let chosen = passes::choose(&frame, &layers, options.view_layer.as_deref())?;
     let mut report = Report {
         view_layer: chosen.name.clone(),
@@ -469,7 +469,7 @@ pub(super) fn existing(output: &Path) -> Option<Frame> {
 /// It is another: nothing is overwritten unasked. Or a preview cannot be written.
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
-    let layers = passes::layers(headers, &options.sources.mapping);
+    let layers = passes::layers_by(headers, &options.sources.mapping);
     let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
     let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);

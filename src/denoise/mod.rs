@@ -21,9 +21,10 @@ pub use batch::{Batch, End, Outcome, Stopper};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, shot, store};
 pub use lights::Alpha;
 pub use plan::{Input, Plan, plan, plan_tree};
-pub use sequence::{follows, frame_number};
+pub use sequence::follows;
 pub use watch::{Look, Watch};
 
+pub use crate::frame_number::frame_number;
 use crate::{Result, models::Denoiser};
 
 /// Reads a frame, denoises it and writes it, whole, with the result as a new layer. What is at the output's place is replaced.

@@ -12,6 +12,7 @@ use std::{
 };
 
 use super::Job;
+use crate::frame_number::split;
 
 /// What the names of a sequence's frames have in common.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -32,14 +33,7 @@ impl Place {
     fn of(file: &Path) -> Option<Self> {
         let name = file.file_name()?.to_str()?;
         let stem = file.file_stem()?.to_str()?;
-        let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
-        let digits = &stem[head.len()..];
-        let number: i64 = digits.parse().ok()?;
-        // A minus is the number's where it stands for nothing else: at the beginning or after a dot.
-        let (head, number) = match head.strip_suffix('-') {
-            Some(rest) if rest.is_empty() || rest.ends_with('.') => (rest, -number),
-            _ => (head, number),
-        };
+        let (head, number) = split(stem)?;
         let (before, after) = (head.to_owned(), name[stem.len()..].to_owned());
         Some(Self { key: Key { folder: file.parent()?.to_owned(), before, after }, number })
     }
@@ -60,11 +54,6 @@ impl Place {
         }
         found
     }
-}
-
-/// The frame number that a file's name ends in; none where it ends in none.
-pub fn frame_number(file: &Path) -> Option<i64> {
-    Place::of(file).map(|place| place.number)
 }
 
 /// Whether a file is the frame after another, by their names.
@@ -201,20 +190,5 @@ mod tests {
         assert_eq!(lengths(2, 3), [1, 1]);
         assert_eq!(lengths(5, 1), [5]);
         assert_eq!(lengths(0, 2), [0usize; 0]);
-    }
-
-    #[test]
-    fn frame_numbers_end_names() {
-        for (name, expected) in [
-            ("shot_0004spp.0017.exr", Some(17)),
-            ("shot0017.exr", Some(17)),
-            ("a-3/shot-0017.exr", Some(17)),
-            ("shot.-0003.exr", Some(-3)),
-            ("0001.exr", Some(1)),
-            ("shot_0004spp.exr", None),
-            ("shot.exr", None),
-        ] {
-            assert_eq!(frame_number(Path::new(name)), expected, "{name}");
-        }
     }
 }

@@ -7,8 +7,7 @@ use rayon::prelude::*;
 
 use super::{
     Finding,
-    light::{logarithms, median, quantile, sums},
-    render,
+    light::{logarithms, median, quantile},
     values::LINEAR,
 };
 use crate::{
@@ -35,21 +34,17 @@ fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Ve
     squares.into_values().filter(|square| square.len() >= EDGES_OF_SQUARE).collect()
 }
 
-/// Judges edges, against those of the beauty only where the guides lie as it does: `is_aligned`.
-pub fn check(set: &PassSet, is_aligned: bool, findings: &mut Vec<Finding>) {
-    let (Some(albedo), Some(normal), Some(render)) =
-        (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal), render(set))
+/// Judges edges, and where the guides lie as the render does also against its `light`, the sums of its channels.
+pub fn check(set: &PassSet, render: &Planes, light: Option<&Vec<f32>>, findings: &mut Vec<Finding>) {
+    let (Some(albedo), Some(normal)) = (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal))
     else {
         return;
     };
     soft(&[albedo, normal], findings);
-    if !is_aligned {
-        return;
-    }
-    let light = sums(render);
-    let logs = logarithms(&light, 0.02);
+    let Some(light) = light else { return };
+    let logs = logarithms(light, 0.02);
     blurred(set, (albedo, normal), &logs, findings);
-    encoded(set, (albedo, normal), &light, findings);
+    encoded(render, (albedo, normal), light, findings);
 }
 
 /// The way along rows or down columns: how far apart pixels are, and how many there are in a line and lines.
@@ -234,14 +229,13 @@ const ALBEDO_STEP: f32 = 0.5;
 const ENCODED: std::ops::Range<f32> = 0.3..0.66;
 
 /// Pixels with the curve of a display: none is above one, and light does not follow the albedo in proportion.
-fn encoded(set: &PassSet, guides: (&Planes, &Planes), light: &[f32], findings: &mut Vec<Finding>) {
-    let Some(render) = render(set) else { return };
+fn encoded(render: &Planes, guides: (&Planes, &Planes), light: &[f32], findings: &mut Vec<Finding>) {
     let (albedo, normal) = guides;
     if !render.data.iter().all(|v| (0.0..=1.0).contains(v)) {
         return;
     }
     let shown = |at: usize| (0..3).map(|c| albedo.channel(c)[at].max(0.0)).sum::<f32>();
-    let mut slopes: Vec<f32> = Way::both(set.width, set.height)
+    let mut slopes: Vec<f32> = Way::both(render.width, render.height)
         .into_iter()
         .flat_map(|way| {
             way.find(9, |place| {

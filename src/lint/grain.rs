@@ -3,11 +3,8 @@
 //!
 //! In: passes of consecutive frames. Out: a warning that names the setting.
 
-use super::Finding;
-use crate::{
-    passes::{Pass, PassSet},
-    planes::Planes,
-};
+use super::{Finding, GUIDES, render};
+use crate::{passes::PassSet, planes::Planes};
 
 /// The noise of a frame, as far as it shows: by how much the light of each pixel differs from the mean of those around it,
 /// relative; NaN where that may be texture or an edge.
@@ -34,9 +31,8 @@ const SHARED: f64 = 0.2;
 impl Grain {
     /// Of a view layer's passes; none without Combined or anything to tell texture by.
     pub fn of(set: &PassSet) -> Option<Self> {
-        let radiance = set.get(Pass::NoisyImage).or_else(|| set.get(Pass::Combined))?;
-        let guides: Vec<&Planes> =
-            [Pass::DenoisingAlbedo, Pass::DenoisingNormal].iter().filter_map(|pass| set.get(*pass)).collect();
+        let radiance = render(set)?;
+        let guides: Vec<&Planes> = GUIDES.iter().filter_map(|pass| set.get(*pass)).collect();
         let (width, height) = (set.width, set.height);
         if guides.is_empty() || width < 3 || height < 3 {
             return None;
@@ -101,7 +97,7 @@ impl Grain {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rng::Rng;
+    use crate::{passes::Pass, rng::Rng};
 
     /// Passes of a flat wall with noise of a seed.
     fn grain(seed: u64, amount: f32) -> Grain {

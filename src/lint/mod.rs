@@ -67,11 +67,13 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     if set.width < LEAST_SIZE || set.height < LEAST_SIZE {
         return findings;
     }
-    noise::check(set, &mut findings);
+    let Some(render) = render(set) else { return findings };
+    let light = light::sums(render);
+    noise::check(set, render, &light, &mut findings);
     // What lies elsewhere tells nothing of the beauty's edges.
-    let is_shifted = shift::check(set, &mut findings);
-    edges::check(set, !is_shifted, &mut findings);
-    noise::clamped(set, &mut findings);
+    let is_shifted = shift::check(set, &light, &mut findings);
+    edges::check(set, render, (!is_shifted).then_some(&light), &mut findings);
+    noise::clamped(set, &light, &mut findings);
     findings
 }
 

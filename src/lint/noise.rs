@@ -9,8 +9,7 @@ use rayon::prelude::*;
 
 use super::{
     Finding,
-    light::{lit_surfaces, median, quantile, sums, usual_logarithms},
-    render,
+    light::{lit_surfaces, median, quantile, usual_logarithms},
 };
 use crate::{passes::PassSet, planes::Planes};
 
@@ -35,9 +34,9 @@ const ALIKE: f32 = 0.88;
 /// 64 samples that is spread by half a pixel has 0.01 to 0.5.
 const REMOVED: f32 = 0.015;
 
-pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
-    let Some(render) = render(set) else { return };
-    if let Some((ratio, amplitude)) = likeness(set, render).filter(|(ratio, _)| *ratio < ALIKE) {
+/// `light` is [`sums`](super::light::sums) of the render.
+pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<Finding>) {
+    if let Some((ratio, amplitude)) = likeness(set, render, light).filter(|(ratio, _)| *ratio < ALIKE) {
         // Where Blender kept the render it is that which is judged here.
         findings.push(if amplitude < REMOVED {
             Finding::new(
@@ -64,11 +63,10 @@ pub fn check(set: &PassSet, findings: &mut Vec<Finding>) {
 
 /// By how much less neighbours differ than pixels two apart, in most squares, and the median of their differences; none where
 /// too little shows.
-fn likeness(set: &PassSet, render: &Planes) -> Option<(f32, f32)> {
+fn likeness(set: &PassSet, render: &Planes, light: &[f32]) -> Option<(f32, f32)> {
     let surfaces = lit_surfaces(set, render)?;
-    let light = sums(render);
     let (w, h) = (set.width, set.height);
-    let logs = usual_logarithms(&light);
+    let logs = usual_logarithms(light);
     let around = |at: usize, n: usize| [at - n * w, at - n, at + n, at + n * w];
     let is_of_use = |at: usize| {
         let others = || around(at, 1).into_iter().chain(around(at, 2));
@@ -119,13 +117,11 @@ const CLAMPED_PIXELS: f32 = 30.0;
 /// such sample adds three times the clamp, divided by N: many pixels stand out from those around them by just that.
 ///
 /// To be asked last: what is cut off at 1 was encoded for a display, which is another fault.
-pub fn clamped(set: &PassSet, findings: &mut Vec<Finding>) {
-    let Some(render) = render(set) else { return };
+pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
     let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
     if findings.iter().any(|finding| finding.code == "display-pixels") {
         return;
     }
-    let light = sums(render);
     let (w, h) = (set.width, set.height);
     let logs: Vec<f32> = (w..w * (h - 1))
         .filter(|at| (1..w - 1).contains(&(at % w)))

@@ -5,11 +5,7 @@
 
 use rayon::prelude::*;
 
-use super::{
-    Finding, GUIDES,
-    light::{logarithms, sums},
-    render,
-};
+use super::{Finding, GUIDES, light::logarithms};
 use crate::{passes::PassSet, planes::Planes};
 
 /// Largest shift that is tried, in pixels.
@@ -28,12 +24,11 @@ const BETTER: f64 = 1.2;
 /// Rows that are held against each other: those of larger frames are picked evenly.
 const ROWS: usize = 400;
 
-/// Whether a guide lies elsewhere.
-pub fn check(set: &PassSet, findings: &mut Vec<Finding>) -> bool {
-    let Some(render) = render(set) else { return false };
+/// Whether a guide lies elsewhere than `light`, the sums of the render's channels.
+pub fn check(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) -> bool {
     let before = findings.len();
     let (w, h) = (set.width, set.height);
-    let blurred = blur(&sums(render), w, h);
+    let blurred = blur(light, w, h);
     let beauty = edges(&[&logarithms(&blurred, 0.05)], w, h, 1.0);
     for pass in GUIDES {
         let Some(guide) = set.get(pass) else { continue };

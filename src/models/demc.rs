@@ -95,28 +95,15 @@ pub fn semc_widths(widths: &[usize]) -> Vec<usize> {
 
 /// DEMC, with fusion or without.
 pub static DESIGN: Design = Design {
-    inputs: INPUTS,
+    inputs: "paper/gamma/1",
     levels: PAPER_WIDTHS.len(),
     prefilter_levels: 0,
     least_parameters: |config| squares(4, &config.widths),
-    build,
+    build: |config, seed| Box::new(Demc::new(config.architecture, &config.widths, seed)),
 };
 
 /// SEMC.
-pub static SINGLE: Design = Design {
-    inputs: INPUTS,
-    levels: PAPER_WIDTHS.len(),
-    prefilter_levels: 0,
-    least_parameters: |config| squares(2, &config.widths),
-    build,
-};
-
-/// See [`Design::inputs`].
-const INPUTS: &str = "paper/gamma/1";
-
-fn build(config: &Config, seed: u64) -> Box<dyn Network> {
-    Box::new(Demc::new(config.architecture, &config.widths, seed))
-}
+pub static SINGLE: Design = Design { least_parameters: |config| squares(2, &config.widths), ..DESIGN };
 
 /// DEMC, DEMC without fusion, or SEMC.
 #[derive(Clone)]

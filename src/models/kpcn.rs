@@ -58,25 +58,19 @@ pub static DESIGN: Design = Design {
     levels: 1,
     prefilter_levels: 0,
     least_parameters: |config| stream_parameters(2, config),
-    build,
+    build: |config, seed| Box::new(Kpcn::new(config, seed)),
 };
 
 /// KPCN with one.
 pub static COMBINED: Design = Design {
     inputs: "kpcn-combined/logarithm/1",
-    levels: 1,
-    prefilter_levels: 0,
     least_parameters: |config| stream_parameters(1, config),
-    build,
+    ..DESIGN
 };
 
 /// Parameters of the layers between a stream's first and last.
 fn stream_parameters(streams: usize, config: &Config) -> usize {
     streams * (LAYERS - 2) * TAPS * TAPS * config.widths[0] * config.widths[0]
-}
-
-fn build(config: &Config, seed: u64) -> Box<dyn Network> {
-    Box::new(Kpcn::new(config, seed))
 }
 
 /// Both streams, or the single one over Combined.

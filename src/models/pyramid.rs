@@ -97,28 +97,16 @@ const NORMAL_CHANNELS: usize = 3;
 
 /// The kernel-predicting dual encoder with its prefilter.
 pub static DESIGN: Design = Design {
-    inputs: INPUTS,
+    // Those of a prefilter as well, since it may be part of a pyramid, and come out of one.
+    inputs: "guides/logarithm/1",
     levels: LEVELS,
     prefilter_levels: LEVELS,
     least_parameters: |config| squares(2, &config.widths) + squares(2, &config.prefilter),
-    build,
+    build: |config, seed| Box::new(Pyramid::new(config, seed)),
 };
 
 /// A prefilter by itself.
-pub static ALONE: Design = Design {
-    inputs: INPUTS,
-    levels: LEVELS,
-    prefilter_levels: 0,
-    least_parameters: |config| squares(2, &config.widths),
-    build,
-};
-
-/// See [`Design::inputs`]: alike, since a prefilter may be part of a pyramid, and come out of one.
-const INPUTS: &str = "guides/logarithm/1";
-
-fn build(config: &Config, seed: u64) -> Box<dyn Network> {
-    Box::new(Pyramid::new(config, seed))
-}
+pub static ALONE: Design = Design { prefilter_levels: 0, ..DESIGN };
 
 /// The kernel-predicting dual encoder.
 #[derive(Clone)]

@@ -1,6 +1,6 @@
 //! Which view layers a frame holds, which passes each has and in which channels, and their decoding.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use super::{
     Mapping, Pass, PassSet,
@@ -51,9 +51,13 @@ pub struct PassChannels {
 /// What Blender calls the layer that its compositor made.
 const COMPOSITE: &str = "Composite";
 
-/// The view layers of a frame, in file order, once for each stereo view. A mapping says what passes are called that have
-/// names of the user's own.
-pub fn layers(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
+/// The view layers of a frame, in file order, once for each stereo view.
+pub fn layers(frame: &Frame) -> Vec<Layer> {
+    layers_by(frame, &Mapping::default())
+}
+
+/// As [`layers`]; a mapping says what passes are called that have names of the user's own.
+pub fn layers_by(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
     let found = by_pass(frame).into_iter();
     found.map(|((name, view), channels)| assign(name, view, channels, mapping)).collect()
 }
@@ -64,7 +68,7 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
     let found = by_pass(frame).into_iter();
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
     let as_combined = |((layer, view), channels): (LayerKey, ByPass)| {
-        let name = name.strip_prefix(&format!("{layer}.")).unwrap_or(name);
+        let name = within(&layer, name);
         let at = find_components(name, channels.get(name)?, Pass::Combined)?;
         Some(Layer { passes: [(Pass::Combined, at)].into(), ..Layer::empty(layer, view) })
     };
@@ -73,15 +77,14 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
 
 /// The layers of a file of its own that are a pass: those of its name, or else the pictures that it holds without a name.
 pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
-    let named: Vec<Layer> = layers(frame, &Mapping::default())
-        .into_iter()
-        .filter(|layer| layer.passes.contains_key(&pass))
-        .collect();
+    let named: Vec<Layer> =
+        layers(frame).into_iter().filter(|layer| layer.passes.contains_key(&pass)).collect();
     if !named.is_empty() {
         return named;
     }
     let picture = |((name, view), channels): (LayerKey, ByPass)| {
-        let at = BLENDER.names(Pass::Combined).find_map(|name| find(&channels, name, pass))?;
+        let index = Index::of(&channels);
+        let at = BLENDER.names(Pass::Combined).find_map(|name| index.find(name, pass))?;
         Some(Layer { passes: [(pass, at)].into(), ..Layer::empty(name, view) })
     };
     by_pass(frame).into_iter().filter_map(picture).collect()
@@ -89,10 +92,11 @@ pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
 
 fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mapping) -> Layer {
     let mut layer = Layer::empty(name, view);
+    let index = Index::of(&channels);
     let known_by = |renderer: &'static Renderer| {
         let found = Pass::ALL.iter().filter_map(|&pass| {
             let mut names = renderer.names(pass);
-            Some((pass, names.find_map(|name| find(&channels, name, pass))?))
+            Some((pass, names.find_map(|name| index.find(name, pass))?))
         });
         found.collect::<BTreeMap<Pass, PassChannels>>()
     };
@@ -119,8 +123,7 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
         }
     }
     for (pass, name) in mapping.iter() {
-        let own = name.strip_prefix(&format!("{}.", layer.name)).unwrap_or(name);
-        if let Some(at) = find(&channels, own, pass) {
+        if let Some(at) = index.find(within(&layer.name, name), pass) {
             layer.passes.insert(pass, at);
         }
     }
@@ -132,41 +135,61 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
     let motion = |name: &&String| renderer.motion.iter().any(|known| plain(known) == plain(name));
     layer.motion = channels.keys().find(motion).cloned();
     layer.position_averaged = layer.passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV);
-    layer.unrecognised = unrecognised(&layer, channels);
+    layer.unrecognised = unrecognised(&layer, &index);
     layer
 }
 
 /// The names of the channels that are of no pass.
-fn unrecognised(layer: &Layer, channels: ByPass) -> Vec<String> {
+fn unrecognised(layer: &Layer, index: &Index<'_>) -> Vec<String> {
     let of_pass = |pass: Pass| layer.renderer.names(pass).map(move |name| (name, pass));
     // Every name of a pass is recognised; the first one present is the one used.
     let named = Pass::ALL.into_iter().flat_map(of_pass);
-    let named: Vec<PassChannels> = named.filter_map(|(name, pass)| find(&channels, name, pass)).collect();
+    let named: Vec<PassChannels> = named.filter_map(|(name, pass)| index.find(name, pass)).collect();
     let used = layer.passes.values().chain(layer.light_groups.values()).chain(&named);
     let known: HashSet<(usize, usize)> =
         used.flat_map(|at| at.channels.iter().map(|&channel| (at.part, channel))).collect();
     let is_used = |pass: &str| layer.passes.values().chain(&named).any(|at| at.name == pass);
-    let mut rest: Vec<Place> = Vec::new();
-    for (pass, places) in channels {
-        let is_motion = layer.motion.as_ref() == Some(&pass);
+    let mut rest: Vec<&Place> = Vec::new();
+    for (pass, places) in index.channels {
+        let is_motion = layer.motion.as_ref() == Some(pass);
         // The fourth channel of an AOV or a noisy image is part of what was recognised.
         let is_known = |place: &Place| {
             known.contains(&(place.part, place.channel))
                 || is_motion
-                || (is_used(&pass) && is_component(&place.component, "A"))
+                || (is_used(pass) && is_component(&place.component, "A"))
         };
-        rest.extend(places.into_iter().filter(|place| !is_known(place)));
+        rest.extend(places.iter().filter(|place| !is_known(place)));
     }
     rest.sort_by_key(|place| (place.part, place.channel));
-    rest.into_iter().map(|place| place.full_name).collect()
+    rest.into_iter().map(|place| place.full_name.clone()).collect()
 }
 
-/// The channels of a pass of that name: of the very name, or of one that programs make of it.
-fn find(channels: &ByPass, name: &str, pass: Pass) -> Option<PassChannels> {
-    let exact = channels.get_key_value(name);
-    let alike = || channels.iter().find(|(key, _)| plain(key) == plain(name) && !plain(name).is_empty());
-    let (key, places) = exact.or_else(alike)?;
-    find_components(key, places, pass)
+/// The name of a layer without that of the view layer before it, which users may leave out.
+pub fn within<'a>(view_layer: &str, name: &'a str) -> &'a str {
+    name.strip_prefix(view_layer).and_then(|rest| rest.strip_prefix('.')).unwrap_or(name)
+}
+
+/// The channels of a layer by the names of their passes, and by what programs make of those.
+struct Index<'a> {
+    channels: &'a ByPass,
+    alike: HashMap<String, &'a str>,
+}
+
+impl<'a> Index<'a> {
+    fn of(channels: &'a ByPass) -> Self {
+        let mut alike = HashMap::new();
+        for name in channels.keys() {
+            alike.entry(plain(name)).or_insert(name.as_str());
+        }
+        alike.remove("");
+        Self { channels, alike }
+    }
+
+    /// The channels of a pass of that name: of the very name, or of one that programs make of it.
+    fn find(&self, name: &str, pass: Pass) -> Option<PassChannels> {
+        let name = if self.channels.contains_key(name) { name } else { self.alike.get(&plain(name))? };
+        find_components(name, &self.channels[name], pass)
+    }
 }
 
 /// The channels that make up a pass, all in the part of the first.
@@ -258,7 +281,7 @@ fn listed(layers: &[Layer]) -> String {
 /// # Errors
 /// No such view layer, or its pixels cannot be decoded.
 pub fn read(frame: &Frame, view_layer: Option<&str>) -> Result<PassSet> {
-    let layers = layers(frame, &Mapping::default());
+    let layers = layers(frame);
     read_layer(frame, choose(frame, &layers, view_layer)?, &Pass::ALL)
 }
 

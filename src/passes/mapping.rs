@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, fs, path::Path};
 
-use super::{Layer, Pass, names::plain};
+use super::{Layer, Pass, layers::within, names::plain};
 use crate::{Error, Result};
 
 /// Short words for what is named most; any pass of Blender's is known by its own name as well.
@@ -80,10 +80,8 @@ impl Mapping {
         // An alpha that goes with the beauty need not be there.
         let mut wanted = self.iter().filter(|(pass, _)| *pass != Pass::Alpha);
         let is_found = |(pass, name): &(Pass, &str)| {
-            let own = name.strip_prefix(&format!("{}.", layer.name)).unwrap_or(name);
-            // Depth is named for two passes.
-            let alike = |at: &str| plain(at) == plain(own);
-            layer.passes.get(pass).is_some_and(|at| alike(&at.name))
+            let own = plain(within(&layer.name, name));
+            layer.passes.get(pass).is_some_and(|at| plain(&at.name) == own)
         };
         let Some((pass, name)) = wanted.find(|named| !is_found(named)) else { return Ok(()) };
         let mut held: Vec<&str> = layer.passes.values().map(|at| at.name.as_str()).collect();

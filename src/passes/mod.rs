@@ -19,8 +19,8 @@ use std::{
 };
 
 pub use layers::{
-    Layer, PassChannels, choose, choose_like, layers, layers_of, read, read_layer, read_light_groups,
-    rgb_layers,
+    Layer, PassChannels, choose, choose_like, layers, layers_by, layers_of, read, read_layer,
+    read_light_groups, rgb_layers,
 };
 pub use mapping::Mapping;
 pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
@@ -350,6 +350,6 @@ pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet>
 /// The file is unusable, or has no such view layer.
 pub fn load_like(path: impl AsRef<Path>, view_layer: &str) -> Result<PassSet> {
     let frame = Frame::read(path)?;
-    let layers = layers(&frame, &Mapping::default());
+    let layers = layers(&frame);
     read_layer(&frame, choose_like(&frame, &layers, view_layer)?, &Pass::ALL)
 }

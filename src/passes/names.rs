@@ -3,7 +3,7 @@
 //! Blender 5 writes `Diffuse Color`, Blender 4 and older `DiffCol`; other renderers have names of their own, which were
 //! looked up where each table says. How a channel is named beyond its pass is `channels`' business.
 
-use std::fmt;
+use std::{collections::HashSet, fmt, sync::LazyLock};
 
 use super::{Pass, Quantity};
 
@@ -386,11 +386,15 @@ pub fn plain(name: &str) -> String {
     name.chars().filter(|c| c.is_alphanumeric()).flat_map(char::to_lowercase).collect()
 }
 
+/// Every name of every renderer, [`plain`].
+static KNOWN: LazyLock<HashSet<String>> = LazyLock::new(|| {
+    let rows = RENDERERS.iter().flat_map(|renderer| renderer.rows);
+    rows.flat_map(|row| row.names).map(|name| plain(name)).collect()
+});
+
 /// Whether some renderer calls a pass so.
 pub fn is_known(name: &str) -> bool {
-    let name = plain(name);
-    let rows = RENDERERS.iter().flat_map(|renderer| renderer.rows);
-    rows.flat_map(|row| row.names).any(|known| plain(known) == name)
+    KNOWN.contains(&plain(name))
 }
 
 /// Whether a layer of that name in a file without view layers is the image itself, as some programs write it.

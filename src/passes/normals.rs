@@ -79,19 +79,14 @@ pub fn to_camera_space(normals: &mut Planes, world_to_camera: Option<[f32; 16]>)
     if seen.is_empty() {
         return None;
     }
-    let turn = match seen_from(normals) {
-        Some(turn) => turn,
-        None => match world_to_camera.and_then(rotation) {
-            Some(_) => Turn::ByMatrix,
-            None => Turn::BySight,
-        },
-    };
-    match turn {
-        Turn::None => {}
-        Turn::TowardsCamera => each(normals, |[x, y, z]| [x, y, -z]),
-        Turn::Inwards => each(normals, |n| n.map(|v| -v)),
-        Turn::ByMatrix => {
-            let rows = world_to_camera.and_then(rotation).expect("it was there above");
+    let rows = world_to_camera.and_then(rotation);
+    let of_world = if rows.is_some() { Turn::ByMatrix } else { Turn::BySight };
+    let turn = seen_from(normals).unwrap_or(of_world);
+    match (turn, rows) {
+        (Turn::None, _) => {}
+        (Turn::TowardsCamera, _) => each(normals, |[x, y, z]| [x, y, -z]),
+        (Turn::Inwards, _) => each(normals, |n| n.map(|v| -v)),
+        (Turn::ByMatrix, Some(rows)) => {
             let turned = |n: Vec3| [0, 1, 2].map(|axis| (0..3).map(|i| n[i] * rows[i][axis]).sum::<f32>());
             // Renderers differ in whether their cameras look along z or against it.
             let behind = seen.iter().filter(|n| turned(**n)[2] > 0.0).count() * 2 > seen.len();
@@ -100,7 +95,7 @@ pub fn to_camera_space(normals: &mut Planes, world_to_camera: Option<[f32; 16]>)
                 [x, y, if behind { -z } else { z }]
             });
         }
-        Turn::BySight => {
+        (Turn::ByMatrix | Turn::BySight, _) => {
             let axes = camera_axes(&seen);
             each(normals, |n| axes.map(|axis| dot(axis, n)));
         }

@@ -120,7 +120,7 @@ pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: 
         bytes: p.stored_bytes,
         channels: p.channels.len(),
     });
-    let layers = passes::layers(&frame, mapping);
+    let layers = passes::layers_by(&frame, mapping);
     let mut report = FileReport {
         path: path.display().to_string(),
         bytes: frame.byte_len(),
