@@ -130,7 +130,8 @@ fn every_renderers_names_are_known() {
     let (rgb, xyz, words) = (["R", "G", "B"], ["X", "Y", "Z"], ["red", "green", "blue"]);
     let (low_rgb, low_xyz) = (["r", "g", "b"], ["x", "y", "z"]);
     // Beauty, albedo and normal: what stands before their components, which may be nothing, and those.
-    let renderers: [(&str, [&str; 3], [[&str; 3]; 3]); 16] = [
+    type Renderer = (&'static str, [&'static str; 3], [[&'static str; 3]; 3]);
+    let renderers: [Renderer; 16] = [
         ("blender file output", ["Image", "Denoising Albedo", "Denoising Normal"], [rgb, rgb, xyz]),
         ("arnold", ["", "denoise_albedo", "N"], [rgb, rgb, xyz]),
         ("arnold of old", ["RGBA", "diffuse_albedo", "N"], [rgb, rgb, xyz]),
