@@ -1,0 +1,60 @@
+"""Compares the twin with what the crate made of the same frame (tests/twin.rs writes that file).
+
+    python check.py WEIGHTS FACTS LOSS
+
+Inputs, image and loss to 1e-3, gradients to 1e-2, each as the root of summed squares relative to the crate's.
+"""
+
+import sys
+
+import torch
+
+import features
+import losses
+import network
+from weights import read_tensors
+
+
+def compare(name, found, wanted, tolerance):
+    error = ((found - wanted).norm() / wanted.norm().clamp(min=1e-12)).item()
+    if not error <= tolerance:
+        sys.exit(f"{name} differs by {error:.2e}, more than {tolerance:.0e}")
+    return error
+
+
+def main(weights, facts, loss):
+    net, _ = network.read(weights)
+    facts, _ = read_tensors(facts)
+    facts = {name: torch.from_numpy(values) for name, values in facts.items()}
+
+    def passes(kind):
+        return [facts.get(f"{kind}.{p}") for p in ("Combined", "Denoising Albedo", "Denoising Normal")]
+
+    noisy, (reference, *of_guides) = passes("noisy"), passes("reference")
+    scale = facts["scale"].view(1, 1, 1, 1)
+    if isinstance(net, network.Prefilter):
+        inputs, found_scale = features.noisy_guides(*noisy[1:])
+        image = net(*noisy[1:]) / found_scale
+        reference = net.targets(*of_guides)
+    else:
+        for parameter in net.prefilter.parameters():
+            parameter.requires_grad = False  # the crate trains it by itself
+        inputs, exposed = features.guides(*noisy, *net.prefilter.clean(*noisy[1:]))
+        image, found_scale = net(*noisy)[0], exposed.reciprocal()
+    compare("the scale", found_scale, scale, 1e-5)
+    errors = [compare(f"input {i}", x, facts[f"input.{i}"], 1e-3) for i, x in enumerate(inputs)]
+    print("inputs", " ".join(f"{e:.1e}" for e in errors))
+    print(f"image {compare('the image', image, facts['image'], 1e-3):.1e}")
+    value = losses.LOSSES[loss](image, reference / scale, None, 1 / scale)
+    print(f"loss {loss} {compare('the loss', value, facts['loss'][0], 1e-3):.1e}")
+    value.backward()
+    gradients = {n: p.grad for n, p in net.named_parameters() if p.grad is not None}
+    wanted = {n.removeprefix("gradient."): g for n, g in facts.items() if n.startswith("gradient.")}
+    if gradients.keys() != wanted.keys():
+        sys.exit(f"other parameters learn: {sorted(gradients.keys() ^ wanted.keys())}")
+    errors = [compare(f"the gradient of {n}", g, wanted[n], 1e-2) for n, g in gradients.items()]
+    print(f"gradients of {len(errors)} parameters, the worst {max(errors):.1e}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,39 @@
+"""Small symmetric positive systems, one for each pixel, as src/filters/solve.rs solves them."""
+
+import torch
+
+_MIN_PIVOT = 1e-5  # of the diagonal it came from: below it the unknown is what others say already
+_TINY = 1.18e-38
+
+
+def cholesky(matrix):
+    """The factors of matrices given as lower triangles, `matrix[row][column]` a tensor each; their diagonals
+    hold the inverse of the pivot's root. A zero matrix gives zero solutions."""
+    factor = []
+    for i, row in enumerate(matrix):
+        factor.append([])
+        for j, value in enumerate(row):
+            total = value
+            for k in range(j):
+                total = total - factor[i][k] * factor[j][k]
+            if i == j:
+                pivot = torch.maximum(total, value * _MIN_PIVOT)
+                total = torch.where(pivot > _TINY, pivot.clamp(min=_TINY).rsqrt(), 0)
+            else:
+                total = total * factor[j][j]
+            factor[i].append(total)
+    return factor
+
+
+def solve(factor, right):
+    """The solutions for a list of right-hand sides' rows."""
+    size, values = len(factor), list(right)
+    for i in range(size):
+        for k in range(i):
+            values[i] = values[i] - factor[i][k] * values[k]
+        values[i] = values[i] * factor[i][i]
+    for i in reversed(range(size)):
+        for k in range(i + 1, size):
+            values[i] = values[i] - factor[k][i] * values[k]
+        values[i] = values[i] * factor[i][i]
+    return values

@@ -1,0 +1,125 @@
+//! The PyTorch twin of the built-in networks (eval/twin) against this crate: inputs, outputs, losses and gradients on a frame of
+//! tests/data, and weights both ways; then a few steps of its training. Needs a Python with torch: the one that
+//! `DEMC_TORCH_PYTHON` names, or `python3`. Where neither has torch the test says so and checks nothing.
+
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use demc::{
+    models::{
+        self, catalogue,
+        network::{Batch, Network, stack},
+        pyramid, weights_file,
+    },
+    nn::{
+        Stats,
+        weights::{self, Precision, Tensor},
+    },
+    passes::PassSet,
+    planes::Planes,
+    shot,
+    train::Loss,
+};
+use dfdx::{tensor::AsArray, tensor_ops::Backward};
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn passes(name: &str) -> PassSet {
+    shot::prepare(root().join("tests/data").join(name), None).unwrap().passes
+}
+
+/// A Python that can import torch.
+fn python() -> Option<OsString> {
+    let named = std::env::var_os("DEMC_TORCH_PYTHON").unwrap_or_else(|| "python3".into());
+    let found = Command::new(&named).args(["-c", "import torch, numpy"]).output();
+    found.is_ok_and(|output| output.status.success()).then_some(named)
+}
+
+/// The twin's script `name`, ready to run.
+fn script(python: &OsString, name: &str) -> Command {
+    let mut command = Command::new(python);
+    command.arg(root().join("eval/twin").join(name));
+    command
+}
+
+/// Its output; fails where it does.
+fn run(command: &mut Command) -> String {
+    let output = command.output().expect("Python runs");
+    let [stdout, stderr] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
+    assert!(output.status.success(), "{stdout}\n{stderr}");
+    stdout.into_owned()
+}
+
+fn tensor(name: impl Into<String>, shape: &[usize], values: Vec<f32>) -> Tensor {
+    Tensor { name: name.into(), shape: shape.into(), values }
+}
+
+/// What the crate makes of a frame: inputs, image, loss and gradients, for the twin to compare.
+fn facts(network: &mut dyn Network, noisy: &PassSet, reference: &PassSet, loss: Loss) -> Vec<Tensor> {
+    let image_of = |planes: &Planes| vec![1, planes.channels, planes.height, planes.width];
+    let mut facts = Vec::new();
+    for (kind, set) in [("noisy", noisy), ("reference", reference)] {
+        let kept = set.iter().filter(|(pass, _)| network.passes().contains(pass));
+        facts.extend(kept.map(|(pass, p)| tensor(format!("{kind}.{pass}"), &image_of(p), p.data.to_vec())));
+    }
+    let inputs = network.inputs(noisy).unwrap();
+    for (i, planes) in inputs.planes.iter().enumerate() {
+        facts.push(tensor(format!("input.{i}"), &image_of(planes), planes.data.to_vec()));
+    }
+    let (scale, batch): (f32, Batch) = (inputs.scale, stack(&[inputs]));
+    facts.push(tensor("scale", &[1], vec![scale]));
+    let target: Vec<f32> = network.target(reference).unwrap().data.iter().map(|v| v / scale).collect();
+    let image = network.forward_taped(&batch, &mut Stats::Batch(Vec::new()));
+    let &(n, c, h, w) = dfdx::shapes::HasShape::shape(&image);
+    facts.push(tensor("image", &[n, c, h, w], image.as_vec()));
+    let loss = loss.of(image, target, None, &[scale]);
+    facts.push(tensor("loss", &[1], vec![loss.array()]));
+    let gradients = loss.backward();
+    for param in network.params().into_iter().filter(|param| param.trainable) {
+        let gradient = gradients.get(&param.tensor).as_vec();
+        facts.push(tensor(format!("gradient.{}", param.name), &param.shape, gradient));
+    }
+    facts
+}
+
+/// Lets the twin compare a network of some weights with what this crate makes of them.
+fn compare(python: &OsString, folder: &Path, weights: &Path, noisy: &PassSet, reference: &PassSet, loss: Loss) {
+    let (mut network, _) = weights_file::read(weights).unwrap();
+    let facts = facts(&mut *network, noisy, reference, loss);
+    let file = folder.join("facts.safetensors");
+    weights::write(&file, "{}", &facts, Precision::Full).unwrap();
+    println!("{}", run(script(python, "check.py").arg(weights).arg(&file).arg(loss.to_string())));
+}
+
+fn built_in(folder: &Path, name: &str) -> PathBuf {
+    let bytes = catalogue::METHODS.iter().find(|m| m.name == name).and_then(|m| m.built_in()).unwrap();
+    let path = folder.join(format!("{name}.safetensors"));
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn the_twin_computes_the_same_outputs_losses_and_gradients() {
+    let Some(python) = python() else {
+        eprintln!("no Python with torch (DEMC_TORCH_PYTHON, python3): the twin is not checked");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (noisy, reference) = (passes("s0000_room_0004spp.exr"), passes("s0000_room_ref.exr"));
+    for loss in [Loss::Ssim, Loss::Geomean] {
+        compare(&python, folder.path(), &built_in(folder.path(), "demc-s"), &noisy, &reference, loss);
+    }
+    // The prefilter of demc-m by itself; references here keep no guides, and another frame's serve as well.
+    let mut prefilter = models::build(&pyramid::prefilter(), 1);
+    let weights = built_in(folder.path(), "demc-m");
+    weights_file::set_prefilter(&mut *prefilter, &std::fs::read(&weights).unwrap(), &weights).unwrap();
+    let (_, metadata) = weights_file::read(&weights).unwrap();
+    let path = folder.path().join("prefilter.safetensors");
+    weights_file::write(&path, &mut *prefilter, &metadata.training).unwrap();
+    compare(&python, folder.path(), &path, &noisy, &passes("s0010_outdoor_0004spp.exr"), Loss::Geomean);
+}
