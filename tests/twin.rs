@@ -88,7 +88,14 @@ fn facts(network: &mut dyn Network, noisy: &PassSet, reference: &PassSet, loss: 
 }
 
 /// Lets the twin compare a network of some weights with what this crate makes of them.
-fn compare(python: &OsString, folder: &Path, weights: &Path, noisy: &PassSet, reference: &PassSet, loss: Loss) {
+fn compare(
+    python: &OsString,
+    folder: &Path,
+    weights: &Path,
+    noisy: &PassSet,
+    reference: &PassSet,
+    loss: Loss,
+) {
     let (mut network, _) = weights_file::read(weights).unwrap();
     let facts = facts(&mut *network, noisy, reference, loss);
     let file = folder.join("facts.safetensors");
@@ -122,4 +129,57 @@ fn the_twin_computes_the_same_outputs_losses_and_gradients() {
     let path = folder.path().join("prefilter.safetensors");
     weights_file::write(&path, &mut *prefilter, &metadata.training).unwrap();
     compare(&python, folder.path(), &path, &noisy, &passes("s0010_outdoor_0004spp.exr"), Loss::Geomean);
+}
+
+#[test]
+fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
+    let Some(python) = python() else {
+        eprintln!("no Python with torch (DEMC_TORCH_PYTHON, python3): the twin is not trained");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let pair = |scene: &str| {
+        let of = |kind: &str| root().join(format!("tests/data/{scene}_{kind}.exr")).display().to_string();
+        format!("{scene},{},{},4", of("0004spp"), of("ref"))
+    };
+    let rows = ["scene,noisy,reference,spp".into(), pair("s0000_room"), pair("s0010_outdoor")];
+    std::fs::write(at("manifest.csv"), rows.join("\n")).unwrap();
+    let packed = run(script(&python, "pack.py").arg(at("manifest.csv")).arg("--out").arg(at("two.pack")));
+    assert!(packed.contains("views 0:2 of 2, 2 pairs"), "{packed}");
+    let train = |steps: &str, more: &[&str]| {
+        let mut command = script(&python, "train.py");
+        command.args(["--model", "demc-s", "--patch", "64", "--batch", "2", "--steps", steps, "--f32"]);
+        command.arg("--data").arg(at("two.pack")).arg("--val").arg(at("two.pack")).args(more);
+        run(command.arg("--prefilter").arg(built_in(folder.path(), "demc-s")).arg("--out").arg(at("run")))
+    };
+    train("3", &[]);
+    train("6", &["--resume"]);
+    let log = std::fs::read_to_string(at("run/log.csv")).unwrap();
+    let steps: Vec<&str> = log.lines().skip(1).map(|row| row.split(',').next().unwrap()).collect();
+    assert_eq!(steps, ["3", "6"]);
+    let validation = log.lines().last().unwrap().split(',').nth(5).unwrap().parse::<f64>().unwrap();
+
+    // The crate reads the weights, says the same of their training, and scores them alike.
+    let (network, metadata) = weights_file::read(&at("run/last.safetensors")).unwrap();
+    assert_eq!((metadata.training.steps, metadata.training.frames), (6, 2));
+    let logs = ["s0000_room", "s0010_outdoor"].map(|scene| {
+        let reference = passes(&format!("{scene}_ref.exr"));
+        let image = network.infer(&passes(&format!("{scene}_0004spp.exr")), None).unwrap();
+        demc::metrics::error::relmse(&image, reference.get(demc::passes::Pass::Combined).unwrap()).ln()
+    });
+    let score = ((logs[0] + logs[1]) / 2.0).exp();
+    assert!((score - validation).abs() < 0.01 * score, "{score} here, {validation} there");
+    // A pack that was damaged on its way is refused.
+    let mut bytes = std::fs::read(at("two.pack")).unwrap();
+    let middle = bytes.len() / 3;
+    bytes[middle] ^= 0x55;
+    std::fs::write(at("two.pack"), bytes).unwrap();
+    let mut command = script(&python, "train.py");
+    command
+        .args(["--steps", "1", "--model", "demc-s", "--data"])
+        .arg(at("two.pack"))
+        .arg("--out")
+        .arg(at("no"));
+    assert!(!command.output().unwrap().status.success());
 }

@@ -15,7 +15,7 @@ LEVELS = 4
 KERNEL, FULL_KERNEL = 5, 3
 _DECODER_EXTRA, _HEAD_GAIN, _LIMIT = 16, 0.3, 40.0
 _BILINEAR = (0.5625, 0.1875, 0.1875, 0.0625)
-_INPUTS = "guides/logarithm/1"  # what weights files say the network reads
+INPUTS = "guides/logarithm/1"  # what weights files say the network reads
 
 SIZES = {
     "demc-s": {"widths": [16, 48, 64, 64], "prefilter": [16, 24, 32, 40]},
@@ -41,11 +41,6 @@ def _upsampling(inputs, outputs):
         for i in range(inputs):
             layer.weight[i, i % outputs] = torch.outer(line, line) / math.ceil(inputs / outputs)
     return layer
-
-
-def _per_pixel(planes):
-    """Four channels in a row are the pixels of a 2x2 square."""
-    return F.pixel_shuffle(planes.float(), 2)
 
 
 def filtered(image, logits, confidence):
@@ -137,6 +132,8 @@ class _Level(nn.Module):
 class Trunk(nn.Module):
     """Encoders, decoder and heads: what the network and its prefilter have in common."""
 
+    narrow = False  # whether convolutions compute in bfloat16; everything else needs all its digits
+
     def __init__(self, widths, guide_channels, full_kernel, extra):
         super().__init__()
         self.kernel = full_kernel
@@ -148,18 +145,25 @@ class Trunk(nn.Module):
         heads["full"] = _convolution(widths[0] + _DECODER_EXTRA, full, 1, _HEAD_GAIN)
         self.head = nn.ModuleDict(heads)
 
+    def hidden(self):
+        """The weights of layers between others, which Muon trains."""
+        return [p for name, p in self.named_parameters() if p.dim() == 4 and "head." not in name]
+
     def predict(self, radiance, guide):
         """What the heads say of every level, full resolution first, and what the first says besides."""
-        skips = [
-            self.encoder[name](F.pixel_unshuffle(planes, 2).contiguous(memory_format=torch.channels_last))
-            for name, planes in (("radiance", radiance), ("guide", guide))
-        ]
-        x, levels = None, []
-        for l in reversed(range(LEVELS)):
-            x = self.decoder[str(l)]([s[l] for s in skips], x)
-            levels.insert(0, _parted(self.head[str(l)](x).float(), KERNEL))
-        full = _per_pixel(self.head["full"](x))
-        return [_parted(full, self.kernel), *levels], full[:, self.kernel**2 + 6 :]
+        with torch.autocast(radiance.device.type, torch.bfloat16, enabled=self.narrow):
+            skips = [
+                self.encoder[name](F.pixel_unshuffle(planes, 2).contiguous(memory_format=torch.channels_last))
+                for name, planes in (("radiance", radiance), ("guide", guide))
+            ]
+            x, heads = None, []
+            for l in reversed(range(LEVELS)):
+                x = self.decoder[str(l)]([s[l] for s in skips], x)
+                heads.insert(0, self.head[str(l)](x))
+            full = self.head["full"](x)
+        full = F.pixel_shuffle(full.float(), 2)  # four channels in a row are the pixels of a 2x2 square
+        levels = [_parted(full, self.kernel), *(_parted(head.float(), KERNEL) for head in heads)]
+        return levels, full[:, self.kernel**2 + 6 :]
 
 
 def _parted(planes, k):
@@ -177,6 +181,11 @@ class Prefilter(Trunk):
 
     def __init__(self, widths):
         super().__init__(widths, 3, KERNEL, 3)
+        self.widths = list(widths)
+
+    def config(self):
+        """As weights files hold it."""
+        return {"architecture": "prefilter", "widths": self.widths}
 
     def forward(self, albedo, normal):
         """What training compares with `targets`: the divisor, and the normal times 0.1, (N, 6, H, W)."""
@@ -205,6 +214,10 @@ class Pyramid(Trunk):
         self.prefilter = Prefilter(prefilter)
         self.widths, self.prefilter_widths = list(widths), list(prefilter)
 
+    def config(self):
+        """As weights files hold it."""
+        return {"architecture": "pyramid", "widths": self.widths, "prefilter": self.prefilter_widths}
+
     def forward(self, radiance, albedo, normal, learn_guides=False):
         """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1). The prefilter learns along
         only where that is asked for."""
@@ -220,11 +233,6 @@ class Pyramid(Trunk):
         image = light * (ratio * divisor.clamp(-_LIMIT, _LIMIT).sigmoid()).exp()
         image = amplified(filter_levels(image, levels) * divided, gain + shade * follow)
         return image * refit.factors(image.detach(), light, normal, divided)
-
-    def hidden(self):
-        """The weights of layers between others, which Muon trains."""
-        heads = {id(p) for part in (self, self.prefilter) for p in part.head.parameters()}
-        return [p for p in self.parameters() if p.dim() == 4 and id(p) not in heads]
 
 
 def build(config):
