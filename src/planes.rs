@@ -74,15 +74,39 @@ impl Planes {
         &mut self.data[c * n..][..n]
     }
 
-    /// Writes `rows`, planes of the same width and number, from row `first` on.
+    /// Writes a rectangle of other planes, `size` columns and rows from column and row `from` on, to column and row `to` on.
     ///
     /// # Panics
-    /// If widths or channels differ, or rows leave the planes.
-    pub fn write_rows(&mut self, first: usize, rows: &Self) {
-        assert_eq!((self.channels, self.width), (rows.channels, rows.width), "rows of the same planes");
+    /// If channels differ, or the rectangle leaves either.
+    pub fn write(
+        &mut self,
+        to: (usize, usize),
+        other: &Self,
+        from: (usize, usize),
+        (width, height): (usize, usize),
+    ) {
+        assert_eq!(self.channels, other.channels, "as many channels");
+        let lies_inside = |planes: &Self, (x, y)| x + width <= planes.width && y + height <= planes.height;
+        assert!(lies_inside(self, to) && lies_inside(other, from), "the rectangle lies inside");
+        let own_width = self.width;
         for c in 0..self.channels {
-            self.channel_mut(c)[first * rows.width..][..rows.pixels()].copy_from_slice(rows.channel(c));
+            let (into, values) = (self.channel_mut(c), other.channel(c));
+            for y in 0..height {
+                let values = &values[(from.1 + y) * other.width + from.0..][..width];
+                into[(to.1 + y) * own_width + to.0..][..width].copy_from_slice(values);
+            }
         }
+    }
+
+    /// Some columns.
+    ///
+    /// # Panics
+    /// If there are no such columns.
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        if columns == (0..self.width) {
+            return self;
+        }
+        self.window((columns.start, 0), (columns.len(), self.height))
     }
 
     /// A rectangle of pixels, from column `x` and row `y`: cuts tiles and undoes padding.
@@ -101,14 +125,8 @@ impl Planes {
     /// # Panics
     /// If they reach beyond.
     pub fn placed_in(&self, (width, height): (usize, usize), (x, y): (usize, usize)) -> Self {
-        assert!(x + self.width <= width && y + self.height <= height, "the planes lie inside");
         let mut whole = Self::new(self.channels, width, height);
-        for c in 0..self.channels {
-            for row in 0..self.height {
-                let from = &self.channel(c)[row * self.width..][..self.width];
-                whole.channel_mut(c)[(y + row) * width + x..][..self.width].copy_from_slice(from);
-            }
-        }
+        whole.write((x, y), self, (0, 0), (self.width, self.height));
         whole
     }
 

@@ -23,10 +23,13 @@ use super::{
     solve::{LANES, Lanes, Symmetric},
     squares::{self, SQUARE, between},
 };
-use crate::kernels::{
-    exponential::exp,
-    logarithm::ln,
-    vectorised::{self, Vectorised},
+use crate::{
+    kernels::{
+        exponential::exp,
+        logarithm::ln,
+        vectorised::{self, Vectorised},
+    },
+    planes::Planes,
 };
 
 /// Window of a fit: binomial weights of the squares on either side of one, a standard deviation of one
@@ -109,28 +112,34 @@ pub struct Guides<'a> {
     pub first: usize,
 }
 
-/// Noisy radiance, (3, H, W).
+/// Noisy radiance.
 #[derive(Clone, Copy)]
 pub enum Samples<'a> {
-    /// Exposed and divided by the albedo.
+    /// Exposed and divided by the albedo, for the rows of the guides, (3, R, W).
     Divided(&'a [f32]),
-    /// As rendered, with the exposure to apply.
-    Rendered(&'a [f32], f32),
+    /// As rendered, (3, H, W) or wider; the column of it that is the first; and the exposure to apply.
+    Rendered(&'a Planes, usize, f32),
 }
 
 impl Guides<'_> {
-    /// Row `y` of three planes that hold the whole frame, (3, H, W).
+    /// Row `y` of the frame in planes that hold rows from `first` on, (3, R, W).
     #[inline(always)]
     fn row<'p>(&self, planes: &'p [f32], y: usize) -> [&'p [f32]; 3] {
-        let (width, height) = self.size;
-        [0, 1, 2].map(|c| &planes[(c * height + y) * width..][..width])
+        let (width, plane) = (self.size.0, planes.len() / 3);
+        [0, 1, 2].map(|c| &planes[c * plane + (y - self.first) * width..][..width])
     }
+}
 
-    /// Row `y` of the frame in a guide, which holds rows from `first` on.
+impl Samples<'_> {
+    /// Row `y` of the frame.
     #[inline(always)]
-    fn guide_row<'p>(&self, guide: &'p [f32], y: usize) -> [&'p [f32]; 3] {
-        let (width, plane) = (self.size.0, guide.len() / 3);
-        [0, 1, 2].map(|c| &guide[c * plane + (y - self.first) * width..][..width])
+    fn row(&self, guides: &Guides, y: usize) -> [&[f32]; 3] {
+        match self {
+            Self::Divided(values) => guides.row(values, y),
+            Self::Rendered(planes, column, _) => {
+                [0, 1, 2].map(|c| &planes.channel(c)[y * planes.width + column..][..guides.size.0])
+            }
+        }
     }
 }
 
@@ -149,20 +158,24 @@ pub struct Refit {
 }
 
 impl Refit {
+    /// How far, in pixels, a factor depends on what is to either side: it is interpolated between two squares, whose windows
+    /// reach further.
+    pub const REACH: usize = (WINDOW.len() / 2 + 1) * SQUARE;
+
     /// A refit of a frame of `width` columns and `height` rows.
     pub fn new((width, height): (usize, usize)) -> Self {
         let [squares, square_rows] = [width, height].map(|n| n.div_ceil(SQUARE));
         Self { squares, square_rows, moments: Default::default(), fits: Default::default(), done: 0 }
     }
 
-    /// Rows of pixels that are finished: their guides are not needed again.
+    /// Rows of pixels that are finished: neither they nor their guides are needed again.
     pub fn done(&self) -> usize {
         self.done
     }
 
-    /// Calls `change` with each value of the exposed denoised `image` (3, H, W) and the factor to multiply it
-    /// by. The first `rows` rows of `image` have been denoised so far; rows whose windows they complete are
-    /// changed, and each row once. `samples` is the noisy frame.
+    /// Calls `change` with each value of the exposed denoised `image`, which holds the rows of the guides, (3, R, W), and
+    /// the factor to multiply it by. The first `rows` rows of the frame have been denoised so far; rows whose windows they
+    /// complete are changed, and each row once. `samples` is the noisy frame.
     pub fn advance(
         &mut self,
         guides: Guides,
@@ -234,11 +247,12 @@ impl Refit {
         rows: Range<usize>,
         change: impl Fn(&mut f32, f32) + Sync,
     ) {
-        let (width, height) = guides.size;
-        let (red, rest) = image.split_at_mut(width * height);
-        let (green, blue) = rest.split_at_mut(width * height);
+        let (width, plane) = (guides.size.0, image.len() / 3);
+        let (red, rest) = image.split_at_mut(plane);
+        let (green, blue) = rest.split_at_mut(plane);
+        let held = (rows.start - guides.first) * width..(rows.end - guides.first) * width;
         let [red, green, blue] =
-            [red, green, blue].map(|plane| plane[rows.start * width..rows.end * width].par_chunks_mut(width));
+            [red, green, blue].map(|plane| plane[held.clone()].par_chunks_mut(width));
         let memory = || Memory {
             pixels: Pixels::new(self.squares),
             fit: vec![0.0; KEPT * (self.squares + 2)],
@@ -308,10 +322,10 @@ impl Pixels {
     fn read(&mut self, guides: Guides, image: [&[f32]; 3], y: usize) {
         let len = SQUARE * self.squares;
         let width = guides.size.0;
-        for (c, row) in guides.guide_row(guides.normal, y).into_iter().enumerate() {
+        for (c, row) in guides.row(guides.normal, y).into_iter().enumerate() {
             part(row, self.squares, &mut self.known[(1 + c) * len..][..len]);
         }
-        for (c, row) in guides.guide_row(guides.albedo, y).into_iter().enumerate() {
+        for (c, row) in guides.row(guides.albedo, y).into_iter().enumerate() {
             let albedo = &mut self.albedo[c * len..][..len];
             part(row, self.squares, albedo);
             let logarithms = &mut self.known[(4 + c) * len..][..len];
@@ -348,9 +362,8 @@ impl Pixels {
         for c in 0..COLOURS {
             let [albedo, light] = [&self.albedo, &self.light].map(|planes| &planes[c * len..][..len]);
             let target = &mut self.targets[(COLOURS + c) * len..][..len];
-            let (Samples::Divided(values) | Samples::Rendered(values, _)) = samples;
-            part(guides.row(values, y)[c], self.squares, line);
-            if let Samples::Rendered(_, exposure) = samples {
+            part(samples.row(&guides, y)[c], self.squares, line);
+            if let Samples::Rendered(_, _, exposure) = samples {
                 line.iter_mut().zip(albedo).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
             }
             for (target, (sample, light)) in target.iter_mut().zip(line.iter().zip(light)) {
@@ -642,10 +655,15 @@ mod tests {
             Guides { size: SIZE, normal: &self.normal, albedo: &self.albedo, first: 0 }
         }
 
+        fn noisy(&self) -> Planes {
+            Planes::from_vec(3, SIZE.0, SIZE.1, self.samples.clone())
+        }
+
         /// Radiance over albedo of the first colour after a refit.
         fn refitted(&self) -> Vec<f32> {
             let mut image = self.image.clone();
-            let samples = Samples::Rendered(&self.samples, 1.0);
+            let samples = self.noisy();
+            let samples = Samples::Rendered(&samples, 0, 1.0);
             Refit::new(SIZE).advance(self.guides(), &mut image, samples, SIZE.1, |v, factor| *v *= factor);
             image[..PIXELS].iter().zip(&self.albedo).map(|(v, a)| v / a).collect()
         }
@@ -749,21 +767,24 @@ mod tests {
         let samples = Samples::Divided(&divided);
         Refit::new(SIZE).advance(frame.guides(), &mut whole, samples, SIZE.1, |v, factor| *v *= factor);
         assert!(whole.iter().zip(&frame.image).any(|(a, b)| (a / b - 1.0).abs() > 0.01));
+        let noisy = frame.noisy().placed_in((SIZE.0 + 9, SIZE.1), (4, 0));
         for step in [1, 7, 16] {
-            let (mut image, mut refit) = (frame.image.clone(), Refit::new(SIZE));
+            let (mut image, mut refit) = (Vec::new(), Refit::new(SIZE));
+            let of = |planes: &[f32]| Planes::from_vec(3, SIZE.0, SIZE.1, planes.to_vec());
+            let [denoised, normal, albedo] = [&frame.image, &frame.normal, &frame.albedo].map(|p| of(p));
             for rows in (0..SIZE.1).step_by(step).map(|y| (y + step).min(SIZE.1)) {
-                // Only guides of rows that are under way are there.
+                // Only rows that are under way are there.
                 let first = refit.done();
-                let [normal, albedo] = [&frame.normal, &frame.albedo].map(|guide| -> Vec<f32> {
-                    let rows = |c: usize| c * PIXELS + first * SIZE.0..c * PIXELS + rows * SIZE.0;
-                    (0..3).flat_map(|c| &guide[rows(c)]).copied().collect()
-                });
-                let guides = Guides { size: SIZE, normal: &normal, albedo: &albedo, first };
-                let samples = Samples::Rendered(&frame.samples, 1.5);
-                refit.advance(guides, &mut image, samples, rows, |v, factor| *v *= factor);
+                let held = |planes: &Planes| planes.window((0, first), (SIZE.0, rows - first));
+                let [mut held, normal, albedo] = [&denoised, &normal, &albedo].map(held);
+                let guides = Guides { size: SIZE, normal: &normal.data, albedo: &albedo.data, first };
+                let samples = Samples::Rendered(&noisy, 4, 1.5);
+                refit.advance(guides, &mut held.data, samples, rows, |v, factor| *v *= factor);
+                image.push(held.window((0, 0), (SIZE.0, refit.done() - first)));
                 assert!(refit.moments.1.len() <= 4 + step.div_ceil(SQUARE), "{}", refit.moments.1.len());
             }
-            assert!(image == whole && refit.done() == SIZE.1, "{step} rows at a time");
+            let image = image.into_iter().reduce(|above, below| above.above(&below)).expect("there are rows");
+            assert!(image.data == whole && refit.done() == SIZE.1, "{step} rows at a time");
         }
     }
 
@@ -776,8 +797,8 @@ mod tests {
             let (normal, albedo, mut image) = (vec![0.3; n], vec![0.6; n], noise(11, n, 1.0));
             image.iter_mut().for_each(|v| *v = v.abs());
             let guides = Guides { size, normal: &normal, albedo: &albedo, first: 0 };
-            let samples = image.clone();
-            let samples = Samples::Rendered(&samples, 1.0);
+            let samples = Planes::from_vec(3, size.0, size.1, image.clone());
+            let samples = Samples::Rendered(&samples, 0, 1.0);
             Refit::new(size).advance(guides, &mut image, samples, size.1, |v, factor| *v *= factor);
             assert!(image.iter().all(|v| v.is_finite()), "{size:?}: {image:?}");
         }

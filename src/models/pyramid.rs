@@ -21,6 +21,7 @@
 //! of light over normals ([`Shading`]) finds it; each pixel says how far its gain is to follow that.
 
 mod bands;
+mod strips;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
@@ -359,6 +360,13 @@ impl Pyramid {
         image.product(field(&factors)).into_images()
     }
 
+    /// How far it sees in its inputs, the denoised guides among them.
+    fn reach_in_inputs(&self) -> usize {
+        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
+        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
+        trunk + (0..=LEVELS).map(|level| (self.kernel(level) / 2 + 1) << level).sum::<usize>()
+    }
+
     /// Every convolution and the level of the frame's pyramid at which it writes.
     fn convolution_levels(&self) -> impl Iterator<Item = (&Conv, usize)> {
         let encoders = self.encoders.iter().flat_map(|e| {
@@ -529,26 +537,23 @@ impl Network for Pyramid {
     }
 
     fn reach(&self) -> usize {
-        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
-        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
-        let prefilter = self.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
-        trunk + (0..=LEVELS).map(|level| (self.kernel(level) / 2 + 1) << level).sum::<usize>() + prefilter
+        self.reach_in_inputs() + self.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach())
     }
 
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
         if self.denoises_guides() {
-            let guides = bands::infer_guides(self, passes, tile)?;
+            let guides = strips::infer_guides(self, passes, tile)?;
             let rows = |c: usize, y: usize, row: &mut [f32]| {
                 row.copy_from_slice(&guides[c / 3].channel(c % 3)[y * passes.width..][..passes.width]);
             };
             return Ok(Planes::from_rows(6, (passes.width, passes.height), rows));
         }
-        bands::infer(self, passes, None, &mut [], tile)
+        strips::infer(self, passes, None, &mut [], tile)
     }
 
     fn clean_guides(&self, passes: &PassSet) -> Result<Option<PassSet>> {
         let Some(prefilter) = &self.prefilter else { return Ok(None) };
-        let [albedo, normal] = bands::infer_guides(prefilter, passes, None)?;
+        let [albedo, normal] = strips::infer_guides(prefilter, passes, None)?;
         let mut guides = passes.rows(&[], 0..passes.height);
         guides.insert(Pass::DenoisingAlbedo, albedo_of_target(albedo));
         guides.insert(Pass::DenoisingNormal, normal_of_target(normal));
@@ -562,7 +567,7 @@ impl Network for Pyramid {
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
-        bands::infer(self, passes, Some(guides), companions, tile)
+        strips::infer(self, passes, Some(guides), companions, tile)
     }
 
     fn takes_companions(&self) -> bool {
@@ -575,7 +580,7 @@ impl Network for Pyramid {
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
-        bands::infer(self, passes, None, companions, tile)
+        strips::infer(self, passes, None, companions, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

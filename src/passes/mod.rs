@@ -222,6 +222,17 @@ impl PassSet {
         self.map(size, |_, planes| planes.window((x, y), size))
     }
 
+    /// Some columns of every pass.
+    ///
+    /// # Panics
+    /// If there are no such columns.
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        if columns == (0..self.width) {
+            return self;
+        }
+        self.window((columns.start, 0), (columns.len(), self.height))
+    }
+
     /// Some rows of those of `passes` that it holds.
     ///
     /// # Panics

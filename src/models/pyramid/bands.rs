@@ -1,4 +1,4 @@
-//! Inference from top to bottom, band by band, to the same bits as [`Network::forward`] on the whole frame.
+//! A network's layers from top to bottom of a frame, band by band, to the same bits as [`Network::forward`] on the whole of it.
 //!
 //! Every layer goes as far down as the rows above it allow and no row is computed twice; rows are kept only
 //! while something below needs them. Memory so grows with the width of a frame, not with its height, and
@@ -7,257 +7,30 @@
 use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
-use rayon::prelude::*;
-
-use super::{Encoder, Finish, KERNEL, LEVELS, NEEDED_BY, Prediction, Pyramid};
+use super::{Encoder, Finish, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
-    companion::{Companion, Kind},
-    features::{
-        self, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
-        guide_rows, keep_black, noisy_guides, normal_of_target, tame_alike,
-    },
-    filters::refit::{Guides, Refit, Samples},
+    companion::Kind,
+    features::Inputs,
     kernels::{Shape, blend::Place},
     models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
-    passes::{Pass, PassSet},
     planes::Planes,
 };
 
 type Maps = Activation<NoneTape>;
 type Field = crate::nn::Field<NoneTape>;
 
-/// Pixels of a band: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
-const BAND_PIXELS: usize = 9 << 14;
-
-/// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean albedo and
-/// normal, where they are known; `rows` those of a band, if the user has an opinion.
-///
-/// # Errors
-/// A pass is missing.
-pub fn infer(
-    network: &Pyramid,
-    passes: &PassSet,
-    guides: Option<&PassSet>,
-    companions: &mut [Companion],
-    rows: Option<usize>,
-) -> Result<Planes> {
-    let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
-    let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
-    let exposure = exposure(radiance);
-    let cut = Cut::new(network, passes, rows);
-    let size = (passes.width, passes.height);
-    let mut refit = Refit::new(size);
-    // Normal and albedo of what the refit has under way.
-    let mut clean: [Planes; 2] = Default::default();
-    let mut image = Planes::default();
-    let kinds: Vec<Kind> = companions.iter().map(|companion| companion.kind).collect();
-    let mut written: Vec<Planes> = kinds.iter().map(|_| Planes::default()).collect();
-    // Images have three channels while they are filtered; a layer of one is not held three times.
-    let channels: Vec<usize> = companions.iter().map(|companion| companion.planes.channels).collect();
-    let mut write = |first: usize, mut parts: Vec<Planes>| {
-        let of_companions = parts.split_off(3);
-        let [part, normal, albedo] = parts.try_into().expect("radiance, normal and albedo");
-        let end = first + part.height;
-        append(&mut image, size, first, part);
-        for ((all, part), channels) in written.iter_mut().zip(of_companions).zip(&channels) {
-            append(all, size, first, if *channels == 1 { part.of_first(1) } else { part });
-        }
-        let first = refit.done();
-        let before = if kinds.contains(&Kind::Light) { end - first } else { 0 };
-        let before = image.window((0, first), (size.0, before));
-        for (clean, new) in clean.iter_mut().zip([normal, albedo]) {
-            *clean = if clean.height == 0 { new } else { clean.above(&new) };
-        }
-        let guides = Guides { size, normal: &clean[0].data, albedo: &clean[1].data, first };
-        let samples = Samples::Rendered(&radiance.data, exposure);
-        refit.advance(guides, &mut image.data, samples, end, |v, factor| *v = *v * factor * exposure.recip());
-        let done = refit.done() - first;
-        for (light, _) in written.iter_mut().zip(&kinds).filter(|(_, kind)| **kind == Kind::Light) {
-            follow(light, (&before, &image), first, done, exposure.recip());
-        }
-        for clean in &mut clean {
-            *clean = clean.window((0, done), (size.0, clean.height - done));
-        }
-        Ok(())
-    };
-    let mut beauty = Feed::new(network, size, cut.rows, &kinds);
-    let shading = Shading::of(passes, exposure, NEEDED_BY)?;
-    let mut feed = |rows: Range<usize>, [albedo, normal]: [Planes; 2]| {
-        let shading = shading.rows(passes, rows.clone(), NEEDED_BY)?;
-        let (padded, seen) = (cut.padded(&rows), rows.clone());
-        let refined = Refined { albedo, normal, shading }.padded_to(padded);
-        let band = guide_rows(passes, rows, padded, exposure, NEEDED_BY)?;
-        // A refit takes exposed radiance, and scales it last.
-        let inputs = Inputs { scale: 1.0, ..features::guides(&band, refined, exposure, NEEDED_BY)? };
-        let divisor = &inputs.planes[1];
-        let tamed = band.require(Pass::Combined, NEEDED_BY)?;
-        let noisy = if kinds.contains(&Kind::Light) {
-            radiance.padded_rows(seen.clone(), padded)
-        } else {
-            Planes::default()
-        };
-        let divided = companions.iter().map(|companion| {
-            let mut planes = companion.planes.padded_rows(seen.clone(), padded);
-            if planes.channels == 1 {
-                planes = planes.of_first(3);
-            }
-            if companion.kind == Kind::Light {
-                tame_alike(&mut planes, &noisy, tamed);
-            }
-            let scale = if companion.kind == Kind::Light { exposure } else { 1.0 };
-            if companion.kind != Kind::Share {
-                let values = planes.data.par_iter_mut().zip(&divisor.data);
-                values.for_each(|(value, divisor)| *value = *value * scale / divisor);
-            }
-            planes
-        });
-        let divided = divided.collect();
-        beauty.push(inputs, divided, &mut write)
-    };
-    if let Some(guides) = guides {
-        for band in cut.bands() {
-            let [albedo, normal] = PREFILTERED_PASSES.map(|pass| guides.require(pass, NEEDED_BY));
-            let part = |planes: &Planes| planes.window((0, band.start), (size.0, band.len()));
-            feed(band.clone(), [part(albedo?), part(normal?)])?;
-        }
-    } else {
-        let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
-        let mut held: Option<[Planes; 2]> = None;
-        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
-        prefilter_bands(prefilter, passes, &cut, &mut |first, parts| {
-            let mut clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
-            let end = first + clean[0].height;
-            if let Some(held) = held.take() {
-                clean = [0, 1].map(|i| held[i].above(&clean[i]));
-            }
-            if end < passes.height && cut.is_last(end) {
-                held = Some(clean);
-                return Ok(());
-            }
-            let [albedo, normal] = clean;
-            let rows = end - albedo.height..end;
-            feed(rows, [albedo_of_target(albedo), normal_of_target(normal)])
-        })?;
-    }
-    keep_black(&mut image, radiance, albedo);
-    for (companion, mut planes) in companions.iter_mut().zip(written) {
-        match companion.kind {
-            Kind::Light => keep_black(&mut planes, radiance, albedo),
-            // What is nothing all around stays nothing.
-            Kind::Share => keep_black(&mut planes, &companion.planes, &companion.planes),
-            Kind::Colour => {}
-        }
-        companion.becomes(planes);
-    }
-    Ok(image)
-}
-
-/// Changes `done` rows of a light, from row `first` on, as a refit changed the beauty: to the `scale` of the result, times the
-/// beauty after over the beauty `before`, which begins at that row.
-fn follow(light: &mut Planes, (before, after): (&Planes, &Planes), first: usize, done: usize, scale: f32) {
-    let (width, pixels) = (light.width, light.pixels());
-    light.data.par_chunks_mut(pixels).enumerate().for_each(|(c, plane)| {
-        let of_rows = first * width..(first + done) * width;
-        let beauty = before.channel(c).iter().zip(&after.channel(c)[of_rows.clone()]);
-        for (value, (before, after)) in plane[of_rows].iter_mut().zip(beauty) {
-            *value *= if *before == 0.0 { scale } else { after / before };
-        }
-    });
-}
-
-/// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them, each (3, H, W).
-///
-/// # Errors
-/// A pass is missing.
-pub fn infer_guides(prefilter: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
-    let size = (passes.width, passes.height);
-    let mut guides: [Planes; 2] = Default::default();
-    prefilter_bands(prefilter, passes, &Cut::new(prefilter, passes, rows), &mut |first, parts| {
-        guides.iter_mut().zip(parts).for_each(|(guide, part)| append(guide, size, first, part));
-        Ok(())
-    })?;
-    Ok(guides)
-}
-
-/// Denoises a frame's guides and hands out what is done of them, as [`Feed::push`] does.
-fn prefilter_bands(
-    prefilter: &Pyramid,
-    passes: &PassSet,
-    cut: &Cut,
-    done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
-) -> Result<()> {
-    let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
-    passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
-    let mut feed = Feed::new(prefilter, (passes.width, passes.height), cut.rows, &[]);
-    for band in cut.bands() {
-        let padded = cut.padded(&band);
-        let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded);
-        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, Vec::new(), done)?;
-    }
-    Ok(())
-}
-
-/// Writes the next rows of planes that are `size` columns and rows in the end.
-fn append(planes: &mut Planes, size: (usize, usize), first: usize, part: Planes) {
-    if part.height == size.1 {
-        *planes = part;
-        return;
-    }
-    if planes.height == 0 {
-        *planes = Planes::unwritten(part.channels, size.0, size.1);
-    }
-    planes.write_rows(first, &part);
-}
-
-/// How a frame is cut into bands.
-struct Cut {
-    multiple: usize,
-    /// Columns and rows once padded, and rows before.
-    width: usize,
-    height: usize,
-    unpadded: usize,
-    /// Rows of a band.
-    rows: usize,
-}
-
-impl Cut {
-    /// That of a frame; `rows` are those of a band, if the user has an opinion.
-    fn new(network: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Self {
-        let multiple = network.multiple();
-        let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(multiple));
-        let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
-        Self { multiple, width, height, unpadded: passes.height, rows }
-    }
-
-    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below themselves, so
-    /// as many come at once as that may take.
-    fn is_last(&self, end: usize) -> bool {
-        self.unpadded < end + self.multiple
-    }
-
-    /// The columns and rows to which some rows are padded.
-    fn padded(&self, rows: &Range<usize>) -> (usize, usize) {
-        (self.width, if rows.end == self.unpadded { self.height } else { rows.end } - rows.start)
-    }
-
-    /// The rows of every band.
-    fn bands(&self) -> impl Iterator<Item = Range<usize>> {
-        let starts = (0..self.unpadded).step_by(self.rows).filter(|&y| y == 0 || !self.is_last(y));
-        starts.map(|y| y..if self.is_last(y + self.rows) { self.unpadded } else { y + self.rows })
-    }
-}
-
 /// A frame that comes in band by band and leaves denoised.
-struct Feed<'a> {
+pub struct Feed<'a> {
     frame: Frame<'a>,
     /// Columns and rows of the frame.
     size: (usize, usize),
 }
 
 impl<'a> Feed<'a> {
-    fn new(network: &'a Pyramid, size: (usize, usize), band: usize, companions: &[Kind]) -> Self {
+    /// A frame of `size` columns and rows, of which no step takes more than `band` rows.
+    pub fn new(network: &'a Pyramid, size: (usize, usize), band: usize, companions: &[Kind]) -> Self {
         let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band, companions);
         Self { frame, size }
     }
@@ -265,7 +38,7 @@ impl<'a> Feed<'a> {
     /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, each (3, R, W), and
     /// its first row: radiance, in its scale, the normal, what radiance was divided by, and the companions, which come in divided
     /// alike; of a prefilter albedo and normal, in their scale.
-    fn push(
+    pub fn push(
         &mut self,
         Inputs { planes, scale }: Inputs,
         companions: Vec<Planes>,

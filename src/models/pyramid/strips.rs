@@ -1,0 +1,471 @@
+//! Inference on a frame, to the same bits as [`Network::forward`] on the whole of it: strip by strip from left to right, each
+//! [band by band](super::bands) from top to bottom, refitted and written once its rows are through.
+//!
+//! What bands keep under way grows with their width. So frames that are wider than most are denoised in vertical strips, each
+//! with as many columns beside its own as they depend on. A strip begins where squares of pixels do at every level. What
+//! depends on the whole frame, exposure and shading, is computed once.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::{NEEDED_BY, Pyramid, bands::Feed};
+use crate::{
+    Result,
+    companion::{Companion, Kind},
+    features::{
+        self, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
+        guide_rows, keep_black, noisy_guides, normal_of_target, tame_alike,
+    },
+    filters::refit::{Guides, Refit, Samples},
+    models::network::Network,
+    passes::{Pass, PassSet},
+    planes::Planes,
+};
+
+/// Pixels of a band: enough to keep threads busy, few enough for little memory.
+const BAND_PIXELS: usize = 9 << 14;
+
+/// Columns of the widest strip. An 8K frame so fits in 3 GiB; narrower strips would cost more time, since they overlap.
+const WIDEST: usize = 6144;
+
+/// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean albedo and
+/// normal, where they are known; `rows` those of a band, if the user has an opinion.
+///
+/// # Errors
+/// A pass is missing.
+pub fn infer(
+    network: &Pyramid,
+    passes: &PassSet,
+    guides: Option<&PassSet>,
+    companions: &mut [Companion],
+    rows: Option<usize>,
+) -> Result<Planes> {
+    infer_in((rows, WIDEST), network, passes, guides, companions)
+}
+
+/// [`infer`] in strips of at most `widest` columns.
+fn infer_in(
+    (rows, widest): (Option<usize>, usize),
+    network: &Pyramid,
+    passes: &PassSet,
+    guides: Option<&PassSet>,
+    companions: &mut [Companion],
+) -> Result<Planes> {
+    let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
+    let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+    let exposure = exposure(radiance);
+    let shading = Shading::of(passes, exposure, NEEDED_BY)?;
+    let channels = std::iter::once(3).chain(companions.iter().map(|companion| companion.planes.channels));
+    let mut written: Vec<Planes> =
+        channels.map(|channels| Planes::unwritten(channels, passes.width, passes.height)).collect();
+    let whole = Whole { network, passes, guides, companions, rows, radiance, exposure, shading };
+    for strip in Strip::all(network, passes.width, widest) {
+        whole.denoise(&strip, &mut written)?;
+    }
+    let mut written = written.into_iter();
+    let mut image = written.next().expect("radiance comes first");
+    keep_black(&mut image, radiance, albedo);
+    for (companion, mut planes) in companions.iter_mut().zip(written) {
+        match companion.kind {
+            Kind::Light => keep_black(&mut planes, radiance, albedo),
+            // What is nothing all around stays nothing.
+            Kind::Share => keep_black(&mut planes, &companion.planes, &companion.planes),
+            Kind::Colour => {}
+        }
+        companion.becomes(planes);
+    }
+    Ok(image)
+}
+
+/// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them, each (3, H, W).
+///
+/// # Errors
+/// A pass is missing.
+pub fn infer_guides(prefilter: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
+    infer_guides_in((rows, WIDEST), prefilter, passes)
+}
+
+/// [`infer_guides`] in strips of at most `widest` columns.
+fn infer_guides_in(
+    (rows, widest): (Option<usize>, usize),
+    prefilter: &Pyramid,
+    passes: &PassSet,
+) -> Result<[Planes; 2]> {
+    let mut guides = [(); 2].map(|()| Planes::unwritten(3, passes.width, passes.height));
+    for Strip { own, seen, .. } in Strip::all(prefilter, passes.width, widest) {
+        let cut = Cut::new(prefilter, passes, seen, rows);
+        prefilter_bands(prefilter, passes, &cut, &mut |first, parts| {
+            for (guide, part) in guides.iter_mut().zip(parts) {
+                let from = (own.start - cut.columns.start, 0);
+                guide.write((own.start, first), &part, from, (own.len(), part.height));
+            }
+            Ok(())
+        })?;
+    }
+    Ok(guides)
+}
+
+/// Denoises the guides in the columns of `cut` and hands out what is done of them, as [`Feed::push`] does.
+fn prefilter_bands(
+    prefilter: &Pyramid,
+    passes: &PassSet,
+    cut: &Cut,
+    done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
+) -> Result<()> {
+    let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
+    passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+    let mut feed = Feed::new(prefilter, cut.size(), cut.rows, &[]);
+    for band in cut.bands() {
+        let padded = cut.padded(&band);
+        let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded).columns(cut.padded_columns());
+        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, Vec::new(), done)?;
+    }
+    Ok(())
+}
+
+/// Some columns of a frame.
+struct Strip {
+    /// Those that are written.
+    own: Range<usize>,
+    /// Those that the network sees, so that the former are right.
+    seen: Range<usize>,
+    /// Those that its prefilter sees, so that the guides of the former are right.
+    prefiltered: Range<usize>,
+}
+
+impl Strip {
+    /// As few of a width as make up a frame, none wider than `widest`.
+    fn all(network: &Pyramid, width: usize, widest: usize) -> impl Iterator<Item = Self> {
+        let multiple = network.multiple();
+        let beside = move |columns: &Range<usize>, reach: usize| {
+            let reach = reach.next_multiple_of(multiple);
+            columns.start.saturating_sub(reach)..(columns.end + reach).min(width)
+        };
+        let reach = network.reach_in_inputs() + Refit::REACH;
+        let reach_of_prefilter = network.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
+        let columns = width.div_ceil(width.div_ceil(widest)).next_multiple_of(multiple);
+        (0..width).step_by(columns).map(move |first| {
+            let own = first..(first + columns).min(width);
+            let seen = beside(&own, reach);
+            Self { prefiltered: beside(&seen, reach_of_prefilter), own, seen }
+        })
+    }
+}
+
+/// How some columns of a frame are cut into bands.
+struct Cut {
+    multiple: usize,
+    columns: Range<usize>,
+    /// Columns and rows of the frame once padded, and rows before.
+    width: usize,
+    height: usize,
+    unpadded: usize,
+    /// Rows of a band.
+    rows: usize,
+}
+
+impl Cut {
+    /// That of a strip; `rows` are those of a band, if the user has an opinion.
+    fn new(network: &Pyramid, passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
+        let multiple = network.multiple();
+        let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(multiple));
+        let of_pixels = BAND_PIXELS / columns.len().next_multiple_of(multiple);
+        let rows = (rows.unwrap_or(of_pixels) / multiple * multiple).max(multiple);
+        Self { multiple, columns, width, height, unpadded: passes.height, rows }
+    }
+
+    /// Columns and rows that there are.
+    fn size(&self) -> (usize, usize) {
+        (self.columns.len(), self.unpadded)
+    }
+
+    /// The columns and those to which they are padded: only where the frame ends is there anything to pad.
+    fn padded_columns(&self) -> Range<usize> {
+        self.columns.start..self.columns.end.next_multiple_of(self.multiple)
+    }
+
+    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below themselves, so
+    /// as many come at once as that may take.
+    fn is_last(&self, end: usize) -> bool {
+        self.unpadded < end + self.multiple
+    }
+
+    /// The columns and rows to which some rows of the whole frame are padded.
+    fn padded(&self, rows: &Range<usize>) -> (usize, usize) {
+        (self.width, if rows.end == self.unpadded { self.height } else { rows.end } - rows.start)
+    }
+
+    /// The rows of every band.
+    fn bands(&self) -> impl Iterator<Item = Range<usize>> {
+        let starts = (0..self.unpadded).step_by(self.rows).filter(|&y| y == 0 || !self.is_last(y));
+        starts.map(|y| y..if self.is_last(y + self.rows) { self.unpadded } else { y + self.rows })
+    }
+}
+
+/// A frame, and what all its strips have in common.
+struct Whole<'a> {
+    network: &'a Pyramid,
+    passes: &'a PassSet,
+    guides: Option<&'a PassSet>,
+    companions: &'a [Companion],
+    rows: Option<usize>,
+    radiance: &'a Planes,
+    exposure: f32,
+    shading: Shading,
+}
+
+impl Whole<'_> {
+    /// Denoises a strip and writes it: radiance and companions.
+    fn denoise(&self, strip: &Strip, written: &mut [Planes]) -> Result<()> {
+        let Self { network, passes, .. } = *self;
+        let cut = Cut::new(network, passes, strip.seen.clone(), self.rows);
+        let kinds: Vec<Kind> = self.companions.iter().map(|companion| companion.kind).collect();
+        let mut beauty = Feed::new(network, cut.size(), cut.rows, &kinds);
+        let mut last = Last::new(self, strip, written);
+        let mut feed = |rows: Range<usize>, guides: [Planes; 2]| {
+            let (inputs, companions) = self.inputs(&cut, rows, guides)?;
+            beauty.push(inputs, companions, &mut |first, parts| {
+                last.push(first, parts);
+                Ok(())
+            })
+        };
+        if let Some(guides) = self.guides {
+            let [albedo, normal] = PREFILTERED_PASSES.map(|pass| guides.require(pass, NEEDED_BY));
+            let (albedo, normal) = (albedo?, normal?);
+            for band in cut.bands() {
+                let size = (cut.columns.len(), band.len());
+                let part = |planes: &Planes| planes.window((cut.columns.start, band.start), size);
+                feed(band.clone(), [part(albedo), part(normal)])?;
+            }
+            return Ok(());
+        }
+        let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
+        let prefiltered = Cut { columns: strip.prefiltered.clone(), ..cut };
+        let from = strip.seen.start - strip.prefiltered.start;
+        let seen = from..from + strip.seen.len();
+        let mut held: Option<[Planes; 2]> = None;
+        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
+        prefilter_bands(prefilter, passes, &prefiltered, &mut |first, parts| {
+            let clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
+            let mut clean = clean.map(|planes| planes.columns(seen.clone()));
+            let end = first + clean[0].height;
+            if let Some(held) = held.take() {
+                clean = [0, 1].map(|i| held[i].above(&clean[i]));
+            }
+            if end < passes.height && prefiltered.is_last(end) {
+                held = Some(clean);
+                return Ok(());
+            }
+            let [albedo, normal] = clean;
+            let rows = end - albedo.height..end;
+            feed(rows, [albedo_of_target(albedo), normal_of_target(normal)])
+        })
+    }
+
+    /// What the network reads of some rows, whose clean albedo and normal are given, and the companions, divided as radiance is.
+    fn inputs(
+        &self,
+        cut: &Cut,
+        rows: Range<usize>,
+        [albedo, normal]: [Planes; 2],
+    ) -> Result<(Inputs, Vec<Planes>)> {
+        let Self { passes, radiance, exposure, .. } = *self;
+        let (padded, columns) = (cut.padded(&rows), cut.padded_columns());
+        let shading = self.shading.rows(passes, rows.clone(), NEEDED_BY)?.columns(cut.columns.clone());
+        let refined = Refined { albedo, normal, shading }.padded_to((columns.len(), padded.1));
+        let band = guide_rows(passes, rows.clone(), padded, exposure, NEEDED_BY)?.columns(columns.clone());
+        // A refit takes exposed radiance, and scales it last.
+        let inputs = Inputs { scale: 1.0, ..features::guides(&band, refined, exposure, NEEDED_BY)? };
+        let divisor = &inputs.planes[1];
+        let tamed = band.require(Pass::Combined, NEEDED_BY)?;
+        let part = |planes: &Planes| planes.padded_rows(rows.clone(), padded).columns(columns.clone());
+        let is_lit = self.companions.iter().any(|companion| companion.kind == Kind::Light);
+        let noisy = if is_lit { part(radiance) } else { Planes::default() };
+        let divided = self.companions.iter().map(|companion| {
+            let mut planes = part(&companion.planes);
+            if planes.channels == 1 {
+                planes = planes.of_first(3);
+            }
+            if companion.kind == Kind::Light {
+                tame_alike(&mut planes, &noisy, tamed);
+            }
+            let scale = if companion.kind == Kind::Light { exposure } else { 1.0 };
+            if companion.kind != Kind::Share {
+                let values = planes.data.par_iter_mut().zip(&divisor.data);
+                values.for_each(|(value, divisor)| *value = *value * scale / divisor);
+            }
+            planes
+        });
+        let divided = divided.collect();
+        Ok((inputs, divided))
+    }
+}
+
+/// The last step of a strip: what is denoised is refitted, and written.
+struct Last<'a> {
+    whole: &'a Whole<'a>,
+    strip: &'a Strip,
+    refit: Refit,
+    /// Columns and rows.
+    size: (usize, usize),
+    /// What the refit has under way: radiance, normal, what radiance was divided by, and companions.
+    held: Vec<Planes>,
+    /// Radiance and companions of the whole frame.
+    written: &'a mut [Planes],
+}
+
+impl<'a> Last<'a> {
+    fn new(whole: &'a Whole<'a>, strip: &'a Strip, written: &'a mut [Planes]) -> Self {
+        let size = (strip.seen.len(), whole.passes.height);
+        Self { whole, strip, refit: Refit::new(size), size, held: Vec::new(), written }
+    }
+
+    /// Takes in the next rows, as [`Feed::push`] hands them out, and writes those that are done with them.
+    fn push(&mut self, first: usize, mut parts: Vec<Planes>) {
+        let Whole { companions, radiance, exposure, .. } = *self.whole;
+        let end = first + parts[0].height;
+        // Images have three channels while they are filtered; a layer of one is not held three times.
+        for (part, companion) in parts[3..].iter_mut().zip(companions) {
+            if companion.planes.channels == 1 {
+                *part = part.of_first(1);
+            }
+        }
+        if self.held.is_empty() {
+            self.held = parts;
+        } else {
+            self.held.iter_mut().zip(parts).for_each(|(held, part)| *held = held.above(&part));
+        }
+        let [image, normal, albedo, others @ ..] = &mut self.held[..] else {
+            unreachable!("radiance, normal, divisor")
+        };
+        let is_lit = companions.iter().any(|companion| companion.kind == Kind::Light);
+        let before = if is_lit { image.clone() } else { Planes::default() };
+        let first = self.refit.done();
+        let guides = Guides { size: self.size, normal: &normal.data, albedo: &albedo.data, first };
+        let samples = Samples::Rendered(radiance, self.strip.seen.start, exposure);
+        let change = |v: &mut f32, factor: f32| *v = *v * factor * exposure.recip();
+        self.refit.advance(guides, &mut image.data, samples, end, change);
+        let done = self.refit.done() - first;
+        for (light, _) in others.iter_mut().zip(companions).filter(|(_, c)| c.kind == Kind::Light) {
+            follow(light, (&before, image), done, exposure.recip());
+        }
+        let Strip { own, seen, .. } = self.strip;
+        let results = std::iter::once(&*image).chain(&*others);
+        for (written, held) in self.written.iter_mut().zip(results) {
+            written.write((own.start, first), held, (own.start - seen.start, 0), (own.len(), done));
+        }
+        for held in &mut self.held {
+            *held = held.window((0, done), (held.width, held.height - done));
+        }
+    }
+}
+
+/// Changes the first `done` rows of a light as a refit changed the beauty: to the `scale` of the result, times the beauty
+/// after over the beauty `before`.
+fn follow(light: &mut Planes, (before, after): (&Planes, &Planes), done: usize, scale: f32) {
+    let (width, pixels) = (light.width, light.pixels());
+    light.data.par_chunks_mut(pixels).enumerate().for_each(|(c, plane)| {
+        let beauty = before.channel(c).iter().zip(after.channel(c));
+        for (value, (before, after)) in plane[..done * width].iter_mut().zip(beauty) {
+            *value *= if *before == 0.0 { scale } else { after / before };
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        models::network::{Architecture, Config},
+        nn::Precision,
+        rng::Rng,
+    };
+
+    const SIZE: (usize, usize) = (1001, 37);
+
+    /// A network narrow enough for tests, with weights drawn from a seed.
+    fn network(precision: Precision) -> Pyramid {
+        let config = Config {
+            prefilter: vec![9, 16, 8, 8],
+            ..Config::new(Architecture::Pyramid, &[24, 16, 9, 8])
+        };
+        let mut network = Pyramid::new(&config, 3);
+        for conv in network.convolutions() {
+            conv.set_precision(precision);
+            conv.range = Some(3.0);
+        }
+        network.freeze();
+        network
+    }
+
+    /// Noise, a pixel in fifty a firefly, and black where a strip ends.
+    fn noise(channels: usize, seed: u64) -> Planes {
+        let mut rng = Rng::new(seed, 0);
+        let mut planes = Planes::new(channels, SIZE.0, SIZE.1);
+        for (i, v) in planes.data.iter_mut().enumerate() {
+            let bright = if rng.uniform() < 0.02 { 1e4 } else { 1.0 };
+            *v = if (240..290).contains(&(i % SIZE.0)) { 0.0 } else { bright * rng.uniform() };
+        }
+        planes
+    }
+
+    fn passes() -> PassSet {
+        let mut passes = PassSet::new("frame.exr", "ViewLayer", SIZE.0, SIZE.1);
+        for (pass, seed) in [(Pass::Combined, 1), (Pass::DenoisingAlbedo, 2), (Pass::DenoisingNormal, 3)] {
+            passes.insert(pass, noise(3, seed));
+        }
+        passes
+    }
+
+    fn companions() -> Vec<Companion> {
+        let kinds = [(Kind::Light, 3), (Kind::Colour, 3), (Kind::Share, 1), (Kind::Light, 1)];
+        let companion = |((kind, channels), seed)| Companion::new(kind, noise(channels, seed));
+        kinds.into_iter().zip(4..).map(companion).collect()
+    }
+
+    #[test]
+    fn strips_give_the_same_bits_as_the_whole_frame() {
+        let passes = passes();
+        for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
+            let network = network(precision);
+            let clean = network.clean_guides(&passes).unwrap().expect("it has a prefilter");
+            for guides in [None, Some(&clean)] {
+                let denoised = |rows, widest| {
+                    let mut companions = companions();
+                    let image = infer_in((rows, widest), &network, &passes, guides, &mut companions).unwrap();
+                    companions.into_iter().fold(vec![image], |all, c| [all, vec![c.planes]].concat())
+                };
+                let whole = denoised(None, SIZE.0);
+                assert!(whole.iter().all(|planes| planes.non_finite() == 0));
+                for (rows, widest) in [(None, 300), (Some(16), 512)] {
+                    let given = guides.is_some();
+                    assert!(denoised(rows, widest) == whole, "{widest}, {precision:?}, guides given: {given}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn strips_of_guides_give_the_same_bits_as_the_whole_frame() {
+        let (network, passes) = (network(Precision::Int8), passes());
+        let prefilter = network.prefilter.as_ref().unwrap();
+        let [whole, strips] =
+            [SIZE.0, 300].map(|widest| infer_guides_in((None, widest), prefilter, &passes).unwrap());
+        assert!(whole == strips);
+    }
+
+    #[test]
+    fn strips_are_as_wide_as_one_another_and_frames_of_usual_widths_are_one() {
+        let network = network(Precision::F32);
+        let strips = |width| Strip::all(&network, width, WIDEST).map(|strip| strip.own).collect::<Vec<_>>();
+        for width in [1, 3840, 4096, 6144] {
+            assert_eq!(strips(width), [0..width]);
+        }
+        assert_eq!(strips(7680), [0..3840, 3840..7680]);
+        assert_eq!(strips(16_384), [0..5472, 5472..10_944, 10_944..16_384]);
+        for strip in Strip::all(&network, 7680, WIDEST) {
+            assert!(strip.prefiltered.len() < 7680, "the strips of a test see less than the frame as well");
+        }
+    }
+}
