@@ -362,9 +362,12 @@ impl Pyramid {
 
     /// How far it sees in its inputs, the denoised guides among them.
     fn reach_in_inputs(&self) -> usize {
-        // At each trunk level two 3x3 convolutions, a pool, one 3x3 and an upsampling; then the kernels.
-        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1 + 2) << level).sum();
-        trunk + (0..=LEVELS).map(|level| (self.kernel(level) / 2 + 1) << level).sum::<usize>()
+        // At each trunk level two 3x3 convolutions and one more, and half a pixel each of a pool and an upsampling; then the
+        // kernels, and below full resolution a pixel for the corners of an upsampling and half a one for the squares of an image.
+        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1) << level).sum();
+        let kernels: usize = (0..=LEVELS).map(|level| (self.kernel(level) / 2) << level).sum();
+        let pyramid: usize = (1..=LEVELS).map(|level| 3 << (level - 1)).sum();
+        trunk + kernels + pyramid
     }
 
     /// Every convolution and the level of the frame's pyramid at which it writes.

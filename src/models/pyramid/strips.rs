@@ -23,10 +23,11 @@ use crate::{
     planes::Planes,
 };
 
-/// Pixels of a band: enough to keep threads busy, few enough for little memory.
+/// Pixels of a band, all strips together: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
 const BAND_PIXELS: usize = 9 << 14;
 
-/// Columns of the widest strip. An 8K frame so fits in 3 GiB; narrower strips would cost more time, since they overlap.
+/// Columns of the widest strip: few enough for bands of few rows to fit in little memory, while strips, which overlap, take
+/// about a tenth longer at most.
 const WIDEST: usize = 6144;
 
 /// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean albedo and
@@ -170,8 +171,7 @@ impl Cut {
     fn new(network: &Pyramid, passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
         let multiple = network.multiple();
         let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(multiple));
-        let of_pixels = BAND_PIXELS / columns.len().next_multiple_of(multiple);
-        let rows = (rows.unwrap_or(of_pixels) / multiple * multiple).max(multiple);
+        let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
         Self { multiple, columns, width, height, unpadded: passes.height, rows }
     }
 
@@ -465,7 +465,7 @@ mod tests {
         assert_eq!(strips(7680), [0..3840, 3840..7680]);
         assert_eq!(strips(16_384), [0..5472, 5472..10_944, 10_944..16_384]);
         for strip in Strip::all(&network, 7680, WIDEST) {
-            assert!(strip.prefiltered.len() < 7680, "the strips of a test see less than the frame as well");
+            assert!(strip.prefiltered.len() < 4400, "{:?}", strip.prefiltered);
         }
     }
 }
