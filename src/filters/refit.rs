@@ -251,8 +251,7 @@ impl Refit {
         let (red, rest) = image.split_at_mut(plane);
         let (green, blue) = rest.split_at_mut(plane);
         let held = (rows.start - guides.first) * width..(rows.end - guides.first) * width;
-        let [red, green, blue] =
-            [red, green, blue].map(|plane| plane[held.clone()].par_chunks_mut(width));
+        let [red, green, blue] = [red, green, blue].map(|plane| plane[held.clone()].par_chunks_mut(width));
         let memory = || Memory {
             pixels: Pixels::new(self.squares),
             fit: vec![0.0; KEPT * (self.squares + 2)],

@@ -6,7 +6,6 @@
 
 use std::{collections::VecDeque, ops::Range};
 
-use dfdx::tensor::NoneTape;
 use super::{Encoder, Finish, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
@@ -17,6 +16,7 @@ use crate::{
     nn::{Activation, Conv, Line, MaxPool},
     planes::Planes,
 };
+use dfdx::tensor::NoneTape;
 
 type Maps = Activation<NoneTape>;
 type Field = crate::nn::Field<NoneTape>;
