@@ -28,6 +28,8 @@ pub struct Shot {
     pub neighbours: BTreeMap<i32, PassSet>,
     /// Light groups, which add up to Combined, by name; see [`Shot::read_light_groups`].
     pub light_groups: BTreeMap<String, Planes>,
+    /// Whether its left and right edges meet.
+    pub wraps: bool,
     /// Whether Blender had denoised Combined, and the render was taken from the pass `Noisy Image`.
     pub was_denoised: bool,
     /// What was done to normals that Blender did not write, for the user.
@@ -74,8 +76,8 @@ impl Shot {
         let is_broken = |render: &&Planes| render.data.iter().any(|v| !v.is_finite());
         let unrepaired = passes.get(Pass::Combined).filter(is_broken).cloned();
         let repaired = passes.sanitize();
-        let (halves, neighbours, light_groups, normals) = Default::default();
-        Self { passes, halves, neighbours, light_groups, normals, was_denoised, repaired, unrepaired }
+        let (halves, neighbours, light_groups, wraps, normals) = Default::default();
+        Self { passes, halves, neighbours, light_groups, wraps, was_denoised, normals, repaired, unrepaired }
     }
 
     /// The render as it was stored, with values that are not finite where it had any.

@@ -10,9 +10,9 @@ use std::{
 
 use common::{
     demc,
-    files::{Stored, data, header, with_attributes, write_render},
+    files::{Stored, data, header, read_exr, samples, with_attributes, write_render},
 };
-use exr::prelude::*;
+use exr::{meta::attribute::EnvironmentMap, prelude::*};
 use predicates::{prelude::*, str::contains};
 
 /// The flag for names of more than 31 letters.
@@ -167,4 +167,25 @@ fn what_cannot_be_decoded_is_listed_and_told_with_its_remedy() {
         command.args(["denoise", "--model", "demc-s"]).arg(&input).arg("--out").arg(dir.path());
         command.assert().code(1).stderr(contains(name).and(contains(told)).and(contains("oiiotool IN.exr")));
     }
+}
+
+#[test]
+fn a_file_that_says_it_is_an_environment_is_denoised_without_a_seam() {
+    let dir = tempfile::tempdir().unwrap();
+    let result = |name: &str, kind: EnvironmentMap, wrap: &[&str]| {
+        let input = dir.path().join("render.exr");
+        let mut image = read_exr(data("s0000_room_0004spp.exr"));
+        image.layer_data[0].attributes.environment_map = Some(kind);
+        image.write().to_file(&input).unwrap();
+        let mut command = demc();
+        command.args(["denoise", "--model", "demc-s", "--overwrite"]).args(wrap).arg(input);
+        command.arg("--out").arg(dir.path().join(name)).assert().success();
+        let image = read_exr(dir.path().join(name).join("render.exr"));
+        samples(&image, "ViewLayer.Denoised.R").unwrap().values_as_f32().collect::<Vec<_>>()
+    };
+    let (all_round, cube) = (EnvironmentMap::LatitudeLongitude, EnvironmentMap::Cube);
+    let (joined, apart) = (result("a", all_round, &[]), result("b", all_round, &["--wrap", "none"]));
+    assert!(
+        joined != apart && joined == result("c", cube, &["--wrap", "x"]) && apart == result("d", cube, &[])
+    );
 }

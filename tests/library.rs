@@ -14,7 +14,7 @@ use demc::{
     models::{self, Denoiser},
     passes::Pass,
     planes::Planes,
-    shot::Shot,
+    shot::{self, Shot},
 };
 
 const FRAME: &str = "s0000_room_0004spp.exr";
@@ -115,4 +115,32 @@ fn each_file_of_a_batch_ends_once() {
     assert_eq!(run(&jobs), [(frame.clone(), "done"), (broken.clone(), "failed")]);
     assert_eq!(run(&jobs), [(broken, "failed"), (frame.clone(), "skipped")]);
     assert!(samples(&read_exr(frame.output), "ViewLayer.Clean.G").is_some());
+}
+
+/// Turned about half, a panorama gives the same picture turned about half: its seam is nowhere.
+#[test]
+fn a_panorama_has_no_seam() {
+    const HALF: usize = 64;
+    let shot = shot::prepare(data("s0000_room_0004spp.exr"), None).unwrap();
+    let (width, height) = (shot.passes.width, shot.passes.height);
+    let turned = |planes: &Planes| {
+        Planes::from_rows(planes.channels, (width, height), |c, y, row| {
+            row.copy_from_slice(&planes.channel(c)[y * width..][..width]);
+            row.rotate_left(HALF);
+        })
+    };
+    let about = Shot::new(shot.passes.map((width, height), |_, planes| turned(planes)));
+    let model = models::open("demc-m").unwrap();
+    let far = |wraps: bool| {
+        let [one, other] = [&shot, &about].map(|shot| {
+            let mut shot = shot.clone();
+            shot.wraps = wraps;
+            denoise::shot(&shot, &*model, &Options::default()).unwrap()
+        });
+        let one = turned(&one);
+        let pairs = one.data.iter().zip(&other.data);
+        pairs.map(|(a, b)| (a - b).abs() / (a + b + 1e-3)).fold(0.0, f32::max)
+    };
+    let (joined, apart) = (far(true), far(false));
+    assert!(joined < 1e-3 && apart > 0.05, "{joined} where edges meet, {apart} where they do not");
 }

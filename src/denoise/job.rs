@@ -9,6 +9,7 @@ use std::{
 use super::{
     lights::{Along, Alpha, Source, light_passes},
     window,
+    wrap::{self, Wrap},
 };
 use crate::{
     Error, Result,
@@ -54,6 +55,8 @@ pub struct Options {
     pub sources: Sources,
     /// Whether light passes and light groups are denoised as well, so that they add up to the denoised beauty.
     pub passes: bool,
+    /// Whether the left and the right edge of a frame meet.
+    pub wrap: Wrap,
 }
 
 impl Default for Options {
@@ -69,6 +72,7 @@ impl Default for Options {
             alpha: Alpha::Auto,
             sources: Sources::default(),
             passes: false,
+            wrap: Wrap::Auto,
         }
     }
 }
@@ -169,6 +173,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     for layer in eyes {
         options.sources.mapping.check(input, layer)?;
         let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
+        shot.wraps = options.wrap.of(&frame);
         report.notes.extend(shot.normals.take());
         report.samples = shot.passes.samples;
         report.was_denoised |= shot.was_denoised;
@@ -304,7 +309,9 @@ pub(super) fn run(
 ) -> Result<Planes> {
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
-    let radiance = model.denoise_along(shot, companions, options.tile)?;
+    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_along(shot, along, options.tile);
+    let radiance =
+        if shot.wraps { wrap::joined(shot, companions, denoise)? } else { denoise(shot, companions)? };
     report.seconds += start.elapsed().as_secs_f64();
     let size = (shot.passes.width, shot.passes.height);
     if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {

@@ -14,6 +14,7 @@ pub mod preview;
 mod sequence;
 mod watch;
 mod window;
+mod wrap;
 
 use std::path::Path;
 
@@ -23,6 +24,7 @@ pub use lights::Alpha;
 pub use plan::{Input, Plan, plan, plan_tree};
 pub use sequence::follows;
 pub use watch::{Look, Watch};
+pub use wrap::Wrap;
 
 pub use crate::frame_number::frame_number;
 use crate::{Result, models::Denoiser};

@@ -203,7 +203,9 @@ impl Window {
         let image = if others.is_empty() || model.reads_halves() {
             run(&own.shot, &mut [], model, options, report)?
         } else {
-            run(&Shot::new(average(&own.shot.passes, &others)), &mut [], model, options, report)?
+            let mut average = Shot::new(average(&own.shot.passes, &others));
+            average.wraps = own.shot.wraps;
+            run(&average, &mut [], model, options, report)?
         };
         self.moment_mut(number, view).expect("it is there").result = Some(image);
         Ok(())

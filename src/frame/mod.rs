@@ -166,6 +166,11 @@ impl Frame {
         self.stored.iter().find_map(|stored| stored.attributes.matrix(name))
     }
 
+    /// Whether the file says that it is an environment by latitude and longitude, whose left and right edges meet.
+    pub fn is_latitude_longitude(&self) -> bool {
+        self.stored.iter().any(|stored| stored.attributes.value("envmap", "envmap") == Some(&[0]))
+    }
+
     /// What viewers show, in the coordinates of the data windows.
     pub fn display_window(&self) -> Window {
         let first = &self.stored[0].attributes;

@@ -26,7 +26,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, preview},
+    denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, Wrap, preview},
     frame::prepare_folder,
     models,
 };
@@ -111,6 +111,10 @@ pub struct Args {
     #[arg(long, value_enum, value_name = "HOW", default_value_t = AlphaChoice::Auto)]
     alpha: AlphaChoice,
 
+    /// Whether the left and the right edge meet, as those of an all-round panorama: auto believes the file's attribute envmap
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = WrapChoice::Auto)]
+    wrap: WrapChoice,
+
     /// Denoise the light passes and light groups as well: they add up to the denoised beauty
     #[arg(long)]
     passes: bool,
@@ -136,6 +140,14 @@ enum AlphaChoice {
     Auto,
     Denoise,
     Keep,
+}
+
+/// The values of `--wrap`.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum WrapChoice {
+    Auto,
+    X,
+    None,
 }
 
 /// Runs the batch.
@@ -181,6 +193,11 @@ pub fn run(args: Args) -> Result<ExitCode> {
         },
         sources,
         passes: args.passes,
+        wrap: match args.wrap {
+            WrapChoice::Auto => Wrap::Auto,
+            WrapChoice::X => Wrap::X,
+            WrapChoice::None => Wrap::None,
+        },
     };
     let style = match (args.json, args.quiet) {
         (true, _) => Style::Json,

@@ -1,0 +1,86 @@
+//! Frames whose left and right edges meet, as those of an all-round panorama do: each edge is denoised with what lies beyond
+//! the other, so that no seam shows where a viewer joins them.
+
+use crate::{Result, companion::Companion, frame::Frame, passes::PassSet, planes::Planes, shot::Shot};
+
+/// Whether the left and the right edge of a frame meet.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Wrap {
+    /// Where the file says so: OpenEXR's attribute `envmap` names a map by latitude and longitude.
+    #[default]
+    Auto,
+    /// They meet.
+    X,
+    /// They do not, whatever the file says.
+    None,
+}
+
+impl Wrap {
+    /// Whether they do in this frame.
+    pub(super) fn of(self, frame: &Frame) -> bool {
+        match self {
+            Self::Auto => frame.is_latitude_longitude(),
+            Self::X => true,
+            Self::None => false,
+        }
+    }
+}
+
+/// Columns of the other edge that an edge is denoised with: about what the built-in networks see to either side, and a multiple of what
+/// they halve a frame by, so that their squares lie where they did.
+const MARGIN: usize = 256;
+
+/// What `run` makes of a shot, and of what goes along with it, that has more columns at either edge, which are taken off again.
+///
+/// # Errors
+/// As `run`.
+pub(super) fn joined(
+    shot: &Shot,
+    companions: &mut [Companion],
+    run: impl FnOnce(&Shot, &mut [Companion]) -> Result<Planes>,
+) -> Result<Planes> {
+    let widened = |set: &PassSet| set.map((set.width + 2 * MARGIN, set.height), |_, planes| widen(planes));
+    let mut wide = Shot::new(widened(&shot.passes));
+    wide.halves = shot.halves.as_ref().map(|halves| halves.each_ref().map(widened));
+    wide.neighbours = shot.neighbours.iter().map(|(later, set)| (*later, widened(set))).collect();
+    for companion in &mut *companions {
+        companion.planes = widen(&companion.planes);
+    }
+    let radiance = run(&wide, companions)?;
+    for Companion { planes, rendered, .. } in companions {
+        [planes, rendered].into_iter().for_each(|planes| *planes = narrow(planes));
+    }
+    Ok(narrow(&radiance))
+}
+
+/// Goes on at either edge with what lies beyond the other.
+fn widen(planes: &Planes) -> Planes {
+    let (width, before) = (planes.width, planes.width - MARGIN % planes.width);
+    Planes::from_rows(planes.channels, (width + 2 * MARGIN, planes.height), |c, y, row| {
+        let from = &planes.channel(c)[y * width..][..width];
+        row.iter_mut().enumerate().for_each(|(x, value)| *value = from[(x + before) % width]);
+    })
+}
+
+/// Takes off what [`widen`] added.
+fn narrow(planes: &Planes) -> Planes {
+    planes.window((MARGIN, 0), (planes.width - 2 * MARGIN, planes.height))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn edges_go_on_with_one_another_and_come_off_again() {
+        for width in [1, 3, 255, 256, 300] {
+            let planes = Planes::from_vec(1, width, 2, (0..2 * width).map(|i| i as f32).collect());
+            let wide = widen(&planes);
+            let row = &wide.channel(0)[..wide.width];
+            let last = (width - 1) as f32;
+            assert_eq!([row[MARGIN - 1], row[MARGIN], row[MARGIN + width - 1]], [last, 0.0, last], "{width}");
+            assert_eq!(row[MARGIN + width], 0.0);
+            assert_eq!(narrow(&wide), planes);
+        }
+    }
+}
