@@ -38,7 +38,7 @@ pub mod error;
 pub mod features;
 pub mod filters;
 pub mod frame;
-pub mod frame_number;
+mod frame_number;
 pub mod kernels;
 pub mod lint;
 pub mod metrics;

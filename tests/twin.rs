@@ -33,11 +33,15 @@ fn passes(name: &str) -> PassSet {
     shot::prepare(root().join("tests/data").join(name), None).unwrap().passes
 }
 
-/// A Python that can import torch.
+/// A Python that can import torch; says so where there is none.
 fn python() -> Option<OsString> {
     let named = std::env::var_os("DEMC_TORCH_PYTHON").unwrap_or_else(|| "python3".into());
     let found = Command::new(&named).args(["-c", "import torch, numpy"]).output();
-    found.is_ok_and(|output| output.status.success()).then_some(named)
+    let is_able = found.is_ok_and(|output| output.status.success());
+    if !is_able {
+        eprintln!("no Python with torch (DEMC_TORCH_PYTHON, python3): the twin is not checked");
+    }
+    is_able.then_some(named)
 }
 
 /// The twin's script `name`, ready to run.
@@ -112,10 +116,7 @@ fn built_in(folder: &Path, name: &str) -> PathBuf {
 
 #[test]
 fn the_twin_computes_the_same_outputs_losses_and_gradients() {
-    let Some(python) = python() else {
-        eprintln!("no Python with torch (DEMC_TORCH_PYTHON, python3): the twin is not checked");
-        return;
-    };
+    let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let (noisy, reference) = (passes("s0000_room_0004spp.exr"), passes("s0000_room_ref.exr"));
     for loss in [Loss::Ssim, Loss::Geomean] {
@@ -133,10 +134,7 @@ fn the_twin_computes_the_same_outputs_losses_and_gradients() {
 
 #[test]
 fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
-    let Some(python) = python() else {
-        eprintln!("no Python with torch (DEMC_TORCH_PYTHON, python3): the twin is not trained");
-        return;
-    };
+    let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let pair = |scene: &str| {

@@ -27,20 +27,22 @@ def main(weights, facts, loss):
     facts, _ = read_tensors(facts)
     facts = {name: torch.from_numpy(values) for name, values in facts.items()}
 
-    def passes(kind):
-        return [facts.get(f"{kind}.{p}") for p in ("Combined", "Denoising Albedo", "Denoising Normal")]
+    def passes(kind, names):
+        return [facts[f"{kind}.{name}"] for name in names]
 
-    noisy, (reference, *of_guides) = passes("noisy"), passes("reference")
-    scale = facts["scale"].view(1, 1, 1, 1)
-    if isinstance(net, network.Prefilter):
-        inputs, found_scale = features.noisy_guides(*noisy[1:])
-        image = net(*noisy[1:]) / found_scale
-        reference = net.targets(*of_guides)
-    else:
+    guides, scale = ("Denoising Albedo", "Denoising Normal"), facts["scale"].view(1, 1, 1, 1)
+    if net.makes_radiance:
         for parameter in net.prefilter.parameters():
             parameter.requires_grad = False  # the crate trains it by itself
+        noisy = passes("noisy", ("Combined", *guides))
         inputs, exposed = features.guides(*noisy, *net.prefilter.clean(*noisy[1:]))
-        image, found_scale = net(*noisy)[0], exposed.reciprocal()
+        image, found_scale = net(torch.cat(noisy, 1))[0], exposed.reciprocal()
+        reference = facts["reference.Combined"]
+    else:
+        noisy = passes("noisy", guides)
+        inputs, found_scale = features.noisy_guides(*noisy)
+        image = net.denoise(*noisy) / found_scale
+        reference = net.target(None, torch.cat(passes("reference", guides), 1))
     compare("the scale", found_scale, scale, 1e-5)
     errors = [compare(f"input {i}", x, facts[f"input.{i}"], 1e-3) for i, x in enumerate(inputs)]
     print("inputs", " ".join(f"{e:.1e}" for e in errors))

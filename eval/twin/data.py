@@ -12,14 +12,19 @@ LEAST = 16  # sides are multiples of this
 
 
 class Frames:
-    """The pairs of some packs, on a device, in half precision."""
+    """The pairs of some packs that are `least` rows and columns large, and where `guides` are asked for those whose
+    references keep them; on a device, in half precision."""
 
-    def __init__(self, paths, device):
+    def __init__(self, paths, device, least, guides):
+        self.guides = guides
         self.pairs = []  # (view, which noisy frame)
         self.views = []
         for path in paths:
             for view in pack.read(path):
                 view["parts"] = {name: torch.from_numpy(p).to(device) for name, p in view["parts"].items()}
+                is_large = min(view["parts"]["reference"].shape[1:]) >= least
+                if not is_large or (guides and "guides" not in view["parts"]):
+                    continue
                 self.views.append(view)
                 self.pairs += [(len(self.views) - 1, i) for i in range(len(view["spp"]))]
         self.sizes = [self.views[view]["parts"]["reference"][0].numel() for view, _ in self.pairs]
@@ -35,16 +40,13 @@ class Frames:
         cut = {name: parts[name][None, :, :h, :w].float() for name in ("reference", "raw", "guides") if name in parts}
         return {"noisy": parts[f"noisy.{which}"][None, :, :h, :w].float(), "spp": spp, **cut}
 
-    def draw(self, rng, count, side, guides):
-        """A batch of augmented crops: noisy (N, 9, S, S), reference and raw (N, 3, S, S), and with `guides` those
-        of the reference, (N, 6, S, S)."""
+    def draw(self, rng, count, side):
+        """A batch of augmented crops: noisy (N, 9, S, S), reference and raw (N, 3, S, S), and the guides of the
+        reference, (N, 6, S, S), where they are kept, else nothing."""
         batch = []
-        while len(batch) < count:
-            (view, which), = rng.choices(self.pairs, self.sizes)
+        for view, which in rng.choices(self.pairs, self.sizes, k=count):
             parts, spp = self.views[view]["parts"], self.views[view]["spp"]
             h, w = parts["reference"].shape[1:]
-            if min(h, w) < side or (guides and "guides" not in parts):
-                continue
             y, x = rng.randrange(h - side + 1), rng.randrange(w - side + 1)
             noisy = parts[f"noisy.{which}"]
             twins = [i for i, count_of in enumerate(spp) if count_of == spp[which] and i != which]
@@ -52,7 +54,7 @@ class Frames:
                 other = parts[f"noisy.{rng.choice(twins)}"]
                 noisy = torch.where(torch.rand(h, w, device=noisy.device) < 0.5, noisy, other)
             reference = parts["reference"]
-            planes = [noisy, reference, parts.get("raw", reference)] + ([parts["guides"]] if guides else [])
+            planes = [noisy, reference, parts.get("raw", reference)] + ([parts["guides"]] if self.guides else [])
             batch.append(_augmented(torch.cat(planes)[:, y : y + side, x : x + side].float(), rng))
         batch = torch.stack(batch)
         return batch[:, :9], batch[:, 9:12], batch[:, 12:15], batch[:, 15:]

@@ -32,10 +32,14 @@ def divisor(albedo):
     return albedo.clamp(0, 1) + ALBEDO_FLOOR
 
 
+def luminance(radiance):
+    """Rec. 709, (N, 1, H, W)."""
+    return (radiance * radiance.new_tensor(_LUMINANCE).view(1, 3, 1, 1)).sum(1, keepdim=True)
+
+
 def exposure(radiance):
     """The factor, (N, 1, 1, 1), that brings the log-average luminance of 16x16 squares to middle grey."""
-    weights = radiance.new_tensor(_LUMINANCE).view(1, 3, 1, 1)
-    squares = F.avg_pool2d((radiance.clamp(min=0) * weights).sum(1, keepdim=True), 16)
+    squares = F.avg_pool2d(luminance(radiance.clamp(min=0)), 16)
     lit = squares > 0
     logarithms = torch.where(lit, squares, 1).log().sum((1, 2, 3), keepdim=True)
     count = lit.sum((1, 2, 3), keepdim=True)

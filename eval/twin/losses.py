@@ -3,16 +3,26 @@
 import torch
 from torch.nn import functional as F
 
+from features import luminance
+
 _EPSILON, _SMALL, _RAW_LIMIT, _SSIM_WEIGHT = 0.001, 2e-4, 8.0, 10.0
 _TARGET, _CAP, _GAMMA, _DARK = 0.35, 0.98, 2.2, 0.005
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+def _weights(reference, exposed):
+    """What squared errors count: the inverse of r^2 + 0.001 in scene radiance."""
+    return 1 / (reference * reference + _EPSILON * exposed * exposed)
+
+
+def relmse(image, reference, exposed=1.0):
+    """The mean of (x - r)^2 / (r^2 + 0.001) of each image, (N, 1, 1, 1)."""
+    return (_weights(reference, exposed) * (image - reference) ** 2).mean((1, 2, 3), keepdim=True)
 
 
 def geomean(image, reference, raw, exposed):
     """Mean over images of ln(1 + RelMSE / 0.0002); its gradient is that against the `raw` reference, as noise in
     the target of a squared error changes no gradient on average."""
-    weight = 1 / (reference * reference + _EPSILON * exposed * exposed)
-    error = (weight * (image.detach() - reference) ** 2).mean((1, 2, 3), keepdim=True)
+    weight, error = _weights(reference, exposed), relmse(image.detach(), reference, exposed)
     target = reference if raw is None else torch.minimum(raw, _RAW_LIMIT * reference + 1)
     loss = (weight / (error + _SMALL) * (image - target) ** 2).mean()
     value = torch.log1p(error / _SMALL).mean()
@@ -21,9 +31,8 @@ def geomean(image, reference, raw, exposed):
 
 def display_exposure(reference):
     """What brings each image's mean luminance, its brightest 2 % capped, to 0.35; 0 for a black one."""
-    weights = reference.new_tensor(_LUMINANCE).view(1, 3, 1, 1)
-    luminance = (reference * weights).sum(1).flatten(1)
-    capped = torch.minimum(luminance, luminance.quantile(_CAP, 1, keepdim=True)).mean(1)
+    values = luminance(reference).flatten(1)
+    capped = torch.minimum(values, values.quantile(_CAP, 1, keepdim=True)).mean(1)
     return torch.where(capped > 0, _TARGET / capped.clamp(min=1e-30), 0).view(-1, 1, 1, 1)
 
 

@@ -179,6 +179,8 @@ def _parted(planes, k):
 class Prefilter(Trunk):
     """Denoises albedo and normal."""
 
+    makes_radiance = False
+
     def __init__(self, widths):
         super().__init__(widths, 3, KERNEL, 3)
         self.widths = list(widths)
@@ -187,27 +189,36 @@ class Prefilter(Trunk):
         """As weights files hold it."""
         return {"architecture": "prefilter", "widths": self.widths}
 
-    def forward(self, albedo, normal):
-        """What training compares with `targets`: the divisor, and the normal times 0.1, (N, 6, H, W)."""
+    def forward(self, noisy, learn_guides=True):
+        """What training compares with `target`, (N, 6, H, W): the divisor, and the normal times 0.1; and the
+        exposure of that, which is none. `noisy` are radiance, albedo and normal, (N, 9, H, W)."""
+        made = self.denoise(noisy[:, 3:6], noisy[:, 6:9])
+        return made, torch.ones_like(made[:, :1, :1, :1])
+
+    def denoise(self, albedo, normal):
+        """The divisor, and the normal times 0.1, (N, 6, H, W)."""
         (light, small, encoded, direction), scale = features.noisy_guides(albedo, normal)
         levels, gain = self.predict(encoded, direction)
         albedo, normal = amplified(filter_levels(light, levels), gain), filter_levels(small, levels)
         return torch.cat((albedo, normal), 1) * scale
 
     @staticmethod
-    def targets(albedo, normal):
-        """Of a reference."""
+    def target(reference, guides):
+        """What its output is to be: of the guides of a reference, (N, 6, H, W)."""
+        albedo, normal = guides[:, :3], guides[:, 3:]
         return torch.cat((features.divisor(albedo), normal.clamp(-1, 1) * features.NORMAL_SCALE), 1)
 
     def clean(self, albedo, normal):
         """The denoised albedo and normal."""
-        made = self(albedo, normal)
+        made = self.denoise(albedo, normal)
         clean_albedo = (made[:, :3] - features.ALBEDO_FLOOR).clamp(0, 1)
         return clean_albedo, (made[:, 3:] / features.NORMAL_SCALE).clamp(-1, 1)
 
 
 class Pyramid(Trunk):
     """The network with its prefilter."""
+
+    makes_radiance = True
 
     def __init__(self, widths, prefilter):
         super().__init__(widths, 7, FULL_KERNEL, 5)
@@ -218,13 +229,19 @@ class Pyramid(Trunk):
         """As weights files hold it."""
         return {"architecture": "pyramid", "widths": self.widths, "prefilter": self.prefilter_widths}
 
-    def forward(self, radiance, albedo, normal, learn_guides=False):
-        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1). The prefilter learns along
-        only where that is asked for."""
+    def forward(self, noisy, learn_guides=False):
+        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1), of noisy radiance, albedo and
+        normal, (N, 9, H, W). The prefilter learns along only where that is asked for."""
+        radiance, albedo, normal = noisy.split(3, 1)
         with torch.set_grad_enabled(learn_guides and torch.is_grad_enabled()):
             clean = self.prefilter.clean(albedo, normal)
         inputs, exposed = features.guides(radiance, albedo, normal, *clean)
         return self.denoise(*inputs), exposed
+
+    @staticmethod
+    def target(reference, guides):
+        """What its output is to be, before the exposure."""
+        return reference
 
     def denoise(self, light, divided, encoded, guide, ratio, shade, normal):
         """The network by itself, on its inputs."""

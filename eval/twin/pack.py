@@ -24,6 +24,8 @@ import numpy as np
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "blender_scripts"))
 
+from demc_blender import exr
+
 GUIDES = (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))
 NOISY = (("Combined", "RGB"), *GUIDES)
 _HALF_MAX = 65504.0
@@ -47,20 +49,18 @@ def _planes(channels, passes):
     """Some passes of an EXR file's channels, one after another, (C, H, W); None where one is missing."""
     names = {}
     for channel in channels:
-        layer, pass_name, component = channel.rsplit(".", 2) if channel.count(".") > 1 else ("", "", channel)
+        *_, pass_name, component = f".{channel}".rsplit(".", 2)
         names.setdefault((pass_name, component), channel)
     wanted = [names.get((p, component)) for p, components in passes for component in components]
     return None if None in wanted else np.stack([channels[name] for name in wanted])
 
 
-def _entries(files, noisy):
-    """What a pack holds of some frames that share a reference."""
-    from demc_blender import exr
-
-    channels = exr.read(files[0]["reference"])
+def _entries(reference, noisy):
+    """What a pack holds of some noisy frames and their reference."""
+    channels = exr.read(reference)
     parts = {"reference": _planes(channels, NOISY[:1])}
     if parts["reference"] is None:
-        raise ValueError(f"{files[0]['reference']}: no Combined pass")
+        raise ValueError(f"{reference}: no Combined pass")
     parts["raw"] = _planes(channels, (("Noisy Image", "RGB"),))
     parts["guides"] = _planes(channels, GUIDES)
     for i, row in enumerate(noisy):
@@ -92,7 +92,7 @@ def write(manifest, out, megabytes, first, frames, seed):
     with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as pack:
         for number, reference in enumerate(order[first:], first):
             noisy = _chosen(views[reference], frames)
-            parts = {name: (squeeze(p), p.shape) for name, p in _entries(views[reference], noisy).items()}
+            parts = {name: (squeeze(p), p.shape) for name, p in _entries(reference, noisy).items()}
             size += sum(len(data) for data, _ in parts.values())
             if size > megabytes * 1e6:
                 break

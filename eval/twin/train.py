@@ -21,16 +21,15 @@ import torch
 
 import losses
 import network
-from data import Frames
+from data import LEAST, Frames
 from optimizer import Optimizer
 
 _WARM_UP = 100
-_SIZES = {**network.SIZES, "prefilter": None}
 
 
 def parse():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", choices=_SIZES, default="demc-m")
+    parser.add_argument("--model", choices=[*network.SIZES, "prefilter"], default="demc-m")
     parser.add_argument("--size-of", choices=network.SIZES, default="demc-m", help="whose prefilter to train")
     parser.add_argument("--data", nargs="+", required=True, metavar="PACK")
     parser.add_argument("--val", nargs="*", default=[], metavar="PACK", help="never trained on")
@@ -81,33 +80,17 @@ def make(options):
     return net.to(options.device, memory_format=torch.channels_last)
 
 
-def output(net, options, noisy):
-    """What the loss compares, in exposed units, and the exposure."""
-    if isinstance(net, network.Prefilter):
-        made = net(noisy[:, 3:6], noisy[:, 6:9])
-        return made, torch.ones_like(made[:, :1, :1, :1])
-    return net(noisy[:, :3], noisy[:, 3:6], noisy[:, 6:9], options.learn_guides)
-
-
-def target_of(net, reference, guides):
-    return net.targets(guides[:, :3], guides[:, 3:]) if isinstance(net, network.Prefilter) else reference
-
-
 @torch.no_grad()
 def validate(net, frames, options):
     """Geometric mean of RelMSE and mean SSIM over whole frames, by sample count."""
     found = {}
     for index in range(len(frames)):
         frame = frames.whole(index)
-        if isinstance(net, network.Prefilter) and "guides" not in frame:
-            continue
-        image, exposed = output(net, options, frame["noisy"])
-        reference = target_of(net, frame["reference"], frame.get("guides"))
-        image = image / exposed
-        relmse = (((image - reference) ** 2) / (reference**2 + 0.001)).mean().clamp(min=1e-12).log().item()
-        radiance = not isinstance(net, network.Prefilter)
-        ssim = losses.displayed_ssim(image, reference).item() if radiance else float("nan")
-        found.setdefault(frame["spp"], []).append((relmse, ssim))
+        image, exposed = net(frame["noisy"], options.learn_guides)
+        image, reference = image / exposed, net.target(frame["reference"], frame.get("guides"))
+        error = losses.relmse(image, reference).clamp(min=1e-12).log().item()
+        ssim = losses.displayed_ssim(image, reference).item() if net.makes_radiance else float("nan")
+        found.setdefault(frame["spp"], []).append((error, ssim))
 
     def mean(values):
         relmse, ssim = (sum(v) / len(v) for v in zip(*values))
@@ -145,9 +128,13 @@ def main():
     os.makedirs(options.out, exist_ok=True)
     net = make(options)
     average = copy.deepcopy(net)
-    hidden = net.hidden()
-    optimizer = Optimizer(net.parameters(), hidden, options.weight_decay)
-    frames, validation = Frames(options.data, options.device), Frames(options.val, options.device)
+    optimizer = Optimizer(net.parameters(), net.hidden(), options.weight_decay)
+    needs_guides = not net.makes_radiance
+    frames = Frames(options.data, options.device, options.patch, needs_guides)
+    validation = Frames(options.val, options.device, LEAST, needs_guides)
+    if not len(frames):
+        what = " whose references keep their guides" if needs_guides else ""
+        sys.exit(f"train.py: no pair of {options.patch}x{options.patch} pixels or more{what}; pack others")
     rng, step, before, pixels = random.Random(options.seed), 0, 0.0, 0
     checkpoint = os.path.join(options.out, "checkpoint.pt")
     if options.resume and os.path.exists(checkpoint):
@@ -191,11 +178,10 @@ def main():
             break
         lr = options.lr[0] + (options.lr[1] - options.lr[0]) * done
         lr *= min(1, (step + 1) / _WARM_UP)
-        learns_guides = isinstance(net, network.Prefilter)
-        noisy, reference, raw, guides = frames.draw(rng, options.batch, options.patch, learns_guides)
-        image, exposed = output(net, options, noisy)
-        target = target_of(net, reference, guides) * exposed
-        raw = raw * exposed if options.raw_references and not learns_guides else None
+        noisy, reference, raw, guides = frames.draw(rng, options.batch, options.patch)
+        image, exposed = net(noisy, options.learn_guides)
+        target = net.target(reference, guides) * exposed
+        raw = raw * exposed if options.raw_references and net.makes_radiance else None
         loss = losses.LOSSES[options.loss](image.float(), target, raw, exposed)
         optimizer.zero()
         loss.backward()

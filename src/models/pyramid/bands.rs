@@ -6,6 +6,8 @@
 
 use std::{collections::VecDeque, ops::Range};
 
+use dfdx::tensor::NoneTape;
+
 use super::{Encoder, Finish, KERNEL, LEVELS, Prediction, Pyramid};
 use crate::{
     Result,
@@ -16,7 +18,6 @@ use crate::{
     nn::{Activation, Conv, Line, MaxPool},
     planes::Planes,
 };
-use dfdx::tensor::NoneTape;
 
 type Maps = Activation<NoneTape>;
 type Field = crate::nn::Field<NoneTape>;

@@ -3,7 +3,7 @@
 //!
 //! What bands keep under way grows with their width. So frames that are wider than most are denoised in vertical strips, each
 //! with as many columns beside its own as they depend on. A strip begins where squares of pixels do at every level. What
-//! depends on the whole frame, exposure and shading, is computed once.
+//! depends on the whole frame, exposures and shading, is computed once.
 
 use std::ops::Range;
 
@@ -60,6 +60,13 @@ fn infer_in(
     let channels = std::iter::once(3).chain(companions.iter().map(|companion| companion.planes.channels));
     let mut written: Vec<Planes> =
         channels.map(|channels| Planes::unwritten(channels, passes.width, passes.height)).collect();
+    let guides = match guides {
+        Some(guides) => {
+            let [albedo, normal] = PREFILTERED_PASSES.map(|pass| guides.require(pass, NEEDED_BY));
+            CleanGuides::Given(albedo?, normal?)
+        }
+        None => CleanGuides::Prefiltered(exposure_of_guides(passes)?),
+    };
     let whole = Whole { network, passes, guides, companions, rows, radiance, exposure, shading };
     for strip in Strip::all(network, passes.width, widest) {
         whole.denoise(&strip, &mut written)?;
@@ -93,10 +100,11 @@ fn infer_guides_in(
     prefilter: &Pyramid,
     passes: &PassSet,
 ) -> Result<[Planes; 2]> {
+    let exposure = exposure_of_guides(passes)?;
     let mut guides = [(); 2].map(|()| Planes::unwritten(3, passes.width, passes.height));
     for Strip { own, seen, .. } in Strip::all(prefilter, passes.width, widest) {
         let cut = Cut::new(prefilter, passes, seen, rows);
-        prefilter_bands(prefilter, passes, &cut, &mut |first, parts| {
+        prefilter_bands(prefilter, passes, exposure, &cut, &mut |first, parts| {
             for (guide, part) in guides.iter_mut().zip(parts) {
                 let from = (own.start - cut.columns.start, 0);
                 guide.write((own.start, first), &part, from, (own.len(), part.height));
@@ -107,15 +115,20 @@ fn infer_guides_in(
     Ok(guides)
 }
 
-/// Denoises the guides in the columns of `cut` and hands out what is done of them, as [`Feed::push`] does.
+/// What a prefilter exposes a frame's guides by.
+fn exposure_of_guides(passes: &PassSet) -> Result<f32> {
+    passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+    Ok(albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?))
+}
+
+/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as [`Feed::push`] does.
 fn prefilter_bands(
     prefilter: &Pyramid,
     passes: &PassSet,
+    exposure: f32,
     cut: &Cut,
     done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
 ) -> Result<()> {
-    let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
-    passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
     let mut feed = Feed::new(prefilter, cut.size(), cut.rows, &[]);
     for band in cut.bands() {
         let padded = cut.padded(&band);
@@ -203,11 +216,19 @@ impl Cut {
     }
 }
 
+/// Where a frame's clean albedo and normal come from.
+enum CleanGuides<'a> {
+    /// They are known.
+    Given(&'a Planes, &'a Planes),
+    /// From the prefilter, which is given the noisy ones at this exposure.
+    Prefiltered(f32),
+}
+
 /// A frame, and what all its strips have in common.
 struct Whole<'a> {
     network: &'a Pyramid,
     passes: &'a PassSet,
-    guides: Option<&'a PassSet>,
+    guides: CleanGuides<'a>,
     companions: &'a [Companion],
     rows: Option<usize>,
     radiance: &'a Planes,
@@ -230,23 +251,24 @@ impl Whole<'_> {
                 Ok(())
             })
         };
-        if let Some(guides) = self.guides {
-            let [albedo, normal] = PREFILTERED_PASSES.map(|pass| guides.require(pass, NEEDED_BY));
-            let (albedo, normal) = (albedo?, normal?);
-            for band in cut.bands() {
-                let size = (cut.columns.len(), band.len());
-                let part = |planes: &Planes| planes.window((cut.columns.start, band.start), size);
-                feed(band.clone(), [part(albedo), part(normal)])?;
+        let exposure = match self.guides {
+            CleanGuides::Prefiltered(exposure) => exposure,
+            CleanGuides::Given(albedo, normal) => {
+                for band in cut.bands() {
+                    let size = (cut.columns.len(), band.len());
+                    let part = |planes: &Planes| planes.window((cut.columns.start, band.start), size);
+                    feed(band.clone(), [part(albedo), part(normal)])?;
+                }
+                return Ok(());
             }
-            return Ok(());
-        }
+        };
         let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
         let prefiltered = Cut { columns: strip.prefiltered.clone(), ..cut };
         let from = strip.seen.start - strip.prefiltered.start;
         let seen = from..from + strip.seen.len();
         let mut held: Option<[Planes; 2]> = None;
         // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
-        prefilter_bands(prefilter, passes, &prefiltered, &mut |first, parts| {
+        prefilter_bands(prefilter, passes, exposure, &prefiltered, &mut |first, parts| {
             let clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
             let mut clean = clean.map(|planes| planes.columns(seen.clone()));
             let end = first + clean[0].height;
