@@ -156,17 +156,54 @@ fn a_deep_part_is_copied_and_the_flat_one_denoised() {
 #[test]
 fn what_cannot_be_decoded_is_listed_and_told_with_its_remedy() {
     let dir = tempfile::tempdir().unwrap();
-    for (name, listed, told) in [
-        ("htj2k32.exr", "Combined", "HTJ2K32"),
-        ("luminance_chroma.exr", "without a view layer", "less than full resolution"),
-    ] {
+    for (name, told) in
+        [("htj2k32.exr", "HTJ2K32"), ("luminance_chroma_b44.exr", "less than full resolution")]
+    {
         let input = data("containers").join(name);
-        demc().arg("inspect").arg(&input).assert().success().stdout(contains(listed).and(contains(told)));
+        demc().arg("inspect").arg(&input).assert().success().stdout(contains("Combined").and(contains(told)));
         demc().args(["inspect", "--json"]).arg(&input).assert().success().stdout(contains(told));
         let mut command = demc();
         command.args(["denoise", "--model", "demc-s"]).arg(&input).arg("--out").arg(dir.path());
         command.assert().code(1).stderr(contains(name).and(contains(told)).and(contains("oiiotool IN.exr")));
     }
+}
+
+#[test]
+fn luminance_and_chroma_are_read_as_the_colours_they_make_and_kept_beside() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = data("containers").join("luminance_chroma.exr");
+    let frame = demc::frame::Frame::read(&input).unwrap();
+    let colours = demc::passes::read(&frame, None).unwrap();
+    let colours = colours.get(demc::passes::Pass::Combined).unwrap();
+    // What OpenImageIO 3.1 reads there.
+    for (x, rgb) in [(10, [1.716_797, 1.596_680, 1.458_984]), (12, [5.042_969, 4.6875, 4.285_156])] {
+        for (c, wanted) in rgb.into_iter().enumerate() {
+            let got = colours.channel(c)[10 * colours.width + x];
+            assert!((got / wanted - 1.0f32).abs() < 2e-3, "{x}, {c}: {got} beside {wanted}");
+        }
+    }
+    let mut command = demc();
+    command.args(["denoise", "--model", "noisy"]).arg(&input).arg("--out").arg(dir.path());
+    command.assert().success();
+    let result = demc::frame::Frame::read(dir.path().join("luminance_chroma.exr")).unwrap();
+    let [kept, added] = result.parts() else { panic!("{:?}", result.parts()) };
+    assert_eq!(
+        (&kept.channels, kept.stored_bytes),
+        (&frame.parts()[0].channels, frame.parts()[0].stored_bytes)
+    );
+    assert_eq!(result.decode(0, &[&[0, 1, 2]]).unwrap(), frame.decode(0, &[&[0, 1, 2]]).unwrap());
+    assert_eq!(
+        added.channels.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(),
+        ["Denoised.B", "Denoised.G", "Denoised.R"]
+    );
+
+    let mut command = demc();
+    command
+        .args(["denoise", "--model", "noisy", "--replace"])
+        .arg(&input)
+        .arg("--out")
+        .arg(dir.path().join("r"));
+    command.assert().code(1).stderr(contains("luminance and chroma").and(contains("--replace")));
 }
 
 #[test]

@@ -8,18 +8,18 @@ use exr::{
 use half::{f16, slice::HalfFloatSliceExt};
 use rayon::prelude::*;
 
-use super::{Frame, StoredChunk, bounds};
+use super::{Frame, StoredChunk, bounds, chroma};
 use crate::{Error, Result};
 
 /// Blocks that each thread decompresses before they are copied out: bounds the memory that decoding adds.
 const BLOCKS_PER_THREAD: usize = 8;
 
 impl Frame {
-    /// Images of a part, each of the full-resolution values of some of its channels in the order asked, (C,
-    /// H, W) of its data window. Unsigned integers are rounded to the nearest f32.
+    /// Images of a part, each of the values of some of its channels in the order asked, (C, H, W) of its data
+    /// window. Unsigned integers are rounded to the nearest f32; chroma of half the resolution is interpolated.
     ///
     /// # Errors
-    /// A block cannot be decompressed, or a channel is subsampled or does not exist.
+    /// A block cannot be decompressed (see [`super::Part::undecodable`]), or a channel does not exist.
     pub fn decode(&self, part: usize, images: &[&[usize]]) -> Result<Vec<Vec<f32>>> {
         let header = self.layout(part)?;
         self.refuse_undecodable(part)?;
@@ -42,9 +42,16 @@ impl Frame {
                 decoded.iter_mut().flat_map(|image| image.chunks_mut(area)).collect();
             planes.into_par_iter().zip(&channels).for_each(|(plane, &channel)| {
                 let finest = blocks.iter().filter(|block| block.index.level == Vec2(0, 0));
-                finest.for_each(|block| copy_block(header, block, channel, plane));
+                let copy = if chroma::is_subsampled(header) { chroma::copy_block } else { copy_block };
+                finest.for_each(|block| copy(header, block, channel, plane));
             });
         }
+        let planes = decoded.iter_mut().flat_map(|image| image.chunks_mut(area)).zip(&channels);
+        let halved: Vec<&mut [f32]> = planes
+            .filter(|(_, channel)| header.channels.list[**channel].sampling != Vec2(1, 1))
+            .map(|(plane, _)| plane)
+            .collect();
+        halved.into_par_iter().for_each(|plane| chroma::reconstruct(plane, header.layer_size.width()));
         Ok(decoded)
     }
 
@@ -67,6 +74,9 @@ impl Frame {
             .get_absolute_block_pixel_coordinates(stored.place)
             .map_err(|e| Self::error(&self.path, e))?;
         let bytes = self.opened.bytes(&stored.bytes)?;
+        let of_block = chroma::is_subsampled(header)
+            .then(|| chroma::of_block(header, at.position.y().unsigned_abs() as usize, at.size));
+        let header = of_block.as_ref().unwrap_or(header);
         bounds::check(header, &bytes, at.size).map_err(|why| {
             Error::invalid(&self.path, format!("damaged EXR ({why}); render it or copy it again"))
         })?;
@@ -112,7 +122,7 @@ fn copy_block(header: &Header, block: &UncompressedBlock, channel: usize, plane:
 }
 
 /// Reads values in native byte order, as `exr` leaves them in uncompressed blocks.
-fn read_values(bytes: &[u8], kind: SampleType, values: &mut [f32]) {
+pub(super) fn read_values(bytes: &[u8], kind: SampleType, values: &mut [f32]) {
     let wide = values.iter_mut().zip(bytes.as_chunks::<4>().0);
     match kind {
         SampleType::F16 => {

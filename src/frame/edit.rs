@@ -26,7 +26,7 @@ use super::{
     header::{Attributes, write_tiles},
     zip,
 };
-use crate::Result;
+use crate::{Error, Result};
 
 /// Largest finite half.
 pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
@@ -36,6 +36,8 @@ pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 const MARK: &str = "demc";
 /// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
 const OWN: [&str; 5] = [MARK, "name", "preview", "chunkCount", "idManifest"];
+/// What a part without a name is called in a file of several, which must have one.
+const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
 const CRYPTOMATTE: &[u8] = b"cryptomatte/";
 
@@ -197,7 +199,9 @@ impl Frame {
                 .all(|c| c.name.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('.'))),
             _ => false,
         };
-        self.is_multi_part() || of_its_own(&self.parts[part])
+        // Blocks that hold halved chroma are kept as they are: what is added gets a part of its own.
+        let is_subsampled = self.parts[part].channels.iter().any(|c| c.subsampled);
+        self.is_multi_part() || is_subsampled || of_its_own(&self.parts[part])
     }
 
     fn add_part(&mut self, beside: usize, name: &str, channels: &Named<'_>) -> Result<()> {
@@ -250,6 +254,10 @@ impl Frame {
     /// Adds channels to a part, or replaces those of the same name.
     fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
         self.refuse_undecodable(part)?;
+        if self.parts[part].channels.iter().any(|c| c.subsampled) {
+            let why = "holds luminance and chroma, which no colours can replace; leave out --replace, and they are added";
+            return Err(Error::invalid(&self.path, why));
+        }
         let Stored { attributes: old_attributes, layout: old } = &self.stored[part];
         let is_new = |name: &Text| new.iter().any(|(n, _)| name.as_slice() == n.as_bytes());
         let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name));
@@ -299,6 +307,9 @@ impl Stored {
             (BlockDescription::Tiles(_), true) => "deeptile",
         };
         attributes.set_text("type", kind);
+        if attributes.text("name").is_none() {
+            attributes.set_text("name", BEAUTY);
+        }
         attributes.set_chunk_count(layout);
     }
 }

@@ -70,6 +70,13 @@ impl Attributes {
         numbers.try_into().ok()
     }
 
+    /// x and y of red, green, blue and white.
+    pub fn chromaticities(&self) -> Option<[f32; 8]> {
+        let numbers = self.value("chromaticities", "chromaticities")?.as_chunks::<4>().0;
+        let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        numbers.try_into().ok()
+    }
+
     /// A rectangle of pixels by its first and last column and row.
     fn corners(&self, name: &str) -> Option<[i32; 4]> {
         let numbers = self.value(name, "box2i")?.as_chunks::<4>().0;

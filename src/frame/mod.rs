@@ -7,6 +7,7 @@
 mod atomic;
 mod bounds;
 mod bytes;
+mod chroma;
 mod decode;
 mod edit;
 mod header;
@@ -27,9 +28,10 @@ use exr::{
 };
 
 pub use atomic::{atomically, prepare_folder};
+pub use chroma::to_rgb;
 pub use edit::{HALF_MAX, NewChannel, Recoded};
 
-use crate::{Error, Result};
+use crate::{Error, Result, metrics::display::LUMINANCE};
 use bytes::{Bytes, Opened};
 use header::{Attributes, string};
 
@@ -98,6 +100,8 @@ pub struct Part {
     pub data_window: Window,
     /// Compressed size in bytes.
     pub stored_bytes: usize,
+    /// Whether what is stored at less than full resolution can be decoded.
+    has_readable_chroma: bool,
 }
 
 /// One channel of a part.
@@ -107,7 +111,7 @@ pub struct Channel {
     pub name: String,
     /// Its number type.
     pub kind: SampleKind,
-    /// Stored at less than full resolution: cannot be decoded.
+    /// Stored at less than full resolution, as chroma beside luminance is.
     pub subsampled: bool,
 }
 
@@ -169,6 +173,12 @@ impl Frame {
     /// Whether the file says that it is an environment by latitude and longitude, whose left and right edges meet.
     pub fn is_latitude_longitude(&self) -> bool {
         self.stored.iter().any(|stored| stored.attributes.value("envmap", "envmap") == Some(&[0]))
+    }
+
+    /// What red, green and blue weigh in the luminance of a part: of its primaries, or of Rec. 709's where it names none.
+    pub fn luminance_weights(&self, part: usize) -> [f32; 3] {
+        let primaries = self.stored[part].attributes.chromaticities();
+        primaries.and_then(chroma::weights).unwrap_or(LUMINANCE.map(|weight| weight as f32))
     }
 
     /// What viewers show, in the coordinates of the data windows.
@@ -247,6 +257,7 @@ impl Part {
                 height: layout.layer_size.height(),
             },
             stored_bytes,
+            has_readable_chroma: chroma::is_readable(layout),
         }
     }
 
@@ -262,13 +273,13 @@ impl Part {
                 self.compression.to_uppercase()
             ))
         } else {
-            subsampled.map(|channel| {
-                format!(
-                    "has channel '{}' at less than full resolution, as chroma beside luminance is; \
-                     convert it to RGB with OpenImageIO: oiiotool IN.exr -o OUT.exr",
-                    channel.name
-                )
-            })
+            let channel = subsampled.filter(|_| !self.has_readable_chroma)?;
+            Some(format!(
+                "has channel '{}' at less than full resolution in a way that demc does not read ({}); convert it to RGB with \
+                 OpenImageIO: oiiotool IN.exr -o OUT.exr",
+                channel.name,
+                self.compression.to_uppercase()
+            ))
         }
     }
 }

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    frame::{Frame, Part, Window},
+    frame::{Frame, Part, Window, to_rgb},
     planes::Planes,
 };
 
@@ -342,7 +342,14 @@ fn decode<'a, K>(
     for (part, (keys, channels)) in by_part {
         let stored = frame.parts()[part].data_window;
         let images = frame.decode(part, &channels)?;
-        for ((key, channels), image) in keys.into_iter().zip(channels).zip(images) {
+        let is_chroma = |channel: usize| frame.parts()[part].channels[channel].subsampled;
+        for ((key, channels), mut image) in keys.into_iter().zip(channels).zip(images) {
+            if let [_, red, blue] = *channels
+                && is_chroma(red)
+                && is_chroma(blue)
+            {
+                to_rgb(&mut image, frame.luminance_weights(part));
+            }
             let image = crop(image, stored, window);
             put(key, Planes::from_vec(channels.len(), window.width, window.height, image));
         }

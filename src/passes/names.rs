@@ -33,7 +33,8 @@ pub fn components(pass: Pass) -> Components {
         // `V` in Blender's File Output node, `T` in Mitsuba, nothing where the channel is the pass.
         Quantity::Distance => &[&["Z"], &["V"], &["T"], &["X"], &["Y"], &["R"], &[""]],
         Quantity::Share => &[&["A"], &[""]],
-        Quantity::Radiance | Quantity::Colour => &[&["R", "G", "B"]],
+        // Luminance and chroma where there are no colours: see [`crate::frame::to_rgb`].
+        Quantity::Radiance | Quantity::Colour => &[&["R", "G", "B"], &["Y", "RY", "BY"]],
     }
 }
 

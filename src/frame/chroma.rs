@@ -1,0 +1,174 @@
+//! Parts that hold luminance beside chroma of half the resolution, as OpenEXR's luminance-chroma images do
+//! (`Y`, `RY`, `BY`; "Technical Introduction to OpenEXR", Luminance/Chroma Images).
+//!
+//! In: uncompressed blocks. Out: chroma at full resolution, and colours of it.
+
+use exr::{
+    block::UncompressedBlock,
+    compression::Compression as C,
+    math::Vec2,
+    meta::{BlockDescription, attribute::ChannelDescription, header::Header},
+};
+
+use super::decode::read_values;
+
+/// The distance of chroma's samples in columns and rows.
+pub const DISTANCE: usize = 2;
+
+/// What the samples at distances 1, 3, 5 ... to each side weigh in a value between them: a windowed sinc, the filter of OpenEXR's
+/// `RgbaYca`.
+const WEIGHTS: [f32; 7] = [0.627_123, -0.186_077, 0.087_929, -0.043_159, 0.019_597, -0.007_540, 0.002_128];
+
+/// Whether some channels are stored at less than full resolution.
+pub fn is_subsampled(header: &Header) -> bool {
+    header.channels.list.iter().any(|channel| channel.sampling != Vec2(1, 1))
+}
+
+/// Whether what is subsampled has half the resolution in rows and columns that there is an even number of, and is compressed as
+/// the `exr` crate decodes it: of version 1.74, B44 takes chroma for larger than it is, and DWA makes other values than OpenEXR.
+pub fn is_readable(header: &Header) -> bool {
+    let halves = |c: &ChannelDescription| c.sampling == Vec2(DISTANCE, DISTANCE);
+    let (origin, size) = (header.own_attributes.layer_position, header.layer_size);
+    let is_even = [origin.x(), origin.y()].iter().all(|edge| edge % 2 == 0)
+        && [size.width(), size.height()].iter().all(|edge| edge.is_multiple_of(DISTANCE));
+    let is_lossy = matches!(header.compression, C::B44 | C::B44A | C::DWAA(_) | C::DWAB(_));
+    is_even
+        && !is_lossy
+        && header.blocks == BlockDescription::ScanLines
+        && header.channels.list.iter().all(|c| c.sampling == Vec2(1, 1) || halves(c))
+}
+
+/// What red, green and blue weigh in luminance, by the places of them and of white in the CIE 1931 diagram: as much as makes white
+/// of equal parts.
+pub fn weights([xr, yr, xg, yg, xb, yb, xw, yw]: [f32; 8]) -> Option<[f32; 3]> {
+    let of = |x: f32, y: f32| [x / y, 1.0, (1.0 - x - y) / y].map(f64::from);
+    let (red, green, blue, white) = (of(xr, yr), of(xg, yg), of(xb, yb), of(xw, yw));
+    let volume = |a: [f64; 3], b: [f64; 3], c: [f64; 3]| {
+        a[0] * (b[1] * c[2] - b[2] * c[1]) - b[0] * (a[1] * c[2] - a[2] * c[1])
+            + c[0] * (a[1] * b[2] - a[2] * b[1])
+    };
+    let whole = volume(red, green, blue);
+    let parts = [volume(white, green, blue), volume(red, white, blue), volume(red, green, white)];
+    let weights = parts.map(|part| (part / whole) as f32);
+    weights.iter().all(|weight| weight.is_finite() && *weight > 0.0).then_some(weights)
+}
+
+/// The header by which a block is decompressed: the `exr` crate takes the size of a block from the bytes of a
+/// pixel, which depend on how many of the block's rows have chroma.
+pub fn of_block(header: &Header, top: usize, size: Vec2<usize>) -> Header {
+    let rows = top..top + size.height();
+    let bytes: usize = rows.flat_map(|y| row(header, y, size.width())).map(|(_, bytes)| bytes).sum();
+    let mut header = header.clone();
+    header.channels.bytes_per_pixel = bytes / size.area().max(1);
+    header
+}
+
+/// The channels that row `y` of a part holds, each with how many bytes it has there.
+fn row(header: &Header, y: usize, width: usize) -> impl Iterator<Item = (usize, usize)> {
+    let held = header.channels.list.iter().enumerate().filter(move |(_, c)| y.is_multiple_of(c.sampling.y()));
+    held.map(move |(index, c)| (index, width / c.sampling.x() * c.sample_type.bytes_per_sample()))
+}
+
+/// Writes a block's values of a channel into the plane of the whole part, each where it was sampled.
+pub fn copy_block(header: &Header, block: &UncompressedBlock, channel: usize, plane: &mut [f32]) {
+    let (at, size) = (block.index.pixel_position, block.index.pixel_size);
+    let description = &header.channels.list[channel];
+    let mut values = vec![0.0; size.width() / description.sampling.x()];
+    let mut start = 0;
+    for y in at.y()..at.y() + size.height() {
+        for (held, bytes) in row(header, y, size.width()) {
+            if held == channel {
+                read_values(&block.data[start..start + bytes], description.sample_type, &mut values);
+                let row = &mut plane[y * header.layer_size.width() + at.x()..];
+                let places = row.iter_mut().step_by(description.sampling.x());
+                places.zip(&values).for_each(|(place, value)| *place = *value);
+            }
+            start += bytes;
+        }
+    }
+}
+
+/// Fills the rows and columns between the samples of a plane. Beyond an edge lies its last sample again.
+pub fn reconstruct(plane: &mut [f32], width: usize) {
+    for row in plane.chunks_mut(width).step_by(DISTANCE) {
+        let samples: Vec<f32> = row.iter().step_by(DISTANCE).copied().collect();
+        let between = row.iter_mut().skip(1).step_by(DISTANCE).enumerate();
+        between.for_each(|(i, value)| *value = middle(i, samples.len(), |at| samples[at]));
+    }
+    let rows = plane.len() / width;
+    for y in (1..rows).step_by(DISTANCE) {
+        let (i, samples) = (y / DISTANCE, rows / DISTANCE);
+        for x in 0..width {
+            plane[y * width + x] = middle(i, samples, |at| plane[at * DISTANCE * width + x]);
+        }
+    }
+}
+
+/// The value halfway between samples `i` and `i + 1` of `count`.
+fn middle(i: usize, count: usize, sample: impl Fn(usize) -> f32) -> f32 {
+    let weighted = WEIGHTS.iter().enumerate().map(|(step, weight)| {
+        weight * (sample(i.saturating_sub(step)) + sample((i + 1 + step).min(count - 1)))
+    });
+    weighted.sum()
+}
+
+/// Luminance and chroma, (3, N), to red, green and blue: chroma is `(R - Y) / Y` and `(B - Y) / Y`, luminance the sum of the
+/// colours by `weights`.
+pub fn to_rgb(planes: &mut [f32], weights: [f32; 3]) {
+    let (luminance, chroma) = planes.split_at_mut(planes.len() / 3);
+    let (red, blue) = chroma.split_at_mut(luminance.len());
+    for ((y, ry), by) in luminance.iter_mut().zip(red).zip(blue) {
+        let (r, b) = ((*ry + 1.0) * *y, (*by + 1.0) * *y);
+        let g = (*y - r * weights[0] - b * weights[2]) / weights[1];
+        (*y, *ry, *by) = (r, g, b);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chroma_between_samples_is_smooth() {
+        let (width, height) = (40, 24);
+        let wave = |x: usize, y: usize| (x as f32 * 0.3).sin() + (y as f32 * 0.2).cos();
+        let mut plane = vec![f32::NAN; width * height];
+        for y in (0..height).step_by(2) {
+            (0..width).step_by(2).for_each(|x| plane[y * width + x] = wave(x, y));
+        }
+        reconstruct(&mut plane, width);
+        for (y, x) in (8..14).flat_map(|y| (14..26).map(move |x| (y, x))) {
+            let off = (plane[y * width + x] - wave(x, y)).abs();
+            assert!(off < 0.03, "{x}, {y}: {off}");
+        }
+        let mut flat = vec![0.25; 36];
+        reconstruct(&mut flat, 6);
+        assert!(flat.iter().all(|v| (v - 0.25).abs() < 1e-5), "{flat:?}");
+    }
+
+    #[test]
+    fn weights_of_primaries() {
+        // Rec. 709 and D65 (ITU-R BT.709-6), and ACEScg (S-2014-004).
+        let rec709 = weights([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290]).unwrap();
+        let aces = weights([0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767]).unwrap();
+        let near = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4);
+        assert!(near(rec709, [0.2126, 0.7152, 0.0722]), "{rec709:?}");
+        assert!(near(aces, [0.27223, 0.67408, 0.05369]), "{aces:?}");
+        assert_eq!(weights([0.0; 8]), None);
+    }
+
+    #[test]
+    fn colours_come_back_from_luminance_and_chroma() {
+        let weights = [0.2126, 0.7152, 0.0722];
+        let colours = [[0.5f32, 0.25, 2.0], [0.0, 1.0, 0.0], [3.0, 3.0, 3.0]];
+        let mut planes = vec![0.0; 9];
+        for (i, rgb) in colours.iter().enumerate() {
+            let y: f32 = rgb.iter().zip(weights).map(|(v, w)| v * w).sum();
+            (planes[i], planes[3 + i], planes[6 + i]) = (y, (rgb[0] - y) / y, (rgb[2] - y) / y);
+        }
+        to_rgb(&mut planes, weights);
+        for (i, rgb) in colours.iter().enumerate() {
+            (0..3).for_each(|c| assert!((planes[3 * c + i] - rgb[c]).abs() < 1e-5, "{planes:?}"));
+        }
+    }
+}
