@@ -1,8 +1,8 @@
-"""Copies a folder of training pairs with its references cleaned by Open Image Denoise.
+"""Copies a folder of pairs, or of sequences, with its references cleaned by Open Image Denoise.
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
-Each <scene>_ref.exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the
+Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the
 scene's noisy frame as guides, denoised first, and keeps what it was as Noisy Image. Noisy frames are
 copied as they are. What is there already is kept.
 """
@@ -10,6 +10,7 @@ copied as they are. What is there already is kept.
 import argparse
 import glob
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,11 +24,14 @@ from demc_blender import exr
 
 
 def pairs(folder):
-    """(scene, reference, its noisy frames) of a folder of pairs, sorted by scene."""
+    """(scene, reference, its noisy frames) of a folder, frame by frame of sequences."""
     folder = glob.escape(folder)
-    for reference in sorted(glob.glob(os.path.join(folder, "*_ref.exr"))):
-        scene = os.path.basename(reference).removesuffix("_ref.exr")
-        yield scene, reference, sorted(glob.glob(os.path.join(folder, glob.escape(scene) + "_[0-9]*spp*.exr")))
+    for reference in sorted(glob.glob(os.path.join(folder, "*_ref.exr")) + glob.glob(os.path.join(folder, "*_ref.*.exr"))):
+        scene, frame = re.fullmatch(r"(.+)_ref((?:\.-?\d+)?)\.exr", os.path.basename(reference)).groups()
+        # Half buffers and further noise seeds of a still go with it.
+        ending = f"*{glob.escape(frame)}.exr" if frame else "*.exr"
+        noisy = glob.glob(os.path.join(folder, glob.escape(scene) + "_[0-9]*spp" + ending))
+        yield scene + frame, reference, sorted(noisy)
 
 
 def planes(channels, ending, letters):
@@ -86,7 +90,7 @@ def clean(oidn, folder, radiance, frame):
 
 def main():
     """Entry point of the script."""
-    parser = argparse.ArgumentParser(prog="clean_references.py", description="Denoises the references of training pairs.")
+    parser = argparse.ArgumentParser(prog="clean_references.py", description="Denoises the references of a folder of pairs.")
     parser.add_argument("pairs", help="folder of <scene>_<spp>spp.exr and <scene>_ref.exr")
     parser.add_argument("out", help="folder for the pairs with clean references")
     parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")

@@ -16,7 +16,8 @@ use crate::{
 #[derive(Debug, ClapArgs)]
 #[command(after_help = "\
 Examples:
-  demc eval --test-set pairs --models demc-s,demc-m --out scores")]
+  demc eval --test-set pairs --models demc-s,demc-m --out scores
+  demc eval --test-set shots --models demc-m,oidn-high --temporal --out flicker")]
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
@@ -24,6 +25,12 @@ pub struct Args {
     /// scores.csv as long as they hold, and are not run again
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// Score demc-s, demc-m, demc-l and weights files with the frames of their sequence around each one too, N before and N after:
+    /// as methods of their own, such as demc-m:temporal. Their time is that of a frame whose neighbours are all denoised for it
+    /// alone [default: frame by frame; 2 without a number]
+    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
+          value_parser = clap::value_parser!(u8).range(1..=8))]
+    temporal: Option<u8>,
     /// Method that the summary's ratios refer to [default: the first of --models]
     #[arg(long, value_name = "NAME")]
     baseline: Option<String>,
@@ -45,7 +52,10 @@ pub struct Args {
 pub fn run(args: Args) -> Result<ExitCode> {
     let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let threads = args.asked.threads();
-    let methods = args.asked.methods()?;
+    let mut methods = args.asked.methods()?;
+    if let Some(reach) = args.temporal {
+        methods.extend(args.asked.temporal(&methods, reach.into())?);
+    }
     let baseline = baseline(&args, &methods)?;
     let options = Options {
         out: args.out,
@@ -151,7 +161,9 @@ impl Progress {
         }
         let value = |name: &str, v: Option<f64>| v.map(|v| format!("  {name} {v:.4}")).unwrap_or_default();
         let time = row.seconds.map(|s| format!("  {:.0} ms", s * 1e3)).unwrap_or_default();
-        format!("{counted}{}{}{time}", value("relmse", row.relmse), value("ssim", row.ssim))
+        let scores = [("relmse", row.relmse), ("ssim", row.ssim), ("flicker", row.flicker)];
+        let scores: String = scores.map(|(name, score)| value(name, score)).concat();
+        format!("{counted}{scores}{time}")
     }
 
     fn finish(&self) {

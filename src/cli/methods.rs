@@ -11,6 +11,7 @@ use super::{SOME_FAILED, peak_memory, warn_line};
 use crate::cli::ExitCode;
 use crate::{
     Error, Result,
+    denoise::{TEMPORAL, Temporal},
     models::{self, Denoiser, oidn::Oidn},
     report::{self, Method, NOISY},
     testset::{self, Pair, Unmatched},
@@ -80,6 +81,32 @@ impl Args {
             });
         }
         Ok(methods)
+    }
+}
+
+impl Args {
+    /// Those of the methods asked for that are this project's own, each with so many frames before and after.
+    ///
+    /// # Errors
+    /// As [`Args::methods`].
+    pub fn temporal(&self, methods: &[Method], reach: usize) -> Result<Vec<Method>> {
+        let asked: Vec<&str> = self.models.iter().map(|model| model.trim()).collect();
+        let mut added = Vec::new();
+        for name in &asked {
+            let short = short_name(name, &asked);
+            let Some(method) = methods.iter().find(|method| method.name == short && report::is_own(&short))
+            else {
+                continue;
+            };
+            added.push(Method {
+                name: short + TEMPORAL,
+                denoiser: Box::new(Temporal::new(models::open(name)?, reach)),
+                // Of a frame with its neighbours in memory, which is not what a stream takes.
+                peak_mib: Box::new(|_| None),
+                stamp: format!("{} {reach}", method.stamp),
+            });
+        }
+        Ok(added)
     }
 }
 

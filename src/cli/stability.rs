@@ -8,9 +8,9 @@ use clap::Args as ClapArgs;
 
 use super::{methods, print_line, warn_line};
 use crate::{
-    Result,
-    report::number,
-    stability::{self, Row, Trial},
+    Error, Result,
+    report::{NOISY, number},
+    stability::{self, Options, Row, Trial, content::Case},
 };
 
 /// Arguments of `demc stability`.
@@ -19,9 +19,23 @@ use crate::{
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for stability.csv, which grows row by row, and stability_summary.csv; those of an earlier run are replaced
+    /// Folder for stability.html, its maps and tables, of which stability.csv grows row by row; those of an earlier run are replaced
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// Changes to try, as listed below [default: all]
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', value_parser = trial)]
+    trials: Vec<Trial>,
+    /// Method that scenes are held against, beside their input
+    #[arg(long, value_name = "NAME", default_value = NOISY)]
+    baseline: String,
+    /// How many of the worst scenes to show with pictures
+    #[arg(long, value_name = "N", default_value_t = 6)]
+    worst: usize,
+}
+
+fn trial(name: &str) -> Result<Trial, String> {
+    let found = Trial::ALL.into_iter().find(|trial| trial.name() == name);
+    found.ok_or_else(|| format!("there are {}", Trial::ALL.map(Trial::name).join(", ")))
 }
 
 /// What the trials do, and what the tables tell of them.
@@ -29,8 +43,11 @@ fn trials() -> String {
     let lines = Trial::ALL.map(|trial| format!("  {:<16}{}\n", trial.name(), trial.meaning()));
     format!(
         "Trials:\n{}\nratio: RelMSE over that of the frame as rendered. deviation: RelMSE between the two results.\n\
+         stability_scenes.csv tells of frames as rendered, renders of one scene and sample count taken together: a method\n\
+         fails where its RelMSE is above the input's, or its light off by 2% more than the input's.\n\
          Half buffers beside a frame are not used: nfor works on the frame alone.\n\n\
-         Examples:\n  demc stability --test-set pairs --models demc-s --out stability",
+         Examples:\n  demc stability --test-set pairs --models demc-s --out stability\n  \
+         demc stability --test-set hard/manifest.csv --models demc-m,oidn-high --trials as-rendered --out hard_map",
         lines.concat()
     )
 }
@@ -42,7 +59,23 @@ fn trials() -> String {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let methods = args.asked.methods()?;
-    let (mut done, all) = (0, pairs.len() * methods.len() * Trial::ALL.len());
+    if methods.iter().all(|method| method.name != args.baseline) {
+        let names: Vec<&str> = methods.iter().map(|method| method.name.as_str()).collect();
+        return Err(Error::Usage(format!(
+            "--baseline {}: none of the methods {}",
+            args.baseline,
+            names.join(", ")
+        )));
+    }
+    let options = Options {
+        out: args.out.clone(),
+        view_layer: args.asked.view_layer.clone(),
+        trials: if args.trials.is_empty() { Trial::ALL.to_vec() } else { in_order(&args.trials) },
+        baseline: args.baseline.clone(),
+        worst: args.worst,
+        threads: args.asked.threads(),
+    };
+    let (mut done, all) = (0, pairs.len() * methods.len() * options.trials.len());
     let mut tell = |row: &Row| {
         done += 1;
         let value =
@@ -53,10 +86,21 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let said = numbers + &why.map(|why| format!(": {why}")).collect::<String>();
         warn_line(&format!("[{done}/{all}] {} {} spp {} {}{said}", row.scene, row.spp, row.model, row.trial));
     };
-    let view_layer = args.asked.view_layer.as_deref();
-    let rows = methods::pool(args.asked.threads())?
-        .install(|| stability::run(&pairs, &methods, view_layer, &args.out, &mut tell))?;
+    let (rows, cases) =
+        methods::pool(options.threads)?.install(|| stability::run(&pairs, &methods, &options, &mut tell))?;
     let failed = rows.iter().filter(|row| !row.reason.is_empty()).count();
+    let judged = cases.iter().filter_map(Case::passes);
+    let (all, bad) = (judged.clone().count(), judged.filter(|passes| !passes).count());
+    if all > 0 {
+        print_line(&format!("{bad} of {all} scenes as rendered are out of bounds"));
+    }
     print_line(&args.out.join("stability_summary.csv").display().to_string());
+    print_line(&args.out.join("stability.html").display().to_string());
     Ok(methods::finish(failed, &args.out.join("stability.csv")))
+}
+
+/// The trials asked for in the order of all, the unchanged frame first: others are told beside it.
+fn in_order(asked: &[Trial]) -> Vec<Trial> {
+    let is_asked = |trial: &Trial| *trial == Trial::AsRendered || asked.contains(trial);
+    Trial::ALL.into_iter().filter(is_asked).collect()
 }

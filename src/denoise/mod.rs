@@ -12,6 +12,7 @@ mod plan;
 #[cfg(feature = "preview")]
 pub mod preview;
 mod sequence;
+mod temporal;
 mod watch;
 mod window;
 mod wrap;
@@ -22,7 +23,8 @@ pub use batch::{Batch, End, Outcome, Stopper};
 pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, shot, store};
 pub use lights::Alpha;
 pub use plan::{Input, Plan, plan, plan_tree};
-pub use sequence::follows;
+pub use sequence::{follows, neighbours};
+pub use temporal::{SUFFIX as TEMPORAL, Temporal};
 pub use watch::{Look, Watch};
 pub use wrap::Wrap;
 

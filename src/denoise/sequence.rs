@@ -62,6 +62,15 @@ pub fn follows(file: &Path, before: &Path) -> bool {
     place.key == before.key && place.number - before.number == 1
 }
 
+/// The files of a frame's sequence that lie beside it, up to so many frames before and after, by how many frames later they are.
+pub fn neighbours(file: &Path, reach: usize) -> BTreeMap<i32, PathBuf> {
+    let Some(place) = Place::of(file).filter(|_| reach > 0) else { return BTreeMap::new() };
+    let offset = |number: i64| i32::try_from(number - place.number).ok();
+    let near = |offset: i32| offset != 0 && offset.unsigned_abs() as usize <= reach;
+    let files = place.siblings().into_iter();
+    files.filter_map(|(number, path)| Some((offset(number).filter(|at| near(*at))?, path))).collect()
+}
+
 /// Jobs of a sequence, by number, or a job alone.
 pub struct Stretch {
     /// What lies on disk, the jobs' own files at their numbers.

@@ -115,6 +115,26 @@ impl Window {
         self.held.insert(number, Held { rest, moments, error });
     }
 
+    /// Takes in a frame that has a single view and comes from no file.
+    pub fn enter_shot(&mut self, number: i64, shot: Shot, model: &dyn Denoiser) {
+        let moments = BTreeMap::from([(ViewKey::default(), Moment::new(shot, model))]);
+        self.held.insert(number, Held { rest: None, moments, error: None });
+    }
+
+    /// What becomes of a frame that [`Window::enter_shot`] took in.
+    ///
+    /// # Errors
+    /// The model cannot denoise it.
+    pub fn denoise_shot(
+        &mut self,
+        number: i64,
+        model: &dyn Denoiser,
+        options: &Options,
+        report: &mut Report,
+    ) -> Result<Planes> {
+        self.view(number, &ViewKey::default(), model, options, report)
+    }
+
     /// Lets go of frames before one.
     pub fn leave(&mut self, before: i64) {
         self.held = self.held.split_off(&before);

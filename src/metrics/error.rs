@@ -50,6 +50,13 @@ pub fn smape(image: &Planes, reference: &Planes) -> f64 {
     mean(image, reference, |x, r| (x - r).abs() / (x.abs() + r.abs() + SMAPE_EPSILON))
 }
 
+/// The sum of all values over the reference's: what becomes of the light. None where the reference's is not positive.
+pub fn energy(image: &Planes, reference: &Planes) -> Option<f64> {
+    let sum = |planes: &Planes| planes.data.iter().map(|v| f64::from(*v)).sum::<f64>();
+    let whole = sum(reference);
+    (whole > 0.0).then(|| sum(image) / whole)
+}
+
 /// RelMSE of each pixel (the mean of its channels), row-major: the error map of a report.
 pub fn relmse_map(image: &Planes, reference: &Planes) -> Vec<f64> {
     (0..image.pixels())

@@ -22,6 +22,11 @@ pub trait Denoiser: Send + Sync {
         false
     }
 
+    /// How many frames of its sequence before and after one it makes use of, see [`Shot::neighbours`].
+    fn reach(&self) -> usize {
+        0
+    }
+
     /// What the user should know about how it treats this frame.
     fn notes(&self, shot: &Shot) -> Option<String> {
         let _ = shot;

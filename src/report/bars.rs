@@ -69,10 +69,22 @@ impl Bars {
         Self::new("SSIM by scene (higher is better)", "ssim", rows, summaries, &[("mean", mean as Mean)])
     }
 
+    /// Flicker of all `rows`, with the means of `summaries`.
+    pub fn flicker(rows: &[Row], summaries: &[Method]) -> Self {
+        let followed: Vec<Row> = rows.iter().filter(|row| row.flicker.is_some()).cloned().collect();
+        let means = [("mean", mean as Mean), ("geometric mean", geomean as Mean)];
+        Self::new("Flicker by frame (logarithmic; lower is better)", "flicker", &followed, summaries, &means)
+    }
+
     fn new(title: &str, metric: &str, rows: &[Row], summaries: &[Method], means: &[(&str, Mean)]) -> Self {
         let overall: Vec<&Method> = summaries.iter().filter(|s| s.spp.is_none()).collect();
         let names: Vec<&str> = overall.iter().map(|s| s.model.as_str()).collect();
-        let is_error = metric == "relmse";
+        let is_error = metric != "ssim";
+        let value: fn(&Row) -> Option<f64> = match metric {
+            "relmse" => |row| row.relmse,
+            "flicker" => |row| row.flicker,
+            _ => |row| row.ssim,
+        };
         let several_spp = rows.iter().any(|r| r.spp != rows[0].spp);
         let mut groups: Vec<Group> = Vec::new();
         let mut by_pair = HashMap::new();
@@ -83,7 +95,7 @@ impl Bars {
                 groups.push(Group { label, is_mean: false, values: vec![None; names.len()] });
                 groups.len() - 1
             });
-            let value = if is_error { row.relmse } else { row.ssim };
+            let value = value(row);
             if let Some(method) = names.iter().position(|n| *n == row.model) {
                 // A logarithmic axis has no zero.
                 groups[at].values[method] = value.filter(|v| !is_error || *v > 0.0);

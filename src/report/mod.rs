@@ -2,7 +2,7 @@
 //!
 //! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
 //! `summary.csv`, the charts `speed_vs_accuracy`, `bars_relmse` and `bars_ssim` as PNG and SVG,
-//! `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish;
+//! `error_over_samples` where scenes were rendered at several sample counts, `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish;
 //! those of earlier runs into the folder stay in `scores.csv` as long as they hold, and are not run again. All else shows what
 //! this run asked for.
 
@@ -11,6 +11,8 @@ mod bars;
 mod canvas;
 mod chart;
 mod figure;
+mod followed;
+mod heat;
 mod labels;
 #[cfg(feature = "train")]
 mod loss;
@@ -20,14 +22,20 @@ mod picture;
 mod provenance;
 mod rows;
 mod run;
+mod samples;
+mod sequences;
 mod settings;
 mod sheet;
 mod summary;
 
 use std::path::{Path, PathBuf};
 
+pub use figure::Figure;
+pub use heat::{HeatCell, HeatMap};
 #[cfg(feature = "train")]
 pub use loss::loss_chart;
+pub(crate) use page::{document, picture_of};
+pub use palette::is_own;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
 pub use run::{Event, Loaded, evaluate, load, load_listed};
 pub use settings::file_stamp;

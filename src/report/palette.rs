@@ -18,6 +18,11 @@ pub const FAINT: RGBColor = RGBColor(120, 120, 130);
 /// The noisy input.
 pub const NOISY_GREY: RGBColor = RGBColor(165, 165, 170);
 
+/// Whether a method is one of this project's own.
+pub fn is_own(name: &str) -> bool {
+    family(name) == Family::Own
+}
+
 /// The family of a method by its name; weights files are ours.
 fn family(name: &str) -> Family {
     catalogue::find(name).map_or(Family::Own, |method| method.family)
@@ -56,7 +61,8 @@ pub fn legible(colour: RGBColor) -> RGBColor {
     mix(colour, INK, 0.45)
 }
 
-fn mix(a: RGBColor, b: RGBColor, share: f64) -> RGBColor {
+/// The colour a share of the way from one to another.
+pub fn mix(a: RGBColor, b: RGBColor, share: f64) -> RGBColor {
     let channel = |a: u8, b: u8| (f64::from(a) + (f64::from(b) - f64::from(a)) * share).round() as u8;
     RGBColor(channel(a.0, b.0), channel(a.1, b.1), channel(a.2, b.2))
 }

@@ -12,6 +12,8 @@ const SIZES: [(u32, u8); 5] = [(1800, 80), (1600, 70), (1400, 65), (1200, 60), (
 /// Bytes for all sheets of a page and for one; base64 adds a third.
 const ALL: usize = 3_300_000;
 const ONE: usize = 450_000;
+/// Width and quality of one of many.
+const SMALL: (u32, u8) = (600, 80);
 /// However many there are, a sheet this small still shows something.
 const LEAST: usize = 60_000;
 
@@ -28,10 +30,7 @@ pub struct Picture {
 /// # Errors
 /// The file is unreadable.
 pub fn embed(path: &Path, count: usize) -> Result<Picture> {
-    let image = ImageReader::open(path)
-        .map_err(Error::io("read", path))?
-        .decode()
-        .map_err(|e| Error::invalid(path, format!("{e}; remove it and run again")))?;
+    let image = open(path)?;
     let budget = (ALL / count.max(1)).clamp(LEAST, ONE);
     let (mut jpeg, mut size) = (Vec::new(), (0, 0));
     let mut last = None;
@@ -55,7 +54,32 @@ pub fn embed(path: &Path, count: usize) -> Result<Picture> {
             break;
         }
     }
-    Ok(Picture { address: format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg)), size })
+    Ok(Picture { address: address(&jpeg), size })
+}
+
+/// One of many small pictures, as wide as half a page at most.
+///
+/// # Errors
+/// The file is unreadable.
+pub fn small(path: &Path) -> Result<Picture> {
+    let image = open(path)?;
+    let small = shrink(&image, SMALL.0);
+    let mut jpeg = Vec::new();
+    small
+        .write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, SMALL.1))
+        .map_err(|e| Error::invalid(path, format!("cannot be encoded: {e}")))?;
+    Ok(Picture { address: address(&jpeg), size: (small.width(), small.height()) })
+}
+
+fn open(path: &Path) -> Result<DynamicImage> {
+    ImageReader::open(path)
+        .map_err(Error::io("read", path))?
+        .decode()
+        .map_err(|e| Error::invalid(path, format!("{e}; remove it and run again")))
+}
+
+fn address(jpeg: &[u8]) -> String {
+    format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg))
 }
 
 fn shrink(image: &DynamicImage, width: u32) -> DynamicImage {

@@ -13,7 +13,7 @@ use super::cell;
 use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
-pub const COLUMNS: [&str; 23] = [
+pub const COLUMNS: [&str; 24] = [
     "scene",
     "model",
     "spp",
@@ -29,6 +29,7 @@ pub const COLUMNS: [&str; 23] = [
     "relmse_trimmed",
     "smape",
     "flip",
+    "flicker",
     "peak_mib",
     "threads",
     "repeats",
@@ -72,6 +73,9 @@ pub struct Row {
     pub smape: Option<f64>,
     /// See [`crate::metrics`].
     pub flip: Option<f64>,
+    /// See [`crate::metrics::flicker`]; none for a frame that no other frame of the test set comes before.
+    #[serde(default)]
+    pub flicker: Option<f64>,
     /// Memory that the first run added at its peak.
     pub peak_mib: Option<f64>,
     /// Threads used.
@@ -121,6 +125,7 @@ impl Row {
             &mut self.relmse_trimmed,
             &mut self.smape,
             &mut self.flip,
+            &mut self.flicker,
             &mut self.peak_mib,
         ];
         for number in numbers {
@@ -189,6 +194,7 @@ impl Row {
             cell(self.relmse_trimmed),
             cell(self.smape),
             cell(self.flip),
+            cell(self.flicker),
             cell(self.peak_mib),
             self.threads.to_string(),
             self.repeats.to_string(),

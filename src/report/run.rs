@@ -13,15 +13,18 @@ use super::{
     bars::Bars,
     chart::Chart,
     figure::Figure,
+    followed::Followed,
     page::Page,
     provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
+    samples::Samples,
+    sequences,
     settings::{self, Settings},
     sheet::{self, Shown},
     summary,
 };
 use crate::{
-    Result,
+    Result, denoise,
     error::attempt,
     frame::prepare_folder,
     metrics::{self, pairing},
@@ -109,6 +112,7 @@ pub fn evaluate(
     }
     now.write(&stored)?;
     let mut peaks = Peaks::new();
+    let mut followed = Followed::new(pairs, options.view_layer.as_deref());
     for (pair, name) in pairs.iter().zip(&sheet_names) {
         let finished: Vec<bool> =
             methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
@@ -118,7 +122,7 @@ pub fn evaluate(
             continue;
         }
         on(Event::Pair(pair));
-        let done = run_pair(pair, methods, &finished, sheet.is_some(), options, &mut peaks);
+        let done = run_pair(pair, methods, &finished, sheet.is_some(), options, (&mut peaks, &mut followed));
         for row in done.rows {
             if !row.note.is_empty() {
                 on(Event::Note(&row.note));
@@ -132,6 +136,9 @@ pub fn evaluate(
                 .filter_map(|m| Some((m.name.as_str(), table.get(&Row::new(pair, &m.name).key())?)))
                 .collect();
             sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
+            if pair.frame.is_some() {
+                sequences::store(out, pair, &scene.images, &scene.reference)?;
+            }
             now.sheets.insert(name.clone(), shows(pair));
             now.write(&stored)?;
         }
@@ -140,11 +147,17 @@ pub fn evaluate(
     let rows = table.finish(keys)?;
     let summaries = summary::summarise(&rows, &names, &options.baseline);
     write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
-    let charts = [
+    let mut charts = vec![
         ("Speed and accuracy", Chart::new(&summaries, options.threads).write(out, "speed_vs_accuracy")?),
         ("RelMSE of every scene", Bars::relmse(&rows, &summaries).write(out, "bars_relmse")?),
         ("SSIM of every scene", Bars::ssim(&rows, &summaries).write(out, "bars_ssim")?),
     ];
+    if rows.iter().any(|row| row.flicker.is_some()) {
+        charts.push(("Flicker of every frame", Bars::flicker(&rows, &summaries).write(out, "bars_flicker")?));
+    }
+    if let Some(samples) = Samples::new(&rows, &names) {
+        charts.push(("Error over samples", samples.write(out, "error_over_samples")?));
+    }
     let scenes: Vec<(&Pair, Option<PathBuf>)> = pairs
         .iter()
         .zip(&sheet_names)
@@ -153,7 +166,9 @@ pub fn evaluate(
             (pair, is_known.then(|| sheets.join(name)).filter(|path| path.is_file()))
         })
         .collect();
+    let sequences = if options.sheets { sequences::section(out, pairs, &names)? } else { None };
     Page {
+        sequences: sequences.as_ref(),
         rows: &rows,
         summaries: &summaries,
         charts: &charts,
@@ -201,6 +216,16 @@ impl Loaded {
     pub fn noisy(&self) -> &Planes {
         self.shot.as_stored().expect("a pair without Combined is not loaded")
     }
+
+    /// Reads the frames around the noisy one that lie beside it, for methods that make use of them; those that cannot be read are
+    /// left out.
+    pub fn read_neighbours(&mut self, reach: usize, view_layer: Option<&str>) {
+        for (offset, path) in denoise::neighbours(&self.shot.passes.path, reach) {
+            if let Ok(shot) = shot::prepare(&path, view_layer) {
+                self.shot.neighbours.insert(offset, shot.passes);
+            }
+        }
+    }
 }
 
 /// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the reference its namesake.
@@ -237,7 +262,7 @@ fn run_pair(
     finished: &[bool],
     shown: bool,
     options: &Options,
-    peaks: &mut Peaks,
+    (peaks, followed): (&mut Peaks, &mut Followed),
 ) -> Done {
     let open = || methods.iter().zip(finished).filter(|(_, finished)| !**finished).map(|(m, _)| m);
     let new_row = |method: &Method| {
@@ -259,6 +284,9 @@ fn run_pair(
     } else {
         Ok(())
     };
+    let reach = methods.iter().map(|method| method.denoiser.reach()).max().unwrap_or(0);
+    loaded.read_neighbours(reach, options.view_layer.as_deref());
+    let mut before = followed.before(pair);
     let mut rows: Vec<Option<Row>> = Vec::new();
     let mut images = Vec::new();
     for (method, &finished) in methods.iter().zip(finished) {
@@ -285,6 +313,15 @@ fn run_pair(
         if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
             let measure = || (method.peak_mib)(&pair.noisy);
             row.peak_mib = *peaks.entry((method.name.clone(), width, height)).or_insert_with(measure);
+        }
+        if !finished && let (Some(image), Some(before)) = (&image, before.as_mut()) {
+            match before.flicker(method, image, &loaded) {
+                Ok(flicker) => row.flicker = flicker,
+                Err(why) => row.say(&why),
+            }
+        }
+        if let Some(image) = &image {
+            followed.keep(pair, &loaded.reference, &method.name, image);
         }
         if shown && let Some(image) = &image {
             images.push(Shown::new(&method.name, image, &loaded.reference));

@@ -13,7 +13,7 @@ use super::{
     provenance::Provenance,
     rows::{Row, write_file},
 };
-use crate::{Result, shot, testset::Pair};
+use crate::{Result, denoise, shot, testset::Pair};
 
 /// The settings of a run, and stamps of what it read. Fields of other versions are passed over.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -92,15 +92,21 @@ impl Settings {
     }
 }
 
+/// The most frames around one that a method makes use of.
+pub const REACH: usize = 8;
+
 /// What `run.json` knows a pair by.
 pub fn name(noisy: &Path, reference: &Path) -> String {
     format!("{} {}", noisy.display(), reference.display())
 }
 
-/// Of all files that a method may read for a pair.
+/// Of all files that a row of a pair may depend on.
 fn pair_stamp(noisy: &Path, reference: &Path) -> String {
     let halves = shot::half_paths(noisy).into_iter().flatten();
-    let files = [noisy.into(), reference.into()].into_iter().chain(halves);
+    // Of a frame of a sequence, those around it.
+    let around = [noisy, reference].map(|file| denoise::neighbours(file, REACH)).into_iter().flatten();
+    let files =
+        [noisy.into(), reference.into()].into_iter().chain(halves).chain(around.map(|(_, file)| file));
     files.map(|file: PathBuf| file_stamp(&file)).collect::<Vec<_>>().join(" ")
 }
 

@@ -73,6 +73,16 @@ impl Shown {
             errors: error::relmse_map(image, reference),
         }
     }
+
+    /// The method's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The frame as it is displayed.
+    pub fn frame(&self) -> &RgbImage {
+        &self.frame
+    }
 }
 
 /// `image` at the exposure of the reference; at its own radiance where that is black.

@@ -18,7 +18,7 @@ use super::{
 type Metric = fn(&Row) -> Option<f64>;
 
 /// Metrics that are summarised.
-const METRICS: [(&str, Metric); 9] = [
+const METRICS: [(&str, Metric); 10] = [
     ("relmse", |r| r.relmse),
     ("ssim", |r| r.ssim),
     ("rmse", |r| r.rmse),
@@ -28,6 +28,7 @@ const METRICS: [(&str, Metric); 9] = [
     ("relmse_trimmed", |r| r.relmse_trimmed),
     ("smape", |r| r.smape),
     ("flip", |r| r.flip),
+    ("flicker", |r| r.flicker),
 ];
 
 /// One metric of one method over the common scenes.

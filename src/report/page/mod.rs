@@ -35,6 +35,8 @@ pub struct Page<'a> {
     pub charts: &'a [(&'a str, String)],
     /// The pairs, each with its sheet where there is one.
     pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
+    /// What sequences look like over time, where there are any.
+    pub sequences: Option<&'a Markup>,
     /// How it was run.
     pub options: &'a Options,
     /// What it was run with and on.
@@ -45,6 +47,40 @@ pub struct Page<'a> {
 const POLICY: &str =
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
 
+/// A page of that title, which is its first heading too, with the style, script and policy of all.
+pub fn document(title: &str, body: &Markup) -> Markup {
+    html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                meta http-equiv="Content-Security-Policy" content=(POLICY);
+                link rel="icon" href="data:,";
+                title { (title) }
+                style { (PreEscaped(include_str!("page.css"))) }
+            }
+            body {
+                h1 { (title) }
+                (body)
+                script { (PreEscaped(include_str!("page.js"))) }
+            }
+        }
+    }
+}
+
+/// A comparison sheet as part of a page of `count` of them.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn picture_of(sheet: &Path, count: usize, what: &str) -> Result<Markup> {
+    let Picture { address, size: (width, height) } = picture::embed(sheet, count)?;
+    Ok(html! {
+        img src=(address) width=(width) height=(height)
+            alt=(format!("{what}: every method, its error map and details"));
+    })
+}
+
 impl Page<'_> {
     /// Writes `report.html` into the output folder.
     ///
@@ -53,7 +89,7 @@ impl Page<'_> {
     pub fn write(&self) -> Result<()> {
         let count = self.scenes.iter().filter(|(_, sheet)| sheet.is_some()).count();
         let scenes = self.scenes.par_iter().enumerate().map(|(index, (pair, sheet))| {
-            let picture = sheet.as_ref().map(|path| picture::embed(path, count)).transpose()?;
+            let picture = sheet.as_ref().map(|path| picture_of(path, count, &pair.label())).transpose()?;
             Ok(self.scene(index, pair, sheet.as_deref(), picture))
         });
         let scenes: Vec<Markup> = scenes.collect::<Result<_>>()?;
@@ -67,19 +103,7 @@ impl Page<'_> {
         let notes: BTreeSet<&str> =
             self.rows.iter().map(|row| row.note.as_str()).filter(|note| !note.is_empty()).collect();
         let spp: BTreeSet<u32> = self.scenes.iter().map(|(pair, _)| pair.spp).collect();
-        html! {
-            (DOCTYPE)
-            html lang="en" {
-                head {
-                    meta charset="utf-8";
-                    meta name="viewport" content="width=device-width, initial-scale=1";
-                    meta http-equiv="Content-Security-Policy" content=(POLICY);
-                    link rel="icon" href="data:,";
-                    title { (title) }
-                    style { (PreEscaped(include_str!("page.css"))) }
-                }
-                body {
-                    h1 { (title) }
+        let body = html! {
                     p.faint {
                         (p.started) ", " (self.options.threads) " threads, " (p.cpu) ", demc " (p.version)
                     }
@@ -98,6 +122,7 @@ impl Page<'_> {
                         h2 { (title) }
                         figure { (PreEscaped(svg)) }
                     }
+                    @if let Some(sequences) = self.sequences { (sequences) }
                     h2 #scenes { "Scenes" }
                     nav {
                         @for (index, (pair, _)) in self.scenes.iter().enumerate() {
@@ -109,10 +134,8 @@ impl Page<'_> {
                     }
                     @for scene in scenes { (scene) }
                     (self.how())
-                    script { (PreEscaped(include_str!("page.js"))) }
-                }
-            }
-        }
+        };
+        document(&title, &body)
     }
 
     /// "10 renders, 6 methods".
@@ -194,7 +217,7 @@ impl Page<'_> {
         }
     }
 
-    fn scene(&self, index: usize, pair: &Pair, sheet: Option<&Path>, picture: Option<Picture>) -> Markup {
+    fn scene(&self, index: usize, pair: &Pair, sheet: Option<&Path>, picture: Option<Markup>) -> Markup {
         let of_pair = |r: &&Row| r.noisy == pair.noisy && r.reference == pair.reference;
         let rows: Vec<&Row> = self.rows.iter().filter(of_pair).collect();
         let names: Vec<&str> = rows.iter().map(|r| r.model.as_str()).collect();
@@ -211,10 +234,9 @@ impl Page<'_> {
                     (pair.label()) ", " (pair.spp) " samples per pixel"
                     @if let Some(size) = size { ", " (size) }
                 }
-                @if let Some(Picture { address, size: (width, height) }) = picture {
+                @if let Some(picture) = picture {
                     figure {
-                        img src=(address) width=(width) height=(height)
-                            alt=(format!("{}: every method, its error map and details", pair.label()));
+                        (picture)
                         @if let Some(file) = file {
                             figcaption.faint { "In full size beside this page: " code { (file) } }
                         }
@@ -251,6 +273,12 @@ impl Page<'_> {
             ("trimmed RelMSE", "the same without the worst 0.1 % of pixels".into()),
             ("SMAPE", "mean of |x - r| / (|x| + |r| + 0.01)".into()),
             ("SSIM", "on the image exposed for display, Gaussian window of sigma 1.5".into()),
+            (
+                "flicker",
+                "mean of (e(t) - W e(t-1))² / (r² + 0.001), e the error of a frame, W the way along its vectors, over \
+                 pixels whose reference changes little"
+                    .into(),
+            ),
             ("FLIP", "HDR-FLIP (Andersson et al. 2021): 0 is no visible difference".into()),
         ];
         html! {
@@ -284,7 +312,7 @@ macro_rules! statistic {
     };
 }
 
-const SUMMARY: [Column<Method>; 12] = [
+const SUMMARY: [Column<Method>; 14] = [
     statistic!("RelMSE", "geometric mean over scenes", Low, score, "relmse", geomean),
     statistic!("× baseline", "RelMSE against the baseline, scene by scene", Low, ratio, "relmse", ratio),
     statistic!("mean RelMSE", "arithmetic mean: the worst scene rules it", Low, score, "relmse", mean),
@@ -299,6 +327,15 @@ const SUMMARY: [Column<Method>; 12] = [
     statistic!("SMAPE", "mean", Low, share, "smape", mean),
     statistic!("SSIM", "mean", High, share, "ssim", mean),
     statistic!("FLIP", "mean", Low, share, "flip", mean),
+    statistic!(
+        "flicker",
+        "change of the error from frame to frame, geometric mean",
+        Low,
+        score,
+        "flicker",
+        geomean
+    ),
+    statistic!("× flicker", "flicker against the baseline, frame by frame", Low, ratio, "flicker", ratio),
     statistic!("ms/Mpx", "milliseconds per megapixel, geometric mean", Low, whole, "ms_per_mpx", geomean),
     statistic!("× time", "time against the baseline, scene by scene", Low, ratio, "ms_per_mpx", ratio),
     Column {
@@ -337,12 +374,13 @@ macro_rules! cell {
     };
 }
 
-const SCENE: [Column<Row>; 10] = [
+const SCENE: [Column<Row>; 11] = [
     cell!("RelMSE", Low, score, relmse),
     cell!("trimmed", Low, score, relmse_trimmed),
     cell!("SMAPE", Low, share, smape),
     cell!("SSIM", High, share, ssim),
     cell!("FLIP", Low, share, flip),
+    cell!("flicker", Low, score, flicker),
     cell!("RMSE", Low, score, rmse),
     cell!("max error", Low, score, max_error),
     Column {

@@ -31,15 +31,17 @@ pub struct Line<'a, T> {
     pub item: &'a T,
 }
 
-/// A table of `lines`, sortable by the page's script.
+/// A table of `lines`, sortable by the page's script. Columns without any value are left out.
 pub fn table<T>(columns: &[Column<T>], lines: &[Line<T>], caption: &str) -> Markup {
+    let has_values = |c: &&Column<T>| lines.iter().any(|line| (c.value)(line.item).is_some());
+    let columns: Vec<&Column<T>> = columns.iter().filter(has_values).collect();
     let best: Vec<Option<f64>> = columns.iter().map(|c| best(c, lines)).collect();
     html! {
         div.scroll { table.sortable {
             @if !caption.is_empty() { caption { (caption) } }
             thead { tr {
                 (heading("method", "", "ascending", "text"))
-                @for column in columns {
+                @for column in &columns {
                     @let first = if column.better == Better::High { "descending" } else { "ascending" };
                     (heading(column.heading, column.hint, first, "number"))
                 }

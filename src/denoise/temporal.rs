@@ -1,0 +1,78 @@
+//! A model with the frames before and after one, as a method among others: what a sequence is scored by.
+//!
+//! In: a [`Shot`] with its neighbours. Out: what [`super::Batch`] makes of the frame with [`super::Options::temporal`].
+
+use super::{
+    Options, Report,
+    window::{PASSES, Window},
+};
+use crate::{Result, models::Denoiser, passes::Pass, planes::Planes, shot::Shot};
+
+/// What its name ends in.
+pub const SUFFIX: &str = ":temporal";
+
+/// A model that takes neighbours together with a frame.
+pub struct Temporal {
+    name: String,
+    model: Box<dyn Denoiser>,
+    reach: usize,
+    optional: Vec<Pass>,
+}
+
+impl Temporal {
+    /// With so many frames before and after.
+    pub fn new(model: Box<dyn Denoiser>, reach: usize) -> Self {
+        let known = [model.passes(), model.optional_passes()].concat();
+        let wanted = PASSES.into_iter().filter(|pass| !known.contains(pass));
+        let optional = model.optional_passes().iter().copied().chain(wanted).collect();
+        Self { name: format!("{}{SUFFIX}", model.name()), model, reach, optional }
+    }
+
+    fn run(&self, shot: &Shot) -> Result<(Planes, Report)> {
+        let mut report = Report::default();
+        let mut window = Window::new(self.reach);
+        let reach = self.reach as i32;
+        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
+            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
+        }
+        let mut own = Shot::new(shot.passes.clone());
+        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
+        window.enter_shot(0, own, &*self.model);
+        let image = window.denoise_shot(0, &*self.model, &Options::default(), &mut report)?;
+        Ok((image, report))
+    }
+}
+
+impl Denoiser for Temporal {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn passes(&self) -> &[Pass] {
+        self.model.passes()
+    }
+
+    fn optional_passes(&self) -> &[Pass] {
+        &self.optional
+    }
+
+    fn reads_halves(&self) -> bool {
+        self.model.reads_halves()
+    }
+
+    fn reach(&self) -> usize {
+        self.reach
+    }
+
+    fn notes(&self, shot: &Shot) -> Option<String> {
+        self.model.notes(shot)
+    }
+
+    fn denoise(&self, shot: &Shot) -> Result<Planes> {
+        self.run(shot).map(|(image, _)| image)
+    }
+
+    fn is_warm(&self) -> bool {
+        self.model.is_warm()
+    }
+}

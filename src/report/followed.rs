@@ -1,0 +1,113 @@
+//! Frames of a test set that are followed by others of their sequence: what methods made of them is kept until those are scored.
+
+use std::{collections::HashMap, path::Path};
+
+use super::{
+    Method, NOISY,
+    run::{Loaded, load},
+};
+use crate::{
+    denoise::follows,
+    error::attempt,
+    metrics::flicker::{self, flicker},
+    passes::Pass,
+    planes::Planes,
+    testset::Pair,
+};
+
+/// A frame and what methods made of it.
+pub struct Before<'a> {
+    pair: &'a Pair,
+    view_layer: Option<&'a str>,
+    reference: Option<Planes>,
+    images: HashMap<String, Planes>,
+    /// The pair, where a result had to be made anew.
+    loaded: Option<Loaded>,
+}
+
+/// The frames that are followed, by their noisy files.
+pub struct Followed<'a> {
+    pairs: &'a [Pair],
+    view_layer: Option<&'a str>,
+    held: HashMap<&'a Path, Before<'a>>,
+}
+
+impl<'a> Followed<'a> {
+    /// Of a test set, in the order of its pairs.
+    pub fn new(pairs: &'a [Pair], view_layer: Option<&'a str>) -> Self {
+        Self { pairs, view_layer, held: HashMap::new() }
+    }
+
+    /// Keeps what a method made of a frame, if another follows it.
+    pub fn keep(&mut self, pair: &Pair, reference: &Planes, method: &str, image: &Planes) {
+        let Some(own) = self.pairs.iter().find(|other| *other == pair) else { return };
+        if !self.pairs.iter().any(|other| is_next(other, pair)) {
+            return;
+        }
+        let view_layer = self.view_layer;
+        let held = self.held.entry(own.noisy.as_path()).or_insert_with(|| Before::new(own, view_layer));
+        held.reference.get_or_insert_with(|| reference.clone());
+        held.images.insert(method.into(), image.clone());
+    }
+
+    /// The frame before one, where the test set has it; it is asked for once.
+    pub fn before(&mut self, pair: &Pair) -> Option<Before<'a>> {
+        let before = self.pairs.iter().find(|other| is_next(pair, other))?;
+        Some(self.held.remove(before.noisy.as_path()).unwrap_or_else(|| Before::new(before, self.view_layer)))
+    }
+}
+
+/// Whether a pair is the frame after another, at the same sample count.
+fn is_next(pair: &Pair, before: &Pair) -> bool {
+    let is_same = (&pair.scene, pair.spp) == (&before.scene, before.spp);
+    is_same && follows(&pair.noisy, &before.noisy)
+}
+
+impl<'a> Before<'a> {
+    fn new(pair: &'a Pair, view_layer: Option<&'a str>) -> Self {
+        Self { pair, view_layer, reference: None, images: HashMap::new(), loaded: None }
+    }
+
+    /// The flicker of a method from this frame to the next, of which `image` is its result; none where no pixel can be followed.
+    ///
+    /// # Errors
+    /// Says why there is none.
+    pub fn flicker(&mut self, method: &Method, image: &Planes, next: &Loaded) -> Result<Option<f64>, String> {
+        let said = |why: &str| format!("no flicker: {why}");
+        let Some(vectors) = next.shot.passes.get(Pass::Vector) else {
+            return Err(said("the frame has no Vector"));
+        };
+        if !self.images.contains_key(&method.name) {
+            self.make(method).map_err(|why| said(&why))?;
+        }
+        let size = |planes: &Planes| (planes.channels, planes.width, planes.height);
+        let before = &self.images[&method.name];
+        let reference = self.reference.as_ref().expect("it comes with the images");
+        if size(before) != size(image) {
+            return Err(said("the frame before is of another size"));
+        }
+        let (images, references) = ([image, before], [&next.reference, reference]);
+        Ok(flicker(&flicker::Pair { images, references, vectors }))
+    }
+
+    /// Runs a method whose row of this frame was kept from an earlier run.
+    fn make(&mut self, method: &Method) -> Result<(), String> {
+        let lost = |why: &dyn std::fmt::Display| format!("of the frame before: {why}");
+        if self.loaded.is_none() {
+            let mut loaded = load(self.pair, self.view_layer).map_err(|e| lost(&e))?;
+            loaded.read_neighbours(super::settings::REACH, self.view_layer);
+            self.loaded = Some(loaded);
+        }
+        let loaded = self.loaded.as_mut().expect("it was loaded above");
+        if method.denoiser.reads_halves() {
+            loaded.shot.read_halves().map_err(|e| lost(&e))?;
+        }
+        let image = match method.name.as_str() {
+            NOISY => loaded.noisy().clone(),
+            _ => attempt(&self.pair.noisy, || method.denoiser.denoise(&loaded.shot)).map_err(|e| lost(&e))?,
+        };
+        self.reference.get_or_insert_with(|| loaded.reference.clone());
+        self.images.insert(method.name.clone(), image);
+        Ok(())
+    }
+}

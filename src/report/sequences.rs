@@ -1,0 +1,253 @@
+//! Sequences of a test set: every frame as each method shows it, to step through, and slices through time.
+//!
+//! A slice is one row of all frames, one below the other: what moves makes slanted lines, what is still upright ones, and what
+//! flickers breaks them up. In: what sheets show. Out: `frames/<pair>/<method>.png`, and `slices/<scene>_<spp>spp.png`.
+
+use std::path::{Path, PathBuf};
+
+use image::{ImageReader, Rgb, RgbImage, imageops};
+use maud::{Markup, html};
+use plotters::prelude::RGBColor;
+
+use super::{
+    canvas::{Anchor, Style, draw_on, write_png},
+    page::picture_of,
+    picture,
+    sheet::Shown,
+};
+use crate::{Error, Result, denoise::follows, frame::prepare_folder, planes::Planes, testset::Pair};
+
+/// Name of the reference among the methods.
+const REFERENCE: &str = "reference";
+/// Pixels that a row is enlarged to, downwards.
+const ROW: u32 = 10;
+/// Height of a strip's name.
+const NAME: u32 = 22;
+const BACKGROUND: Rgb<u8> = Rgb([24, 24, 27]);
+const TEXT: RGBColor = RGBColor(235, 235, 235);
+/// Bytes that all frames to step through may take in a page.
+const MOST_BYTES: usize = 6_000_000;
+
+/// Frames that follow each other, at one sample count.
+pub struct Sequence<'a> {
+    /// The frames, two at least.
+    pub pairs: Vec<&'a Pair>,
+}
+
+/// The sequences of a test set.
+pub fn sequences(pairs: &[Pair]) -> Vec<Sequence<'_>> {
+    let mut found: Vec<Sequence<'_>> = Vec::new();
+    for pair in pairs.iter().filter(|pair| pair.frame.is_some()) {
+        let goes_on = |sequence: &&mut Sequence<'_>| {
+            let last = sequence.pairs.last().expect("it begins with a frame");
+            (&last.scene, last.spp) == (&pair.scene, pair.spp) && follows(&pair.noisy, &last.noisy)
+        };
+        match found.iter_mut().find(goes_on) {
+            Some(sequence) => sequence.pairs.push(pair),
+            None => found.push(Sequence { pairs: vec![pair] }),
+        }
+    }
+    found.retain(|sequence| sequence.pairs.len() > 1);
+    found
+}
+
+/// Where the frame of a pair lies as a method shows it.
+fn file(out: &Path, pair: &Pair, method: &str) -> PathBuf {
+    let safe = |name: &str| name.replace(['/', '\\', ':'], "_");
+    out.join("frames").join(safe(&pair.id())).join(format!("{}.png", safe(method)))
+}
+
+/// Keeps what a sheet shows of a frame.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn store(out: &Path, pair: &Pair, images: &[Shown], reference: &Planes) -> Result<()> {
+    let reference = Shown::new(REFERENCE, reference, reference);
+    for image in images.iter().chain([&reference]) {
+        let path = file(out, pair, image.name());
+        prepare_folder(path.parent().expect("it lies in a folder"))?;
+        write_png(&path, image.frame())?;
+    }
+    Ok(())
+}
+
+impl Sequence<'_> {
+    fn first(&self) -> &Pair {
+        self.pairs[0]
+    }
+
+    /// Its name: the scene's, and the samples.
+    fn label(&self) -> String {
+        format!("{}, {} samples per pixel", self.first().scene, self.first().spp)
+    }
+
+    /// Those of the methods of which all frames were kept, the reference last.
+    fn shown<'m>(&self, out: &Path, methods: &'m [String]) -> Vec<&'m str> {
+        let names = methods.iter().map(String::as_str).chain([REFERENCE]);
+        names.filter(|name| self.pairs.iter().all(|pair| file(out, pair, name).is_file())).collect()
+    }
+
+    /// Writes the slice through the middle row; returns its path, or none where no frames were kept.
+    fn slice(&self, out: &Path, methods: &[&str]) -> Result<Option<PathBuf>> {
+        let mut strips = Vec::new();
+        for method in methods {
+            let frames = self.pairs.iter().map(|pair| read(&file(out, pair, method)));
+            strips.push((*method, frames.collect::<Result<Vec<RgbImage>>>()?));
+        }
+        let sizes = || strips.iter().flat_map(|(_, frames)| frames).map(RgbImage::dimensions);
+        let Some(size) = sizes().next().filter(|size| sizes().all(|other| other == *size)) else {
+            return Ok(None);
+        };
+        let path = out.join("slices").join(format!("{}_{:04}spp.png", self.first().scene, self.first().spp));
+        prepare_folder(path.parent().expect("it lies in a folder"))?;
+        write_png(&path, &stack(&strips, size)?)?;
+        Ok(Some(path))
+    }
+}
+
+/// The middle rows of the frames of each method, method below method.
+fn stack(strips: &[(&str, Vec<RgbImage>)], (width, height): (u32, u32)) -> Result<RgbImage> {
+    let frames = strips.iter().map(|(_, frames)| frames.len()).max().unwrap_or(0) as u32;
+    let strip = NAME + frames * ROW;
+    let mut image = RgbImage::from_pixel(width, strip * strips.len() as u32, BACKGROUND);
+    for (s, (_, frames)) in strips.iter().enumerate() {
+        for (f, frame) in frames.iter().enumerate() {
+            let row = imageops::crop_imm(frame, 0, height / 2, width, 1).to_image();
+            let tall = imageops::resize(&row, width, ROW, imageops::FilterType::Nearest);
+            let top = s as u32 * strip + NAME + f as u32 * ROW;
+            imageops::replace(&mut image, &tall, 0, top.into());
+        }
+    }
+    draw_on(&mut image, |canvas| {
+        strips.iter().enumerate().try_for_each(|(s, (name, _))| {
+            let at = (6, (s as u32 * strip + NAME / 2) as i32);
+            canvas.text(name, at, Anchor::Left, Style { colour: TEXT, ..Style::new(14) })
+        })
+    })?;
+    Ok(image)
+}
+
+fn read(path: &Path) -> Result<RgbImage> {
+    let image = ImageReader::open(path).map_err(Error::io("read", path))?;
+    let image =
+        image.decode().map_err(|e| Error::invalid(path, format!("{e}; run again with --overwrite")))?;
+    Ok(image.to_rgb8())
+}
+
+/// What the page shows of all sequences; nothing where there are none.
+///
+/// # Errors
+/// A picture cannot be read or written.
+pub fn section(out: &Path, pairs: &[Pair], methods: &[String]) -> Result<Option<Markup>> {
+    let mut parts = Vec::new();
+    let mut bytes = 0;
+    for sequence in sequences(pairs) {
+        let shown = sequence.shown(out, methods);
+        let Some(slice) = sequence.slice(out, &shown)? else { continue };
+        let picture = picture_of(&slice, 1, &format!("{}: the middle row over time", sequence.label()))?;
+        let mut frames = Vec::new();
+        for (f, pair) in sequence.pairs.iter().enumerate() {
+            for method in &shown {
+                let image = picture::small(&file(out, pair, method))?;
+                bytes += image.address.len();
+                frames.push((f, *method, image.address));
+            }
+        }
+        let stepper = (bytes < MOST_BYTES).then(|| stepper(&frames, &shown, sequence.pairs.len()));
+        parts.push(html! {
+            h3 { (sequence.label()) ", " (sequence.pairs.len()) " frames" }
+            @match stepper {
+                Some(stepper) => (stepper),
+                None => p.faint { "Its frames lie beside this page, in " code { "frames/" } "." },
+            }
+            p.faint { "The middle row of each frame, from the first down to the last:" }
+            figure.slice { (picture) }
+        });
+    }
+    if parts.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(html! {
+        h2 #sequences { "Sequences" }
+        @for part in parts { (part) }
+    }))
+}
+
+/// Two methods side by side, and a slider over the frames.
+fn stepper(frames: &[(usize, &str, String)], methods: &[&str], count: usize) -> Markup {
+    // What one looks at first: the noisiest beside the best that is not the reference.
+    let chosen = [0, methods.len().saturating_sub(2)];
+    html! {
+        div.stepper {
+            div.panes {
+                @for first in chosen {
+                    div {
+                        select aria-label="method" {
+                            @for (m, method) in methods.iter().enumerate() {
+                                option value=(method) selected[m == first] { (method) }
+                            }
+                        }
+                        img.pane alt="the frame as this method shows it";
+                    }
+                }
+            }
+            label { "frame " input type="range" min="0" max=(count - 1) value="0"; " " output { "1" } }
+            @for (frame, method, address) in frames {
+                img hidden data-frame=(frame) data-method=(method) src=(address) alt="";
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pair(scene: &str, spp: u32, frame: Option<&str>) -> Pair {
+        let suffix = frame.map(|frame| format!(".{frame}")).unwrap_or_default();
+        Pair {
+            scene: scene.into(),
+            noisy: format!("{scene}_{spp:04}spp{suffix}.exr").into(),
+            reference: format!("{scene}_ref{suffix}.exr").into(),
+            spp,
+            frame: frame.map(str::to_owned),
+        }
+    }
+
+    #[test]
+    fn frames_that_follow_each_other_are_a_sequence() {
+        let pairs = [
+            pair("pan", 4, Some("0001")),
+            pair("pan", 16, Some("0001")),
+            pair("pan", 4, Some("0002")),
+            pair("pan", 16, Some("0002")),
+            pair("pan", 4, Some("0004")),
+            pair("still", 4, None),
+        ];
+        let found: Vec<(u32, usize)> =
+            sequences(&pairs).iter().map(|s| (s.first().spp, s.pairs.len())).collect();
+        assert_eq!(found, [(4, 2), (16, 2)]);
+    }
+
+    #[test]
+    fn a_slice_holds_the_middle_row_of_each_frame() {
+        let out = tempfile::tempdir().unwrap();
+        let pairs = [pair("pan", 4, Some("0001")), pair("pan", 4, Some("0002"))];
+        let picture = |light: f32| Planes::from_rows(3, (40, 20), |_, _, row| row.fill(light));
+        let reference = picture(0.5);
+        for (pair, light) in pairs.iter().zip([0.0, 0.5]) {
+            let image = Shown::new("a:b", &picture(light), &reference);
+            store(out.path(), pair, &[image], &reference).unwrap();
+        }
+        let methods = ["a:b".to_owned(), "absent".to_owned()];
+        let page = section(out.path(), &pairs, &methods).unwrap().unwrap().into_string();
+        assert!(page.contains("pan, 4 samples") && page.contains("data-method=\"a:b\""), "{page}");
+        assert!(!page.contains("absent"), "a method without frames is left out");
+        assert_eq!(page.matches("data-frame=").count(), 4, "two frames, by the method and by the reference");
+        let slice = read(&out.path().join("slices/pan_0004spp.png")).unwrap();
+        assert_eq!(slice.dimensions(), (40, 2 * (NAME + 2 * ROW)));
+        let of = |frame: u32| slice.get_pixel(20, NAME + frame * ROW + ROW / 2)[0];
+        assert!(of(0) < 5 && of(1) > 100, "{} {}", of(0), of(1));
+        assert!(section(out.path(), &pairs[..1], &methods).unwrap().is_none());
+    }
+}

@@ -1,0 +1,254 @@
+//! How methods do on each scene of a test set as it was rendered: a row for each scene, sample count and method, with the spread over
+//! noise seeds, and whether it is within the bounds.
+//!
+//! In: the rows of [`super::run`]. Renders of one scene and sample count are its seeds. Bounds: the result has at most the input's
+//! RelMSE, since a denoiser that makes a frame worse had better be off; and all light in it is within 2% of the reference's, about
+//! the least difference in brightness that an eye sees (Weber's fraction), and as much more as the input itself is off, which has
+//! fireflies or lacks what few paths find.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    path::PathBuf,
+};
+
+use super::{Row, Trial};
+use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean};
+
+/// How far the energy of a result may be from one, beside how far its input's is.
+const ENERGY: f64 = 0.02;
+
+/// Columns of `stability_scenes.csv`.
+pub const COLUMNS: [&str; 12] = [
+    "scene",
+    "spp",
+    "model",
+    "seeds",
+    "failed",
+    "relmse",
+    "spread",
+    "to_input",
+    "to_baseline",
+    "ssim",
+    "energy",
+    "verdict",
+];
+
+/// What one method made of one scene at one sample count.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Case {
+    /// Scene, with the frame of a sequence.
+    pub scene: String,
+    /// Samples per pixel of the noisy renders.
+    pub spp: u32,
+    /// Method.
+    pub model: String,
+    /// The renders that were scored, one for each noise seed.
+    pub seeds: Vec<PathBuf>,
+    /// Those on which the method failed.
+    pub failed: usize,
+    /// Mean RelMSE over seeds.
+    pub relmse: Option<f64>,
+    /// Standard deviation of RelMSE over seeds, as a share of the mean; none for a single seed.
+    pub spread: Option<f64>,
+    /// RelMSE over that of the input: geometric mean over seeds.
+    pub to_input: Option<f64>,
+    /// RelMSE over that of the baseline: geometric mean over seeds.
+    pub to_baseline: Option<f64>,
+    /// Mean SSIM over seeds.
+    pub ssim: Option<f64>,
+    /// Mean over seeds of the sum of all values over the reference's.
+    pub energy: Option<f64>,
+    /// What is out of bounds; empty where all is well, and for the input itself.
+    pub faults: Vec<String>,
+}
+
+impl Case {
+    /// Whether it is within the bounds; none for the input itself.
+    pub fn passes(&self) -> Option<bool> {
+        (self.model != NOISY).then_some(self.faults.is_empty())
+    }
+
+    /// Its cells in the order of [`COLUMNS`].
+    pub fn cells(&self) -> [String; COLUMNS.len()] {
+        let verdict = match self.passes() {
+            None => String::new(),
+            Some(true) => "pass".into(),
+            Some(false) => format!("fail: {}", self.faults.join("; ")),
+        };
+        [
+            self.scene.clone(),
+            self.spp.to_string(),
+            self.model.clone(),
+            self.seeds.len().to_string(),
+            self.failed.to_string(),
+            cell(self.relmse),
+            cell(self.spread),
+            cell(self.to_input),
+            cell(self.to_baseline),
+            cell(self.ssim),
+            cell(self.energy),
+            verdict,
+        ]
+    }
+
+    fn judge(&mut self, input_energy: Option<f64>) {
+        if self.failed > 0 {
+            self.faults.push(format!("no result for {} renders", self.failed));
+        }
+        if let Some(ratio) = self.to_input.filter(|ratio| *ratio > 1.0) {
+            self.faults.push(format!("{ratio:.2} x the input's RelMSE"));
+        }
+        if let (Some(energy), Some(input)) = (self.energy, input_energy)
+            && (energy - 1.0).abs() > ENERGY + (input - 1.0).abs()
+        {
+            self.faults.push(format!("{:.1}% of the reference's light", 100.0 * energy));
+        }
+    }
+}
+
+/// The cases of all frames as they were rendered, in the order of the rows.
+pub fn cases(rows: &[Row], baseline: &str) -> Vec<Case> {
+    let mut groups: BTreeMap<usize, Vec<&Row>> = BTreeMap::new();
+    let mut order: Vec<(&str, u32, &str)> = Vec::new();
+    for row in rows.iter().filter(|row| row.trial == Trial::AsRendered.name()) {
+        let key = (row.scene.as_str(), row.spp, row.model.as_str());
+        let at = order.iter().position(|known| *known == key).unwrap_or_else(|| {
+            order.push(key);
+            order.len() - 1
+        });
+        groups.entry(at).or_default().push(row);
+    }
+    let of = |scene: &str, spp: u32, model: &str| {
+        let at = order.iter().position(|known| *known == (scene, spp, model));
+        at.map(|at| groups[&at].as_slice()).unwrap_or_default()
+    };
+    let case = |(at, own): (&usize, &Vec<&Row>)| {
+        let (scene, spp, model) = order[*at];
+        let values = |value: fn(&Row) -> Option<f64>| -> Vec<f64> {
+            own.iter().filter_map(|row| value(row)).collect()
+        };
+        let relmse = values(|row| row.relmse);
+        let against = |other: &str| {
+            let other = of(scene, spp, other);
+            let ratios = own.iter().filter_map(|row| {
+                let twin = other.iter().find(|twin| twin.noisy == row.noisy)?;
+                Some(row.relmse? / twin.relmse.filter(|error| *error > 0.0)?)
+            });
+            geometric_mean(&ratios.collect::<Vec<f64>>())
+        };
+        let input: Vec<f64> = of(scene, spp, NOISY).iter().filter_map(|row| row.energy).collect();
+        let mut case = Case {
+            scene: scene.into(),
+            spp,
+            model: model.into(),
+            seeds: own.iter().map(|row| row.noisy.clone()).collect(),
+            failed: own.iter().filter(|row| !row.reason.is_empty()).count(),
+            relmse: mean(&relmse),
+            spread: spread(&relmse),
+            to_input: against(NOISY),
+            to_baseline: against(baseline),
+            ssim: mean(&values(|row| row.ssim)),
+            energy: mean(&values(|row| row.energy)),
+            faults: Vec::new(),
+        };
+        if model != NOISY {
+            case.judge(mean(&input));
+        }
+        case
+    };
+    groups.iter().map(case).collect()
+}
+
+/// The cases by methods: a group of columns for each sample count.
+pub fn map(title: String, methods: &[String], cases: &[Case], value: fn(&Case) -> Option<f64>) -> HeatMap {
+    let counts: Vec<u32> = cases.iter().map(|case| case.spp).collect::<BTreeSet<_>>().into_iter().collect();
+    let mut scenes: Vec<&str> = Vec::new();
+    for case in cases {
+        if !scenes.contains(&case.scene.as_str()) {
+            scenes.push(&case.scene);
+        }
+    }
+    let cell = |scene: &str, spp: u32, model: &String| {
+        let of_cell = |case: &&Case| case.scene == scene && case.spp == spp && case.model == *model;
+        let case = cases.iter().find(of_cell);
+        let is_marked = case.is_some_and(|case| !case.faults.is_empty());
+        HeatCell { value: case.and_then(value), is_marked }
+    };
+    let row = |scene: &&str| {
+        let cells = counts.iter().flat_map(|spp| methods.iter().map(move |model| (*spp, model)));
+        ((*scene).to_owned(), cells.map(|(spp, model)| cell(scene, spp, model)).collect())
+    };
+    HeatMap {
+        title,
+        methods: methods.to_vec(),
+        groups: counts.iter().map(|spp| format!("{spp} spp")).collect(),
+        rows: scenes.iter().map(row).collect(),
+    }
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+fn spread(values: &[f64]) -> Option<f64> {
+    let mean = mean(values).filter(|mean| values.len() > 1 && *mean > 0.0)?;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    Some((squares / (values.len() - 1) as f64).sqrt() / mean)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(model: &str, seed: usize, relmse: f64, energy: f64) -> Row {
+        Row {
+            scene: "fog".into(),
+            model: model.into(),
+            spp: 4,
+            noisy: format!("fog_{seed}.exr").into(),
+            trial: Trial::AsRendered.name(),
+            relmse: Some(relmse),
+            ssim: Some(0.5),
+            energy: Some(energy),
+            ..Row::default()
+        }
+    }
+
+    #[test]
+    fn seeds_are_put_together_and_judged() {
+        let rows = [
+            row(NOISY, 0, 0.2, 1.05),
+            row("good", 0, 0.1, 1.06),
+            row("dark", 0, 0.1, 0.9),
+            row("bad", 0, 0.4, 1.0),
+            row(NOISY, 1, 0.4, 1.01),
+            row("good", 1, 0.3, 1.0),
+            row("dark", 1, 0.1, 0.92),
+            row("bad", 1, 0.9, 1.0),
+            Row { trial: Trial::Mirrored.name(), ..row("good", 0, 9.0, 9.0) },
+        ];
+        let cases = cases(&rows, "good");
+        let names: Vec<&str> = cases.iter().map(|case| case.model.as_str()).collect();
+        assert_eq!(names, [NOISY, "good", "dark", "bad"]);
+        assert_eq!(
+            cases.iter().map(Case::passes).collect::<Vec<_>>(),
+            [None, Some(true), Some(false), Some(false)]
+        );
+        let good = &cases[1];
+        assert_eq!((good.seeds.len(), good.relmse), (2, Some(0.2)));
+        // (0.1 / 0.2 * 0.3 / 0.4)^(1/2), and the deviation of 0.1 and 0.3 by n - 1 over their mean.
+        assert!((good.to_input.unwrap() - 0.375f64.sqrt()).abs() < 1e-12);
+        assert!((good.spread.unwrap() - 0.02f64.sqrt() / 0.2).abs() < 1e-12);
+        assert!((cases[3].to_baseline.unwrap() - 12.0f64.sqrt()).abs() < 1e-12);
+        assert!(cases[2].cells()[11].contains("91.0% of the reference's light"), "{:?}", cases[2].cells());
+        assert!(cases[3].cells()[11].contains("x the input's RelMSE"));
+    }
+
+    #[test]
+    fn what_gave_no_result_fails() {
+        let failed =
+            Row { relmse: None, ssim: None, energy: None, reason: "no".into(), ..row("m", 0, 0.0, 0.0) };
+        let cases = cases(&[row(NOISY, 0, 0.1, 1.0), failed], NOISY);
+        assert_eq!((cases[1].passes(), cases[1].relmse, cases[1].to_input), (Some(false), None, None));
+    }
+}

@@ -1,0 +1,408 @@
+//! How much a method's result changes when its input is not what it should be, and on which scenes it fails as they are.
+//!
+//! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene the result is
+//! scored against what the reference then is, and beside the result for the frame as it was rendered: `ratio` is its
+//! RelMSE over that one's, `deviation` the RelMSE between the two. A method that is indifferent to the change has a
+//! ratio of 1 and a deviation of 0. Methods see what is in the frame alone: half buffers that lie beside it, which do not have the
+//! change, are not used, not for the frame as it was rendered either. What comes of frames as they were rendered is judged
+//! in [`content`].
+
+pub mod content;
+mod page;
+mod trial;
+
+use std::path::PathBuf;
+
+use crate::{
+    Error, Result,
+    error::attempt,
+    frame::prepare_folder,
+    metrics::{self, display, error, ssim},
+    planes::Planes,
+    report::{
+        self, Event, Figure, HeatCell, HeatMap, Loaded, Method, NOISY, append_row, cell, geometric_mean,
+        to_csv, write_file,
+    },
+    shot::Shot,
+    testset::Pair,
+};
+
+use content::Case;
+use trial::CORNER;
+pub use trial::Trial;
+
+/// What one method made of one changed frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Row {
+    /// Scene, with the frame of a sequence.
+    pub scene: String,
+    /// Method.
+    pub model: String,
+    /// Samples per pixel of the noisy render.
+    pub spp: u32,
+    /// The noisy file: renders of one scene and sample count differ in their noise.
+    pub noisy: PathBuf,
+    /// Name of the trial.
+    pub trial: &'static str,
+    /// RelMSE against what of the reference is in the frame.
+    pub relmse: Option<f64>,
+    /// SSIM against the same; see [`crate::metrics`].
+    pub ssim: Option<f64>,
+    /// The sum of all values over the reference's; none where that is not positive.
+    pub energy: Option<f64>,
+    /// The same over that of the frame as rendered.
+    pub ratio: Option<f64>,
+    /// RelMSE between this result and that for the frame as rendered.
+    pub deviation: Option<f64>,
+    /// Why the trial failed; empty where all is well.
+    pub reason: String,
+    /// Why a number is missing where nothing failed.
+    pub note: String,
+}
+
+/// Columns of `stability.csv`.
+const COLUMNS: [&str; 12] = [
+    "scene",
+    "model",
+    "spp",
+    "trial",
+    "relmse",
+    "ratio",
+    "deviation",
+    "reason",
+    "note",
+    "ssim",
+    "energy",
+    "noisy",
+];
+
+/// Columns of `stability_summary.csv`; `scenes` are those that have a ratio.
+const SUMMARY_COLUMNS: [&str; 8] =
+    ["model", "trial", "scenes", "failed", "ratio", "worst_ratio", "worst_scene", "worst_deviation"];
+
+impl Row {
+    fn cells(&self) -> [String; COLUMNS.len()] {
+        [
+            self.scene.clone(),
+            self.model.clone(),
+            self.spp.to_string(),
+            self.trial.into(),
+            cell(self.relmse),
+            cell(self.ratio),
+            cell(self.deviation),
+            self.reason.clone(),
+            self.note.clone(),
+            cell(self.ssim),
+            cell(self.energy),
+            self.noisy.display().to_string(),
+        ]
+    }
+}
+
+/// What is asked for.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Folder for everything that is written.
+    pub out: PathBuf,
+    /// View layer to read; by default the one with the most passes.
+    pub view_layer: Option<String>,
+    /// The changes to try. Without [`Trial::AsRendered`] nothing is told of scenes as they were rendered.
+    pub trials: Vec<Trial>,
+    /// Method whose RelMSE `to_baseline` is over.
+    pub baseline: String,
+    /// How many of the worst scenes are shown with pictures.
+    pub worst: usize,
+    /// Threads that all methods use.
+    pub threads: usize,
+}
+
+/// Runs every trial of every method on every pair. Each row is appended to `stability.csv`, then told; at the end
+/// `stability_summary.csv` (trials), `stability_scenes.csv` (scenes as rendered), their maps and `stability.html` are written. A pair
+/// or method that fails has rows that say why.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn run(
+    pairs: &[Pair],
+    methods: &[Method],
+    options: &Options,
+    on: &mut dyn FnMut(&Row),
+) -> Result<(Vec<Row>, Vec<Case>)> {
+    let out = &options.out;
+    prepare_folder(out)?;
+    let table = out.join("stability.csv");
+    write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
+    let mut rows = Vec::new();
+    for pair in pairs {
+        let loaded = report::load_listed(pair, options.view_layer.as_deref());
+        for method in methods {
+            let mut before = None;
+            for &trial in &options.trials {
+                let mut row = Row {
+                    scene: pair.label(),
+                    model: method.name.clone(),
+                    spp: pair.spp,
+                    noisy: pair.noisy.clone(),
+                    trial: trial.name(),
+                    ..Row::default()
+                };
+                match &loaded {
+                    Ok(loaded) => {
+                        let measured =
+                            attempt(&pair.noisy, || measure(trial, method, loaded, &mut before, &mut row));
+                        row.reason = measured.err().map(|error| error.to_string()).unwrap_or_default();
+                    }
+                    Err(error) => row.reason = error.to_string(),
+                }
+                append_row(&table, &row.cells())?;
+                on(&row);
+                rows.push(row);
+            }
+        }
+    }
+    let summary = summarise(&rows, methods, &options.trials);
+    let lines = summary.iter().map(Summary::cells);
+    write_file(&out.join("stability_summary.csv"), to_csv(&SUMMARY_COLUMNS, lines).as_bytes())?;
+    let cases = content::cases(&rows, &options.baseline);
+    write_file(
+        &out.join("stability_scenes.csv"),
+        to_csv(&content::COLUMNS, cases.iter().map(Case::cells)).as_bytes(),
+    )?;
+    show(pairs, methods, options, &rows, &cases)?;
+    Ok((rows, cases))
+}
+
+/// Draws the maps, and the worst scenes with pictures.
+fn show(pairs: &[Pair], methods: &[Method], options: &Options, rows: &[Row], cases: &[Case]) -> Result<()> {
+    let names: Vec<String> = methods.iter().map(|method| method.name.clone()).collect();
+    let mut maps = Vec::new();
+    if !cases.is_empty() {
+        let title = "RelMSE over the input's (below 1 is better; framed: out of bounds)".into();
+        let map = content::map(title, &names, cases, |case| case.to_input);
+        maps.push(("Scenes, beside the input", map, "map_input"));
+    }
+    if !cases.is_empty() && options.baseline != NOISY {
+        let title =
+            format!("RelMSE over that of {} (below 1 is better; framed: out of bounds)", options.baseline);
+        let map = content::map(title, &names, cases, |case| case.to_baseline);
+        maps.push(("Scenes, beside the baseline", map, "map_baseline"));
+    }
+    if options.trials.iter().any(|trial| *trial != Trial::AsRendered) {
+        let map = map_of_trials(names.clone(), &options.trials, &summarise(rows, methods, &options.trials));
+        maps.push(("Inputs gone wrong", map, "map_trials"));
+    }
+    let maps = maps.into_iter().map(|(title, map, name)| Ok((title, map.write(&options.out, name)?)));
+    let maps: Vec<(&str, String)> = maps.collect::<Result<_>>()?;
+    let worst = worst(pairs, cases, options);
+    let folder = options.out.join("worst");
+    if !worst.is_empty() {
+        let shown = report::Options {
+            out: folder.clone(),
+            repeats: 1,
+            threads: options.threads,
+            baseline: options.baseline.clone(),
+            view_layer: options.view_layer.clone(),
+            overwrite: true,
+            sheets: true,
+        };
+        report::evaluate(&worst, methods, &shown, &mut |_: Event<'_>| {})?;
+    }
+    page::write(&options.out, &maps, cases, &worst)
+}
+
+/// Rows are trials, by what they cost.
+fn map_of_trials(methods: Vec<String>, trials: &[Trial], summaries: &[Summary]) -> HeatMap {
+    let cells = |trial: Trial| {
+        let of_trial = summaries.iter().filter(move |line| line.trial == trial);
+        of_trial.map(|line| HeatCell { value: line.ratio, is_marked: line.failed > 0 }).collect()
+    };
+    let rows = trials.iter().filter(|trial| **trial != Trial::AsRendered);
+    HeatMap {
+        title: "RelMSE over that of the frame as rendered (1 is best; framed: some have no result)".into(),
+        methods,
+        groups: vec![String::new()],
+        rows: rows.map(|trial| (trial.name().to_owned(), cells(*trial))).collect(),
+    }
+}
+
+/// The renders on which our own methods, or else any, do worst beside the baseline: one of each scene.
+fn worst(pairs: &[Pair], cases: &[Case], options: &Options) -> Vec<Pair> {
+    let others = [NOISY, options.baseline.as_str()];
+    let is_judged = |case: &&Case| !others.contains(&case.model.as_str());
+    let is_own = |case: &&Case| report::is_own(&case.model);
+    let judged: Vec<&Case> = cases.iter().filter(is_judged).collect();
+    let own: Vec<&Case> = judged.iter().copied().filter(is_own).collect();
+    let mut ranked: Vec<(f64, &Case)> = if own.is_empty() { judged } else { own }
+        .into_iter()
+        .filter_map(|case| Some((case.to_baseline?, case)))
+        .collect();
+    ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut chosen: Vec<Pair> = Vec::new();
+    for (_, case) in ranked {
+        let pair = pairs.iter().find(|pair| case.seeds.first() == Some(&pair.noisy));
+        let is_new = |pair: &&Pair| chosen.iter().all(|other| other.label() != pair.label());
+        if chosen.len() < options.worst {
+            chosen.extend(pair.filter(is_new).cloned());
+        }
+    }
+    chosen
+}
+
+/// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial leaves there.
+fn measure(
+    trial: Trial,
+    method: &Method,
+    loaded: &Loaded,
+    before: &mut Option<Planes>,
+    row: &mut Row,
+) -> Result<()> {
+    let (width, height) = (loaded.shot.passes.width, loaded.shot.passes.height);
+    if trial == Trial::Cropped && (width <= CORNER.0 || height <= CORNER.1) {
+        row.note =
+            format!("skipped: {}x{} pixels less leave nothing of {width}x{height}", CORNER.0, CORNER.1);
+        return Ok(());
+    }
+    // Half buffers beside the frame do not have the change: the shot has none.
+    let shot = Shot::new(trial.change(&loaded.shot.passes));
+    let image = trial.undo(method.denoiser.denoise(&shot)?);
+    let reference = trial.seen(&loaded.reference);
+    metrics::check(&image, &reference).map_err(|why| Error::invalid(&shot.passes.path, why))?;
+    let error = error::relmse(&image, &reference);
+    row.relmse = Some(error);
+    let exposure = display::exposure(&reference);
+    row.ssim =
+        exposure.and_then(|e| ssim::ssim(&display::display(&image, e), &display::display(&reference, e)));
+    row.energy = error::energy(&image, &reference);
+    if trial == Trial::AsRendered {
+        (row.ratio, row.deviation) = (Some(1.0), Some(0.0));
+        *before = Some(image);
+        return Ok(());
+    }
+    let Some(before) = before else {
+        row.note = "no ratio, no deviation: there is no result for the frame as rendered".into();
+        return Ok(());
+    };
+    let before = trial.seen(before);
+    row.deviation = Some(error::relmse(&image, &before));
+    match error::relmse(&before, &reference) {
+        0.0 => row.note = "no ratio: the result for the frame as rendered is exact".into(),
+        before => row.ratio = Some(error / before),
+    }
+    Ok(())
+}
+
+/// What one method made of all frames changed in one way.
+struct Summary {
+    model: String,
+    trial: Trial,
+    scenes: usize,
+    failed: usize,
+    /// Geometric mean over scenes.
+    ratio: Option<f64>,
+    worst: Option<(f64, String)>,
+    worst_deviation: Option<f64>,
+}
+
+/// A line for each method and trial, method by method.
+fn summarise(rows: &[Row], methods: &[Method], trials: &[Trial]) -> Vec<Summary> {
+    let lines = methods.iter().flat_map(|method| trials.iter().map(move |trial| (method, *trial)));
+    let line = |(method, trial): (&Method, Trial)| {
+        let own = || rows.iter().filter(|row| row.model == method.name && row.trial == trial.name());
+        let ratios: Vec<(f64, &str)> =
+            own().filter_map(|row| Some((row.ratio?, row.scene.as_str()))).collect();
+        let worst = ratios.iter().max_by(|a, b| a.0.total_cmp(&b.0));
+        Summary {
+            model: method.name.clone(),
+            trial,
+            scenes: ratios.len(),
+            failed: own().filter(|row| !row.reason.is_empty()).count(),
+            ratio: geometric_mean(&ratios.iter().map(|(ratio, _)| *ratio).collect::<Vec<_>>()),
+            worst: worst.map(|(ratio, scene)| (*ratio, (*scene).to_owned())),
+            worst_deviation: own().filter_map(|row| row.deviation).max_by(f64::total_cmp),
+        }
+    };
+    lines.map(line).collect()
+}
+
+impl Summary {
+    fn cells(&self) -> [String; SUMMARY_COLUMNS.len()] {
+        let (ratio, scene) = self.worst.clone().unzip();
+        [
+            self.model.clone(),
+            self.trial.name().into(),
+            self.scenes.to_string(),
+            self.failed.to_string(),
+            cell(self.ratio),
+            cell(ratio),
+            scene.unwrap_or_default(),
+            cell(self.worst_deviation),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{models::Denoiser, passes::Pass};
+
+    /// Fails on fireflies as no method should.
+    struct Delicate;
+
+    impl Denoiser for Delicate {
+        fn name(&self) -> &str {
+            "delicate"
+        }
+
+        fn passes(&self) -> &[Pass] {
+            &[Pass::Combined]
+        }
+
+        fn denoise(&self, shot: &Shot) -> Result<Planes> {
+            let radiance = shot.passes.require(Pass::Combined, "delicate")?;
+            let (mean, most) = radiance
+                .data
+                .iter()
+                .fold((0.0, 0.0), |(mean, most), v| (mean + v / radiance.data.len() as f32, v.max(most)));
+            assert!(most < 100.0 * mean, "on purpose");
+            Ok(radiance.clone())
+        }
+    }
+
+    #[test]
+    fn rows_are_stored_as_they_finish_and_a_panic_costs_one() {
+        let out = tempfile::tempdir().unwrap();
+        let frame = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/s0000_room_0004spp.exr");
+        let pairs = crate::testset::read(frame).unwrap().pairs;
+        let method = Method {
+            name: "delicate".into(),
+            denoiser: Box::new(Delicate),
+            peak_mib: Box::new(|_| None),
+            stamp: String::new(),
+        };
+        let mut told = 0;
+        let options = Options {
+            out: out.path().into(),
+            view_layer: None,
+            trials: Trial::ALL.to_vec(),
+            baseline: NOISY.into(),
+            worst: 0,
+            threads: 1,
+        };
+        let (rows, _) = run(&pairs, &[method], &options, &mut |row| {
+            told += 1;
+            let text = std::fs::read_to_string(out.path().join("stability.csv")).unwrap();
+            assert_eq!(text.lines().count(), 1 + told);
+            assert!(text.lines().last().unwrap().contains(row.trial), "{text}");
+        })
+        .unwrap();
+        assert_eq!((rows.len(), told), (Trial::ALL.len(), Trial::ALL.len()));
+        for row in rows {
+            let failed = row.trial == Trial::Fireflies.name();
+            assert_eq!(
+                (row.relmse.is_none(), row.reason.contains("internal error")),
+                (failed, failed),
+                "{row:?}"
+            );
+        }
+    }
+}

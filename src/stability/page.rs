@@ -1,0 +1,59 @@
+//! `stability.html`: the maps, what is out of bounds, and the worst scenes with pictures, on one page that needs nothing but itself.
+
+use std::path::Path;
+
+use maud::{PreEscaped, html};
+
+use super::content::Case;
+use crate::{
+    Result,
+    report::{document, picture_of, write_file},
+    testset::Pair,
+};
+
+/// Writes the page into `out`, whose folder `worst` holds a report of the worst scenes.
+///
+/// # Errors
+/// A sheet cannot be read or the file not be written.
+pub fn write(out: &Path, maps: &[(&str, String)], cases: &[Case], worst: &[Pair]) -> Result<()> {
+    let judged = cases.iter().filter(|case| case.passes().is_some()).count();
+    let failed: Vec<&Case> = cases.iter().filter(|case| case.passes() == Some(false)).collect();
+    let mut pictures = Vec::new();
+    for pair in worst {
+        let sheet = out.join("worst/sheets").join(format!("{}.png", pair.id()));
+        if sheet.is_file() {
+            pictures.push((pair, picture_of(&sheet, worst.len(), &pair.label())?));
+        }
+    }
+    let body = html! {
+        p {
+            (failed.len()) " of " (judged) " cases are out of bounds: worse than their input in RelMSE, or with light that is "
+            "neither the reference's within 2 % nor as far off as the input's."
+        }
+        @for (title, svg) in maps {
+            h2 { (title) }
+            figure { (PreEscaped(svg)) }
+        }
+        @if !failed.is_empty() {
+            h2 { "Out of bounds" }
+            div.scroll { table {
+                thead { tr { @for name in ["scene", "samples", "method", "what"] { th.text { (name) } } } }
+                tbody { @for case in failed {
+                    tr {
+                        td.text { (case.scene) } td { (case.spp) } td.text { (case.model) }
+                        td.text { (case.faults.join("; ")) }
+                    }
+                } }
+            } }
+        }
+        @if !pictures.is_empty() {
+            h2 { "The worst" }
+            p.faint { "Where our methods do worst beside the baseline; all scores in " code { "worst/report.html" } "." }
+            @for (pair, picture) in &pictures {
+                h3 { (pair.label()) ", " (pair.spp) " samples per pixel" }
+                figure { (picture) }
+            }
+        }
+    };
+    write_file(&out.join("stability.html"), document("demc stability", &body).into_string().as_bytes())
+}
