@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
-use super::{print_line, warn_line};
-use crate::cli::ExitCode;
+use super::lines::{ExitCode, print_line, warn_line};
 use crate::{
     Error, Result,
     frame::Frame,

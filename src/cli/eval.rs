@@ -5,8 +5,8 @@ use std::{collections::HashSet, io::IsTerminal, path::PathBuf};
 use clap::Args as ClapArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{methods, print_line, warn_line};
-use crate::cli::ExitCode;
+use super::lines::{ExitCode, print_line, warn_line};
+use super::methods;
 use crate::{
     Error, Result,
     report::{self, Event, Method, Options, Row},

@@ -2,12 +2,10 @@
 
 use std::path::PathBuf;
 
-use crate::cli::ExitCode;
-
 use clap::{Args as ClapArgs, Command};
 use clap_complete::Shell;
 
-use super::print_line;
+use super::lines::{ExitCode, print_line};
 use crate::{Error, Result};
 
 /// Arguments of `demc completions`.

@@ -7,8 +7,8 @@ use std::{
 
 use clap::Args as ClapArgs;
 
-use super::{SOME_FAILED, peak_memory, warn_line};
-use crate::cli::ExitCode;
+use super::lines::{ExitCode, SOME_FAILED, warn_line};
+use super::peak_memory;
 use crate::{
     Error, Result,
     denoise::{TEMPORAL, Temporal},

@@ -9,6 +9,7 @@ mod environment;
 mod eval;
 mod inputs;
 mod inspect;
+mod lines;
 mod manual;
 mod methods;
 mod models;
@@ -21,7 +22,7 @@ mod train;
 
 use std::{
     ffi::OsString,
-    io::{self, Write},
+    io,
     panic::{catch_unwind, set_hook},
     path::{Path, PathBuf},
     process,
@@ -29,6 +30,8 @@ use std::{
 };
 
 use clap::{CommandFactory, Parser, Subcommand};
+
+use lines::{ExitCode, SOME_FAILED, USAGE, warn_line};
 
 use crate::{
     Error, Result,
@@ -72,28 +75,9 @@ enum Command {
     PeakMemory(peak_memory::Args),
 }
 
-/// Exit status when some input failed, each named on stderr.
-pub const SOME_FAILED: u8 = 1;
-/// Exit status of a wrong command line.
-pub const USAGE: u8 = 2;
-
 /// Parses the process arguments and runs the subcommand.
 pub fn main() -> process::ExitCode {
     main_with(Cli::parse()).0.into()
-}
-
-/// What the program ends with, as a number: unlike the standard library's it can be handed to another language.
-#[derive(Clone, Copy)]
-struct ExitCode(u8);
-
-impl ExitCode {
-    const SUCCESS: Self = Self(0);
-}
-
-impl From<u8> for ExitCode {
-    fn from(status: u8) -> Self {
-        Self(status)
-    }
 }
 
 /// As [`main`], with these arguments, the program's own path first: for a program that is not a process' own executable, as the
@@ -160,14 +144,4 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Man(args) => manual::man(&args, &Cli::command()),
         Command::PeakMemory(args) => peak_memory::run(&args),
     }
-}
-
-/// One line on stdout. A reader that has gone away (`demc ... | head`) is no reason to stop.
-fn print_line(line: &str) {
-    let _ = writeln!(io::stdout(), "{line}");
-}
-
-/// One line on stderr. Nobody who reads it is no reason to stop either.
-fn warn_line(line: &str) {
-    let _ = writeln!(io::stderr(), "{line}");
 }

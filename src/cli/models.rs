@@ -1,6 +1,6 @@
 //! `demc models`: the methods there are, and what they cost.
 
-use crate::cli::ExitCode;
+use super::lines::ExitCode;
 use crate::{
     Result,
     models::{
@@ -71,15 +71,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let rows = METHODS.iter().filter(with_weights).map(trained).chain(untrained);
     let rows: Vec<Row> = rows.collect::<Result<_>>()?;
     if args.json {
-        super::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
+        super::lines::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
         return Ok(ExitCode::SUCCESS);
     }
-    super::print_line(&format!(
+    super::lines::print_line(&format!(
         "{:<14} {:<10} {:>12} {:>15} {:>16}  {}",
         "model", "weights", "parameters", "kMAC per pixel", "receptive field", "passes"
     ));
     for r in &rows {
-        super::print_line(&format!(
+        super::lines::print_line(&format!(
             "{:<14} {:<10} {:>12} {:>15.1} {:>16}  {}",
             r.model,
             r.weights,
@@ -91,7 +91,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     for r in &rows {
         if let Some(trained) = &r.trained {
-            super::print_line(&format!("{}: trained for {trained}", r.model));
+            super::lines::print_line(&format!("{}: trained for {trained}", r.model));
         }
     }
     Ok(ExitCode::SUCCESS)

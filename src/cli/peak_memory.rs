@@ -10,8 +10,7 @@ use std::{
 
 use clap::Args as ClapArgs;
 
-use super::print_line;
-use crate::cli::ExitCode;
+use super::lines::{ExitCode, print_line};
 use crate::{Error, Result, models, shot};
 
 /// Name of the subcommand.
@@ -98,6 +97,7 @@ fn status_mib(field: &str) -> Option<f64> {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
+    use super::lines::{ExitCode, print_line};
     use super::*;
 
     #[test]

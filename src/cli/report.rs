@@ -12,12 +12,8 @@ use std::{
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 
-use super::{
-    SOME_FAILED,
-    inputs::{self, Search},
-    print_line, warn_line,
-};
-use crate::cli::ExitCode;
+use super::inputs::{self, Search};
+use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
 use crate::{Error, Result};
 
 /// Arguments of `demc report`.

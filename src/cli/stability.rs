@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use crate::cli::ExitCode;
-
 use clap::Args as ClapArgs;
 
-use super::{methods, print_line, warn_line};
+use super::lines::{ExitCode, print_line, warn_line};
+use super::methods;
 use crate::{
     Error, Result,
     report::{NOISY, number},

@@ -13,8 +13,7 @@ use std::{
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::warn_line;
-use crate::cli::ExitCode;
+use super::lines::{ExitCode, warn_line};
 use crate::{
     Error, Result,
     frame::Frame,
@@ -360,6 +359,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 #[cfg(test)]
 mod tests {
+    use super::lines::{ExitCode, warn_line};
     use super::*;
 
     fn pair(reference: String, frame: Option<String>) -> Pair {

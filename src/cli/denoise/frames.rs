@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use crate::{
     Error, Result,
-    cli::warn_line,
+    cli::lines::warn_line,
     denoise::{Input, frame_number},
 };
 

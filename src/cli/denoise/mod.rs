@@ -12,17 +12,15 @@ use std::{
     time::Duration,
 };
 
-use crate::cli::ExitCode;
-
 use clap::{Args as ClapArgs, ValueEnum};
 use frames::Frames;
 use progress::{Progress, Style};
 
+use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::{
-    SOME_FAILED,
     inputs::{self, Inputs, Search},
     sources::{Guides, Names},
-    stop, warn_line,
+    stop,
 };
 use crate::{
     Error, Result,

@@ -7,7 +7,7 @@ use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::{
-    cli::{print_line, warn_line},
+    cli::lines::{print_line, warn_line},
     denoise::{Job, Outcome},
 };
 

@@ -6,16 +6,12 @@ mod print;
 
 use std::path::PathBuf;
 
-use crate::cli::ExitCode;
-
 use clap::Args as ClapArgs;
 
+use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
 use super::{
-    SOME_FAILED,
     inputs::{self, Search},
-    print_line,
     sources::Names,
-    warn_line,
 };
 use crate::{Result, denoise, error::attempt, lint::Trace};
 
