@@ -97,7 +97,6 @@ fn status_mib(field: &str) -> Option<f64> {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
-    use super::lines::{ExitCode, print_line};
     use super::*;
 
     #[test]

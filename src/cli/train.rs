@@ -359,7 +359,6 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 #[cfg(test)]
 mod tests {
-    use super::lines::{ExitCode, warn_line};
     use super::*;
 
     fn pair(reference: String, frame: Option<String>) -> Pair {

@@ -25,6 +25,8 @@ const LABEL: Style = Style::new(13);
 const VALUE: Style = Style::new(11);
 /// The ratio at which a colour is full.
 const FULL: f64 = 10.0;
+/// Ratios whose colour is light enough for dark numbers.
+const LIGHT: std::ops::RangeInclusive<f64> = 0.22..=4.5;
 const BETTER: RGBColor = RGBColor(33, 102, 172);
 const WORSE: RGBColor = RGBColor(178, 24, 43);
 const MISSING: RGBColor = RGBColor(240, 240, 242);
@@ -113,7 +115,7 @@ impl Figure for HeatMap {
                     Some(value) => {
                         let fill = colour(value);
                         canvas.fill(corners, fill)?;
-                        let ink = if value > 4.5 || value < 1.0 / 4.5 { WHITE } else { INK };
+                        let ink = if LIGHT.contains(&value) { INK } else { WHITE };
                         canvas.text(&short(value), middle, Anchor::Centre, Style { colour: ink, ..VALUE })?;
                     }
                     None => {

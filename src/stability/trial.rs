@@ -55,8 +55,8 @@ const VERY_DARK: f32 = 1.0 / 4096.0;
 
 /// World axes in camera space of [`Trial::WorldNormals`]: a camera that looks 30 degrees to the side and 25 down on a world
 /// whose z points up.
-const WORLD_TO_CAMERA: [[f32; 3]; 3] =
-    [[0.866_025, 0.5, 0.0], [-0.211_309, 0.365_998, 0.906_308], [0.453_154, -0.784_886, 0.422_618]];
+const WORLD_AXES: [[f32; 3]; 3] =
+    [[0.866_025, -0.211_309, 0.453_154], [0.5, 0.365_998, -0.784_886], [0.0, 0.906_308, 0.422_618]];
 
 /// First column and row of [`Trial::Cropped`]; no multiple of what networks halve by.
 pub const CORNER: (usize, usize) = (5, 3);
@@ -293,13 +293,13 @@ fn srgb(v: f32) -> f32 {
     if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Turns normals from camera space to that of [`WORLD_TO_CAMERA`].
+/// Turns normals from camera space to that of [`WORLD_AXES`].
 fn to_world(normals: &mut Planes) {
     let pixels = normals.pixels();
     for at in 0..pixels {
         let n = [0, 1, 2].map(|c| normals.data[c * pixels + at]);
-        for c in 0..3 {
-            normals.data[c * pixels + at] = (0..3).map(|row| WORLD_TO_CAMERA[row][c] * n[row]).sum();
+        for (c, axis) in WORLD_AXES.iter().enumerate() {
+            normals.data[c * pixels + at] = axis.iter().zip(n).map(|(axis, n)| axis * n).sum();
         }
     }
 }
