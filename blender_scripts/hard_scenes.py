@@ -65,7 +65,8 @@ def parse(arguments):
     )
     parser.add_argument("--out", metavar="DIR", help="folder for the scenes")
     parser.add_argument(
-        "--cases", type=cl.names, default=list(hard.CASES), metavar="a,b", help="these cases only (default: all)"
+        "--cases", type=cl.names, default=list(hard.CASES), metavar="a,b",
+        help="these cases only (default: all)",
     )
     parser.add_argument(
         "--spp", type=cl.counts, default=[4, 16, 64], metavar="N[,N]", help="sample counts (default: 4,16,64)"
@@ -78,8 +79,8 @@ def parse(arguments):
         help="pixels of a frame (default: 160x96); panoramas are half as high as wide",
     )
     parser.add_argument(
-        "--ref-spp", type=cl.positive, default=1024, metavar="N",
-        help="samples a part of a reference has at most (default: 1024)",
+        "--ref-spp", type=cl.positive, default=512, metavar="N",
+        help="samples a part of a reference has at most (default: 512)",
     )
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--list", action="store_true", help="render nothing, print the cases")
@@ -229,7 +230,7 @@ def main():
     options = parse(cl.script_arguments())
     if options.list:
         for name in options.cases:
-            print(f"{name:19} {hard.CASES[name][1]}")
+            print(f"{name:19} {hard.CASES[name]}")
         return
     options.out = os.path.abspath(options.out)
     if options.check:

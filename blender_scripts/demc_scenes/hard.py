@@ -13,34 +13,34 @@ from . import hard_light as light
 from .assets import Library
 from .stage import Stage
 
-# Name -> (builder, why denoisers fail there).
+# Name -> why denoisers fail there; the builder has the same name.
 CASES = {
-    "glass_ball": (light.glass_ball, "Guides show the glass or what is behind it, the light both and reflections too."),
-    "mirror": (light.mirror, "What is mirrored has detail that the mirror's own albedo and normal lack."),
-    "caustic": (light.caustic, "Few paths find the light; their bright dots are taken for fireflies."),
-    "thin_shadow": (light.thin_shadow, "Shadows as thin as a pixel are in no guide, and are blurred away as noise."),
-    "many_lights": (light.many_lights, "Each sample sees one lamp of many: noise of all colours, and many soft shadows."),
-    "light_gap": (light.light_gap, "Light comes through a gap that few paths find: most samples are black, some bright."),
-    "fog": (light.fog, "Haze scatters before surfaces that guides describe: their edges are printed onto it."),
-    "fog_beam": (light.fog_beam, "Beams in haze have edges where nothing is: guides are flat there."),
-    "hair": (detail.hair, "Strands thinner than a pixel make guides as noisy as the light."),
-    "foliage": (detail.foliage, "Every pixel holds edges of several leaves, and guides average them."),
-    "subsurface": (light.subsurface, "Light within wax is noisy and smooth at once, and seams of guides cut it."),
-    "depth_of_field": (detail.depth_of_field, "Guides of blurred things are noisy, and discs of light have sharp rims."),
-    "motion_blur": (detail.motion_blur, "Guides mix the thing that moves with what is behind it, with noise of their own."),
-    "bump": (detail.bump, "Normals are full of detail that even light hardly shows: it is printed onto the result."),
-    "text": (detail.text, "Letters of one pixel's stroke are lost where noise is as strong as ink."),
-    "text_through_glass": (detail.text_through_glass, "Frosted glass hides the print from guides, not from the eye."),
-    "emissive": (light.emissive, "Patterns that shine are clean beside noise, and their albedo tells nothing of them."),
-    "stars": (light.stars, "Lights smaller than a pixel look like fireflies and are removed."),
-    "snow": (detail.snow, "Small bright flakes in the air look like fireflies in light and guides."),
-    "glints": (light.glints, "Ripples mirror the sun for a pixel or less: real sparkle that looks like fireflies."),
-    "film_alpha": (detail.film_alpha, "Colour fades with alpha at edges: haloes and fringes show once it is composited."),
-    "wide_filter": (detail.wide_filter, "Edges of light and guides are four pixels wide and are made too sharp."),
-    "very_dark": (detail.very_dark, "Constants that suit values near 1 swamp an image near 0.001."),
-    "very_bright": (detail.very_bright, "Values near 1000 leave the range in which networks were trained."),
-    "half_overflow": (detail.half_overflow, "A lamp beyond 65504 is infinite or cut in a half float, and spills around."),
-    "panorama": (detail.panorama, "The left and right edges meet: denoised apart they leave a seam in what lies across."),
+    "glass_ball": "Light through glass and off it is seen at once, and guides hold one of them, or noise.",
+    "mirror": "What is mirrored has edges of its own, which guides show only where a mirror is smooth.",
+    "caustic": "Few paths find light that glass and metal gather: its bright dots are taken for fireflies.",
+    "thin_shadow": "Shadows as thin as a pixel are in no guide, and are blurred away as noise.",
+    "many_lights": "Each sample sees one lamp of many: noise of all colours over many soft shadows.",
+    "light_gap": "Light comes by a gap that few paths find: most samples are black, and some very bright.",
+    "fog": "Haze brings noise into guides as into light, and hides edges that guides still show.",
+    "fog_beam": "Beams in haze have edges where no surface is, and guides know nothing of them.",
+    "hair": "Strands are thinner than a pixel: guides are as noisy as the light.",
+    "foliage": "Each pixel holds edges of several leaves, which guides average, noise and all.",
+    "subsurface": "Light from below a surface is smooth where guides have edges, and its noise is coloured.",
+    "depth_of_field": "Guides of what is out of focus are noisy, and discs of light have sharp rims.",
+    "motion_blur": "Guides mix what moves with what is behind it, and are noisy themselves.",
+    "bump": "Normals are full of detail that even light hardly shows: it is printed onto the result.",
+    "text": "Strokes of letters are a pixel wide, and are lost where noise is as strong as ink.",
+    "text_through_glass": "Frosted glass hides the print from the guides but not from the eye.",
+    "emissive": "Patterns that shine are free of noise amid noise, and light their surroundings.",
+    "stars": "Lights smaller than a pixel look like fireflies, and are removed.",
+    "snow": "Small bright flakes look like fireflies, in the light and in the guides.",
+    "glints": "Ripples mirror the sun for a pixel or less: sparkle that is real and looks like fireflies.",
+    "film_alpha": "Colour fades with alpha at edges: what bleeds there is a fringe once composited.",
+    "wide_filter": "Edges of light and guides are four pixels wide, and come out too sharp or with steps.",
+    "very_dark": "Constants that suit values near 1 swamp an image whose mean is near 0.001.",
+    "very_bright": "Values near 1000 are outside of what networks were trained on.",
+    "half_overflow": "A lamp beyond 65504 is cut in a half float, and what is left of it spills around.",
+    "panorama": "Left and right edges meet: denoised apart they leave a seam in what lies across.",
 }
 
 
@@ -57,6 +57,6 @@ def build(name, hard):
     # Clamping hides some of the troubles, and what it takes away the reference lacks as well.
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
-    CASES[name][0](stage, hard)
+    getattr(light if hasattr(light, name) else detail, name)(stage, hard)
     scene.frame_set(1)
     return stage

@@ -57,7 +57,7 @@ def bump(stage, hard):
     """A wall and shapes with dented normals, or smooth ones, under even light."""
     n = m.Nodes("dented")
     cells = n.shader("ShaderNodeTexVoronoi", Vector=n.place(1.0), Scale=14.0)
-    normal = dict(Normal=n.bump(cells, 1.0, 0.08)) if hard else {}
+    normal = dict(Normal=n.bump(cells, 0.6, 0.08)) if hard else {}
     dented = n.principled(Base_Color=(0.6, 0.55, 0.5), Roughness=0.8, Specular_IOR_Level=0.1, **normal)
     parts.floor(stage, dented)
     parts.wall(stage, dented, 1.0)
@@ -67,43 +67,36 @@ def bump(stage, hard):
     parts.view(stage)
 
 
-def page(stage, hard, y=0.0, height=1.3):
-    """An upright page of small print with a chart's lines below it, or of the same grey throughout."""
-    draw = np.random.default_rng(7)
-    sheet = printed.page(draw)[:160, :240]
-    sheet = np.concatenate([sheet, *[sheet[:, ::-1]] * (sheet.shape[1] < 200)], 1)
-    if not hard:
-        sheet = np.full_like(sheet, 0.8)
+def page(stage, printed_on):
+    """An upright page of small print, a stroke of which is a pixel wide, or an empty one."""
+    # This seed prints dark letters on white.
+    sheet = printed.page(np.random.default_rng(24))[:110, :120]
+    if not printed_on:
+        sheet = np.broadcast_to(sheet.mean((0, 1)), sheet.shape)
     n = m.Nodes("page")
     base = m.image(n, printed.stored("page", sheet), n.uv(1.0))
     base.interpolation = "Closest"
-    width = height * sheet.shape[1] / sheet.shape[0]
     paper = n.principled(Base_Color=base.outputs[0], Roughness=0.8)
-    return stage.add(shapes.plane(width, height, unit_uv=True), paper, (0, y, 0.06))
+    stage.add(shapes.plane(1.42, 1.3, unit_uv=True), paper, (-0.35, 0, 0.06))
+    parts.softbox(stage, 45, at=(1.6, -1.6, 2.4), size=0.3)
+    parts.world(stage, 0.15)
+    parts.view(stage, at=(0, -2.6, 0.9), target=(0, 0, 0.7))
 
 
 def text(stage, hard):
-    """A printed page under dim lamps and a line of letters, or an empty page."""
+    """A printed page and a fine-grained wall, or an empty page and a bare wall."""
     parts.floor(stage, parts.matt((0.3, 0.25, 0.2)))
-    parts.wall(stage, parts.matt((0.4, 0.45, 0.5)), 1.0)
+    parts.wall(stage, parts.grained(90) if hard else parts.matt((0.5, 0.45, 0.4)), 0.6)
     page(stage, hard)
-    if hard:
-        stage.add(shapes.text("denoise 1.50  x=0.5", 0.13, 0.0), parts.matt((0.02, 0.02, 0.02)), (-0.9, -0.05, 1.42))
-    parts.softbox(stage, 45, at=(1.6, -1.6, 2.4), size=0.3)
-    parts.world(stage, 0.1)
-    parts.view(stage, at=(0, -2.9, 1.1), target=(0, 0, 0.75))
 
 
 def text_through_glass(stage, hard):
     """A printed page behind a frosted pane, or without the pane."""
     parts.floor(stage, parts.matt((0.3, 0.25, 0.2)))
-    parts.wall(stage, parts.matt((0.4, 0.45, 0.5)), 1.0)
+    parts.wall(stage, parts.matt((0.5, 0.45, 0.4)), 0.6)
     page(stage, True)
     if hard:
-        stage.add(shapes.box((1.7, 0.01, 1.2), 0, (0.15, 0, 0.62)), parts.glass(0.3), (0, -0.03, 0))
-    parts.softbox(stage, 45, at=(1.6, -1.6, 2.4), size=0.3)
-    parts.world(stage, 0.25)
-    parts.view(stage, at=(0, -2.9, 1.1), target=(0, 0, 0.75))
+        stage.add(shapes.box((1.5, 0.01, 1.4), 0, (-0.2, 0, 0.7)), parts.glass(0.3), (0, -0.03, 0))
 
 
 def snow(stage, hard):
@@ -142,7 +135,8 @@ def motion_blur(stage, hard):
     parts.floor(stage, parts.checker(0.3))
     parts.wall(stage, parts.grained(20), 1.5)
     ball = stage.add(shapes.sphere(0.3, 5), parts.checker(0.1, parts.RED), (-0.6, 0, 0.25))
-    wheel = stage.add(shapes.boxes([((1.0, 0.06, 0.1), (0, 0, 0)), ((0.1, 0.06, 1.0), (0, 0, 0))]), parts.matt(parts.BLUE))
+    spokes = [((1.0, 0.06, 0.1), (0, 0, 0)), ((0.1, 0.05, 1.0), (0, 0, 0))]
+    wheel = stage.add(shapes.boxes(spokes), parts.matt(parts.BLUE))
     wheel.location = (0.75, 0, 0.65)
     for frame, side in ((0, -1), (2, 1)):
         ball.location.x = -0.6 + 0.5 * side
@@ -160,7 +154,8 @@ def film_alpha(stage, hard):
     """Leaf cards, a ring and a pane over a transparent film, or before the world."""
     stage.add(shapes.leaves(stage.rng, 160, 0.55, 0.2), leaf(), (-0.6, 0, 0.6))
     stage.add(shapes.torus(0.35, 0.03), parts.matt(parts.RED), (0.6, -0.1, 0.1), 0.5).rotation_euler.x = 1.0
-    stage.add(shapes.box((0.6, 0.02, 0.6), 0, (0, 0, 0.3)), parts.matt(parts.BLUE, Alpha=0.5), (0.75, 0.3, 0.4), 0.3)
+    pane = parts.matt(parts.BLUE, Alpha=0.5)
+    stage.add(shapes.box((0.6, 0.02, 0.6), 0, (0, 0, 0.3)), pane, (0.75, 0.3, 0.4), 0.3)
     parts.softbox(stage, 60)
     parts.world(stage, 0.3)
     parts.view(stage, target=(0, 0, 0.5))
@@ -189,12 +184,13 @@ def very_bright(stage, hard):
 def half_overflow(stage, hard):
     """The still life with a lamp that is seen: brighter than a half float can hold, or not."""
     parts.still_life(stage)
-    n = m.Nodes("lamp")
-    # What the camera sees alone overflows: as a light of that strength the lamp would burn out the frame.
-    seen = n.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
-    strength = n.math("ADD", n.math("MULTIPLY", seen, 2e5 if hard else 0.0), 20.0)
-    lamp = n.finish(n.shader("ShaderNodeEmission", Color=(1, 0.9, 0.75), Strength=strength))
-    stage.add(shapes.sphere(0.09, 4), lamp, (-0.15, 0.2, 0.95))
+    warm = (1, 0.9, 0.75)
+    stage.add(shapes.sphere(0.08, 4), parts.glow(20, warm), (-0.15, 0.2, 0.95))
+    # The shell is for the camera's eyes only: as a light of that strength it would burn out the frame.
+    shell = stage.add(shapes.sphere(0.09, 4), parts.glow(2e5 if hard else 20, warm), (-0.15, 0.2, 0.94))
+    shell.active_material.cycles.emission_sampling = "NONE"
+    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(shell, f"visible_{ray}", False)
 
 
 def panorama(stage, hard):

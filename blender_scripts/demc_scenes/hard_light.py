@@ -25,9 +25,8 @@ def mirror(stage, hard):
     parts.floor(stage, parts.checker(0.25))
     parts.wall(stage, parts.matt(parts.GREY))
     silver = m.Nodes("silver").principled(Base_Color=(0.92, 0.92, 0.92), Metallic=1.0, Roughness=0.0)
-    stage.add(
-        shapes.box((2.4, 0.04, 1.3), 0, (0, 0, 0.7)), silver if hard else parts.matt((0.6, 0.6, 0.6)), (0, 0.9, 0), 0.12
-    )
+    board = shapes.box((2.4, 0.04, 1.3), 0, (0, 0, 0.7))
+    stage.add(board, silver if hard else parts.matt((0.6, 0.6, 0.6)), (0, 0.9, 0), 0.12)
     stage.add(shapes.sphere(0.22, 5), parts.matt(parts.RED), (-0.6, 0.2, 0))
     stage.add(shapes.monkey(0.5), parts.matt(parts.GREEN), (0.6, 0.1, 0), -0.5)
     stage.add(shapes.box((5, 0.04, 2.5), 0, (0, 0, 1.25)), parts.checker(0.2, (0.8, 0.4, 0.1)), (0, -4.5, 0))
@@ -41,7 +40,8 @@ def caustic(stage, hard):
     parts.floor(stage, parts.matt((0.6, 0.6, 0.58)))
     brass = m.Nodes("brass").principled(Base_Color=(0.9, 0.65, 0.3), Metallic=1.0, Roughness=0.05)
     stage.add(shapes.sphere(0.35, 6), parts.glass(), (-0.5, 0, 0))
-    stage.add(shapes.lathe([(0.33, 0), (0.35, 0), (0.35, 0.25), (0.33, 0.25), (0.33, 0)], 96), brass, (0.65, -0.1, 0))
+    ring = shapes.lathe([(0.33, 0), (0.35, 0), (0.35, 0.1), (0.33, 0.1), (0.33, 0)], 96)
+    stage.add(ring, brass, (0.65, -0.1, 0))
     parts.softbox(stage, 90, at=(0.6, 2.2, 2.0), size=0.35, aim=(0, 0, 0))
     parts.world(stage, 0.05)
     parts.view(stage, at=(0, -2.6, 1.6), target=(0, -0.15, 0.1))
@@ -70,7 +70,7 @@ def many_lights(stage, hard):
         stage.add(shapes.monkey(0.6), parts.matt(tint), (x, 0.1, 0), x)
     for _ in range(150 if hard else 0):
         at = (stage.rng.uniform(-2, 2), stage.rng.uniform(-1.4, 1.1), stage.rng.uniform(0.03, 1.6))
-        stage.lamp("POINT", at, 1.2, m.color(stage.rng, (0.3, 1.0), (0.8, 1.0)), shadow_soft_size=0.008)
+        stage.lamp("POINT", at, 0.55, m.color(stage.rng, (0.3, 1.0), (0.8, 1.0)), shadow_soft_size=0.008)
     if not hard:
         parts.softbox(stage, 60)
     parts.world(stage, 0.02)
@@ -78,16 +78,15 @@ def many_lights(stage, hard):
 
 
 def light_gap(stage, hard):
-    """A closed room beside a bright one, and a door between: ajar by three centimetres, or open."""
-    gap = 0.03 if hard else 1.2
-    left, right = -1.0 + gap / 2, 1.0 - gap / 2
+    """A closed room beside a bright one, and a door between: ajar by a hand's breadth, or open."""
+    gap = 0.1 if hard else 1.2
     room = [((4, 8, 0.1), (0, 2, -0.05)), ((4, 8, 0.1), (0, 2, 2.45)), ((0.1, 8, 2.4), (-2.05, 2, 1.2))]
-    room += [((0.1, 8, 2.4), (2.05, 2, 1.2)), ((4, 0.1, 2.4), (0, -2.05, 1.2)), ((4, 0.1, 2.4), (0, 6.05, 1.2))]
+    room += [((4, 0.1, 2.4), (0, y, 1.2)) for y in (-2.05, 6.05)] + [((0.1, 8, 2.4), (2.05, 2, 1.2))]
     room += [((2 - gap / 2, 0.1, 2.4), (x - gap / 4 * s, 1.0, 1.2)) for x, s in ((-1, 1), (1, -1))]
     stage.add(shapes.boxes(room), parts.matt((0.7, 0.68, 0.64)))
-    stage.add(shapes.box((0.6, 0.6, 0.6), 0.02, (0, 0, 0.3)), parts.matt(parts.RED), (left - 0.1, 0.2, 0), 0.4)
-    stage.add(shapes.monkey(0.7), parts.matt(parts.BLUE), (right, 0.3, 0), -0.3)
-    parts.softbox(stage, 2500 if hard else 120, at=(0.4, 4.5, 1.9), size=1.2, aim=(0, 1, 0.8))
+    stage.add(shapes.box((0.6, 0.6, 0.6), 0.02, (0, 0, 0.3)), parts.matt(parts.RED), (-0.9, 0.2, 0), 0.4)
+    stage.add(shapes.monkey(0.7), parts.matt(parts.BLUE), (0.8, 0.3, 0), -0.3)
+    parts.softbox(stage, 700 if hard else 110, at=(0.2, 2.6, 2.0), size=1.2, aim=(0, 0, 0.4))
     parts.world(stage, 0.0)
     parts.view(stage, at=(0, -1.95, 1.4), target=(0, 0.6, 0.8), lens=24)
 
@@ -96,7 +95,8 @@ def fog(stage, hard):
     """Balls one behind the other and lamps among them, in haze or in clear air."""
     parts.floor(stage, parts.checker(0.5))
     for i, tint in enumerate((parts.RED, parts.GREEN, parts.BLUE) * 2):
-        stage.add(shapes.sphere(0.4, 5), parts.matt(tint), (-1.2 + 0.9 * (i % 3) + 0.2 * i, -0.6 + 1.1 * i, 0))
+        at = (-1.2 + 0.9 * (i % 3) + 0.2 * i, -0.6 + 1.1 * i, 0)
+        stage.add(shapes.sphere(0.4, 5), parts.matt(tint), at)
     for x, y in ((-0.9, 0.6), (1.4, 2.4)):
         stage.add(shapes.sphere(0.08, 3), parts.glow(60, (1, 0.8, 0.5)), (x, y, 1.0))
     if hard:
@@ -123,8 +123,8 @@ def subsurface(stage, hard):
     """A head and a ball of wax with light behind them; the control's are matt."""
     parts.floor(stage, parts.checker(0.3))
     parts.wall(stage, parts.matt((0.3, 0.32, 0.35)), 2.2)
-    wax = dict(Subsurface_Weight=1.0, Subsurface_Radius=(1.0, 0.4, 0.2), Subsurface_Scale=0.12) if hard else {}
-    material = parts.matt((0.85, 0.65, 0.5), **wax)
+    wax = dict(Subsurface_Weight=1.0, Subsurface_Radius=(1.0, 0.4, 0.2), Subsurface_Scale=0.12)
+    material = parts.matt((0.85, 0.65, 0.5), **(wax if hard else {}))
     stage.add(shapes.monkey(1.0), material, (-0.4, 0, 0), 0.2)
     stage.add(shapes.sphere(0.3, 5), material, (0.75, -0.2, 0))
     parts.softbox(stage, 90, at=(1.0, 1.6, 1.8), size=0.4)
@@ -140,11 +140,12 @@ def emissive(stage, hard):
     for x, tint in ((-0.95, (1.0, 0.35, 0.1)), (0.95, (0.15, 0.5, 1.0))):
         n = m.Nodes("panel")
         tone = parts.squares(n, 0.07, tint, (0.01, 0.01, 0.02))
-        emission = dict(Emission_Color=tone, Emission_Strength=4.0, Base_Color=(0, 0, 0))
+        emission = dict(Emission_Color=tone, Emission_Strength=1.5, Base_Color=(0, 0, 0))
         panel = n.principled(Roughness=0.8, **(emission if hard else dict(Base_Color=tone)))
         stage.add(shapes.box((0.9, 0.05, 0.9), 0, (0, 0, 0.5)), panel, (x, 0.6, 0), -0.2 * x)
     letters = shapes.text("OPEN", 0.32, 0.02)
-    stage.add(letters, parts.glow(6, (0.2, 1.0, 0.5)) if hard else parts.matt((0.2, 0.8, 0.4)), (-0.42, 0.5, 1.05))
+    green = parts.glow(3, (0.2, 1.0, 0.5)) if hard else parts.matt((0.2, 0.8, 0.4))
+    stage.add(letters, green, (-0.42, 0.5, 1.05))
     stage.add(shapes.sphere(0.25, 5), parts.matt((0.7, 0.7, 0.7)), (0, -0.1, 0))
     if not hard:
         parts.softbox(stage, 60)
@@ -154,14 +155,12 @@ def emissive(stage, hard):
 
 def stars(stage, hard):
     """A night sky over dark hills, with stars or without."""
-    stage.add(
-        shapes.terrain(30, 90, lambda x, y: 0.5 * math.sin(0.7 * x + 1) * math.cos(0.5 * y) - 0.3), parts.grained(8)
-    )
+    hills = shapes.terrain(30, 90, lambda x, y: 0.5 * math.sin(0.7 * x + 1) * math.cos(0.5 * y) - 0.3)
+    stage.add(hills, parts.grained(8))
     if hard:
-        for strength, count, side in ((8, 260, 0.02), (40, 70, 0.025), (250, 12, 0.03)):
-            spots = [
-                ((side,) * 3, (stage.rng.uniform(-6.5, 6.5), 12.0, stage.rng.uniform(0.3, 7.0))) for _ in range(count)
-            ]
+        for strength, count, side in ((8, 300, 0.02), (40, 80, 0.025), (250, 15, 0.03)):
+            draw = stage.rng.uniform
+            spots = [((side,) * 3, (draw(-9, 9), 12.0, draw(0.3, 9.0))) for _ in range(count)]
             stage.add(shapes.boxes(spots), parts.glow(strength, (0.9, 0.95, 1.0)))
     parts.sun(stage, 0.25, -60, 35, 0.6)  # the moon
     parts.world(stage, 0.02, (0.3, 0.45, 1.0))
@@ -170,7 +169,8 @@ def stars(stage, hard):
 
 def glints(stage, hard):
     """Water under a low sun, rippled or calm."""
-    waves = [(stage.rng.uniform(-14, 14), stage.rng.uniform(6, 40), stage.rng.uniform(0, 6.28)) for _ in range(6)]
+    draw = stage.rng.uniform
+    waves = [(draw(-14, 14), draw(6, 40), draw(0, 6.28)) for _ in range(6)]
 
     def height(x, y):
         return sum(0.09 / (abs(a) + b) * math.sin(a * x + b * y + c) for a, b, c in waves)

@@ -50,7 +50,8 @@ def grained(scale=60.0):
     """A fine texture without edges, as of stone."""
     n = m.Nodes("grained")
     grain = n.noise(n.place(1.0), scale, 6, 0.7)
-    return n.principled(Base_Color=n.ramp(grain, (0.4, (0.15, 0.1, 0.07)), (0.6, (0.8, 0.72, 0.6))), Roughness=0.8)
+    tone = n.ramp(grain, (0.4, (0.15, 0.1, 0.07)), (0.6, (0.8, 0.72, 0.6)))
+    return n.principled(Base_Color=tone, Roughness=0.8)
 
 
 def floor(stage, material):
