@@ -119,13 +119,18 @@ class Table(Ledger):
 
     def write_manifest(self):
         """Lists every noisy frame whose scene has its reference."""
-        listed = {file: row for file, row in self.rows().items() if not self.missing(file)}
-        references = {row["view"]: row for file, row in listed.items() if file.endswith("_ref.exr")}
+        there = [row for row in self.rows().values() if os.path.exists(os.path.join(self.folder, row["file"]))]
+        references = {row["view"]: row for row in there if row["noise_seed"] == _PARTS}
+        noisy = [row for row in there if row["noise_seed"].isdigit() and row["view"] in references]
+        cases = list(hard.CASES)
+        noisy.sort(
+            key=lambda row: (cases.index(row["kind"]), row["view"], int(row["spp"]), int(row["noise_seed"]))
+        )
         rows = [["scene", "noisy", "reference", "spp"]]
-        for file, row in listed.items():
-            reference = references.get(row["view"])
-            if reference and "spp" in file and row["frame"] == reference["frame"]:
-                rows.append([row["view"], file, reference["file"], row["spp"]])
+        for row in noisy:
+            reference = references[row["view"]]
+            if row["frame"] == reference["frame"]:
+                rows.append([row["view"], row["file"], reference["file"], row["spp"]])
         partial = os.path.join(self.folder, "manifest.tmp")
         with open(partial, "w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
