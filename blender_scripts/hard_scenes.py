@@ -119,7 +119,8 @@ class Table(Ledger):
 
     def write_manifest(self):
         """Lists every noisy frame whose scene has its reference."""
-        there = [row for row in self.rows().values() if os.path.exists(os.path.join(self.folder, row["file"]))]
+        exists = lambda row: os.path.exists(os.path.join(self.folder, row["file"]))
+        there = list(filter(exists, self.rows().values()))
         references = {row["view"]: row for row in there if row["noise_seed"] == _PARTS}
         noisy = [row for row in there if row["noise_seed"].isdigit() and row["view"] in references]
         cases = list(hard.CASES)
