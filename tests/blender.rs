@@ -507,6 +507,44 @@ fn makes_hard_cases_of_a_pair() {
 }
 
 #[test]
+fn renders_a_hard_scene_beside_its_control_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("hard");
+    let render = |more: &str| {
+        let mut command = blender();
+        command.arg(script("hard_scenes.py")).arg("--out").arg(&out);
+        run(command.args(more.split_whitespace()))
+    };
+    let arguments = "--cases text --spp 1 --seeds 2 --size 32x20 --ref-spp 8";
+    let said = render(arguments);
+    assert_eq!(said.lines().count(), 2, "a line a scene: {said}");
+    assert_eq!(
+        fs::read_to_string(out.join("manifest.csv")).unwrap(),
+        "scene,noisy,reference,spp\n\
+         text,text_0001spp.exr,text_ref.exr,1\n\
+         text,text_0001spp_n1.exr,text_ref.exr,1\n\
+         text_control,text_control_0001spp.exr,text_control_ref.exr,1\n\
+         text_control,text_control_0001spp_n1.exr,text_control_ref.exr,1\n"
+    );
+    let pairs = testset::read(out.join("manifest.csv").to_str().unwrap()).unwrap().pairs;
+    assert_eq!(pairs.len(), 4);
+    let load = |name: &str| passes::load(out.join(name), None).unwrap();
+    let [noisy, again, control] =
+        ["text_0001spp.exr", "text_0001spp_n1.exr", "text_control_0001spp.exr"].map(load);
+    assert_eq!((noisy.width, noisy.height), (32, 20));
+    for pass in [Pass::Combined, Pass::Alpha, Pass::DenoisingAlbedo, Pass::DenoisingNormal, Pass::Position] {
+        assert!(noisy.get(pass).is_some(), "{pass}");
+    }
+    assert_ne!(noisy.get(Pass::Combined), again.get(Pass::Combined), "every seed has noise of its own");
+    assert_ne!(noisy.get(Pass::DenoisingAlbedo), control.get(Pass::DenoisingAlbedo), "an empty page");
+    assert!(load("text_ref.exr").get(Pass::DenoisingAlbedo).is_some(), "references have guides");
+    assert_eq!(render(arguments), "", "nothing is missing");
+    assert!(render("--check").contains("10 of 10 files are as listed"));
+    let cases = run(blender().arg(script("hard_scenes.py")).arg("--list"));
+    assert_eq!(cases.lines().count(), 26, "{cases}");
+}
+
+#[test]
 fn guides_alone_are_the_guides_of_whole_renders() {
     let folder = tempfile::tempdir().unwrap();
     let load = |kind: &str, more: &str| {

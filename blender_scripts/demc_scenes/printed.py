@@ -48,9 +48,13 @@ _WORDS = (
 def image(rng):
     """A Blender image of a random sort."""
     make = rng.choice((page, page, chart, interface, interface, sprite, pattern))
-    pixels = make(np.random.default_rng(rng.randrange(1 << 32)))
+    return stored(make.__name__, make(np.random.default_rng(rng.randrange(1 << 32))))
+
+
+def stored(name, pixels):
+    """An array of pixels as a Blender image."""
     height, width = pixels.shape[:2]
-    made = bpy.data.images.new(make.__name__, width, height)
+    made = bpy.data.images.new(name, width, height)
     rgba = np.ones((height, width, 4), np.float32)
     rgba[..., :3] = pixels[::-1]  # Blender's first row is the lowest
     made.pixels.foreach_set(rgba.ravel())
