@@ -247,7 +247,7 @@ class Studio:
                 rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0,
             )
             channels, seconds = self._render()
-        exr.write_half(os.path.join(self.folder, self.view.noisy(spp, noise_seed)), channels)
+        exr.write_half(os.path.join(self.folder, self.view.noisy(spp, noise_seed)), channels, spp)
         return seconds
 
     def part(self, which):

@@ -166,7 +166,7 @@ class Studio:
             seed = rendering.mixed_seed(self.pair.case, spp, noise_seed)
             rendering.set_sampling(edits, self.scene, spp, seed)
             channels, seconds = self._render()
-        exr.write_half(os.path.join(self.options.out, self.pair.noisy(spp, noise_seed)), channels)
+        exr.write_half(os.path.join(self.options.out, self.pair.noisy(spp, noise_seed)), channels, spp)
         return seconds
 
     def part(self, which):

@@ -76,10 +76,13 @@ def add_text_attribute(path, name, text):
     os.replace(partial, path)
 
 
-def write_half(path, channels):
-    """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all."""
+def write_half(path, channels, spp=None):
+    """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all.
+    `spp` is told as Blender tells it, `cycles.<view layer>.samples`: denoisers treat final frames with more care."""
     limit = float(np.finfo(np.float16).max)
-    _write(path, {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}, 1)
+    halves = {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}
+    layers = {name.split(".")[0] for name in channels} if spp else ()
+    _write(path, halves, 1, texts={f"cycles.{layer}.samples": str(spp) for layer in sorted(layers)})
 
 
 def write_float(path, channels, level=_LEVEL):
@@ -87,7 +90,7 @@ def write_float(path, channels, level=_LEVEL):
     _write(path, {name: plane.astype("<f4") for name, plane in channels.items()}, 2, level)
 
 
-def _write(path, channels, kind, level=_LEVEL):
+def _write(path, channels, kind, level=_LEVEL, texts=None):
     names = sorted(channels)
     planes = [channels[name] for name in names]
     height, width = planes[0].shape
@@ -100,6 +103,7 @@ def _write(path, channels, kind, level=_LEVEL):
         ("lineOrder", "lineOrder", b"\0"), ("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
         ("screenWindowCenter", "v2f", struct.pack("<ff", 0.0, 0.0)),
         ("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+        *((name, "string", text.encode()) for name, text in (texts or {}).items()),
     ):
         header += name.encode() + b"\0" + type_.encode() + b"\0" + struct.pack("<i", len(value)) + value
     header += b"\0"
