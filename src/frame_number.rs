@@ -1,5 +1,5 @@
-//! The number of a frame, which stands at the end of its file's name, of any width, as Blender writes it before the extension:
-//! `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
+//! What a file's name tells: the number of a frame, which stands at its end, of any width, as Blender writes it before the
+//! extension (`shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`), and samples per pixel.
 
 use std::path::Path;
 
@@ -19,6 +19,14 @@ pub fn split(stem: &str) -> Option<(&str, i64)> {
     })
 }
 
+/// The samples per pixel in a name: those of `shot_0004spp.0017.exr`, `shot_0004spp_a.exr`.
+pub fn samples(file: &Path) -> Option<u32> {
+    let (head, rest) = file.file_stem()?.to_str()?.rsplit_once("spp")?;
+    let is_end = rest.is_empty() || rest.starts_with(['.', '_']);
+    let (_, digits) = head.rsplit_once('_').filter(|_| is_end)?;
+    digits.parse().ok().filter(|_| digits.bytes().all(|b| b.is_ascii_digit()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -35,6 +43,22 @@ mod tests {
             ("shot.exr", None),
         ] {
             assert_eq!(frame_number(Path::new(name)), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn samples_stand_before_spp() {
+        for (name, expected) in [
+            ("a/shot_0004spp.0017.exr", Some(4)),
+            ("shot_256spp.exr", Some(256)),
+            ("shot_0016spp_n1.exr", Some(16)),
+            ("a_4spp/shot.exr", None),
+            ("shot_spp.exr", None),
+            ("shot_+4spp.exr", None),
+            ("shot_4sppx.exr", None),
+            ("shot4spp.exr", None),
+        ] {
+            assert_eq!(samples(Path::new(name)), expected, "{name}");
         }
     }
 }

@@ -13,6 +13,7 @@ use super::{
 use crate::{
     Error, Result,
     frame::{Frame, Part, Window, to_rgb},
+    frame_number::samples,
     planes::Planes,
 };
 
@@ -303,9 +304,11 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
     set.renderer = layer.renderer;
-    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had.
-    let samples = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
-    set.samples = samples.and_then(|count| count.trim().parse().ok());
+    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had. Programs that write a render
+    // anew leave it out: then what render pairs are named by.
+    let told = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
+    let told = told.and_then(|count| count.trim().parse().ok());
+    set.samples = told.or_else(|| samples(frame.path()));
 
     decode(frame, window, held().map(|(pass, at)| (*pass, at)), |pass, planes| set.insert(pass, planes))?;
     Ok(set)
