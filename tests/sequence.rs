@@ -15,6 +15,7 @@ use assert_cmd::Command;
 use common::{
     files::{bits, read_exr, samples, values},
     python,
+    tables::table,
 };
 use demc::{
     metrics::flicker::{Pair, flicker},
@@ -158,6 +159,13 @@ fn demc(out: &Path) -> Command {
 /// Where a frame's result lies.
 fn result(out: &Path, number: i64) -> PathBuf {
     out.join(format!("shot_0004spp.{number:04}.exr"))
+}
+
+/// The planes of a layer, (3, H, W).
+fn planes(file: &Path, layer: &str, components: &[&str]) -> Planes {
+    let image = read_exr(file);
+    let all = components.iter().flat_map(|c| values(&image, &format!("ViewLayer.{layer}.{c}")));
+    Planes::from_vec(components.len(), SIZE.0, SIZE.1, all.collect())
 }
 
 /// The bits of a result.
@@ -337,6 +345,65 @@ fn stills_and_single_frames_are_denoised_as_ever() {
         let image = read_exr(out.join(name));
         assert_eq!(values(&image, "ViewLayer.Denoised.R"), values(&image, "ViewLayer.Combined.R"));
     }
+}
+
+/// What `demc eval` says of a sequence is what `demc denoise` makes of it, frame by frame and with neighbours; a frame that is scored
+/// later, when the one before it is there already, gets the same score.
+#[test]
+fn a_sequence_is_scored_as_it_is_denoised() {
+    let dir = sequence(SHOT, 1..=4);
+    let reference = |n: i64| dir.path().join(format!("shot_ref.{n:04}.exr"));
+    for n in 1..=4 {
+        let channel = |(c, name): (usize, &str)| {
+            let truth = (0..SIZE.0 * SIZE.1).map(|i| SHOT.truth(c, i, n)).collect();
+            AnyChannel::new(format!("ViewLayer.Combined.{name}").as_str(), FlatSamples::F32(truth))
+        };
+        let list = ["R", "G", "B"].into_iter().enumerate().map(channel).collect();
+        write_channels(&reference(n), SIZE, list, &[]);
+    }
+    let out = dir.path().join("report");
+    let eval = || {
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["eval", "--models", "demc-s", "--temporal", "--repeats", "1", "--test-set"]);
+        command.arg(dir.path()).arg("--out").arg(&out).assert().success();
+        table(&out.join("scores.csv"))
+    };
+    let rows = eval();
+    assert_eq!(rows.len(), 4 * 3, "frames, and the methods noisy, demc-s and demc-s:temporal");
+    for (model, arguments) in [("demc-s", &[][..]), ("demc-s:temporal", &["--temporal"])] {
+        let folder = dir.path().join(model.replace(':', "_"));
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["denoise", "--model", "demc-s"]).args(arguments).arg("--out").arg(&folder);
+        command.arg(dir.path().join("shot_0004spp.*.exr")).assert().success();
+        let colours = ["R", "G", "B"];
+        let image = |n: i64| planes(&result(&folder, n), "Denoised", &colours);
+        let truth = |n: i64| planes(&reference(n), "Combined", &colours);
+        for n in 1..=4 {
+            let row = rows.iter().find(|row| row["model"] == model && row["scene"].ends_with(&n.to_string()));
+            let told = row.unwrap()["flicker"].parse::<f64>().ok();
+            if n == 1 {
+                assert_eq!(told, None, "nothing comes before the first frame");
+                continue;
+            }
+            let vectors = planes(&named(&dir, n), "Vector", &["X", "Y", "Z", "W"]);
+            let (images, references) = ([image(n), image(n - 1)], [truth(n), truth(n - 1)]);
+            let pair =
+                Pair { images: images.each_ref(), references: references.each_ref(), vectors: &vectors };
+            let expected = flicker(&pair).unwrap();
+            assert!((told.unwrap() / expected - 1.0).abs() < 1e-4, "{model}, {n}: {told:?}, {expected}");
+        }
+    }
+    let path = out.join("scores.csv");
+    let text = fs::read_to_string(&path).unwrap();
+    let kept: Vec<&str> = text.lines().filter(|line| !line.starts_with("shot.0003,demc-s")).collect();
+    fs::write(&path, kept.join("\n") + "\n").unwrap();
+    let again = eval();
+    for (before, after) in rows.iter().zip(&again) {
+        assert_eq!(before["flicker"], after["flicker"], "{before:?}");
+    }
+    let page = fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(page.contains("class=\"stepper\"") && page.contains("demc-s:temporal"));
+    assert!(out.join("slices/shot_0004spp.png").is_file() && out.join("bars_flicker.svg").is_file());
 }
 
 #[test]
