@@ -17,7 +17,7 @@ use crate::{
 #[command(after_help = "\
 Examples:
   demc eval --test-set pairs --models demc-s,demc-m --out scores
-  demc eval --test-set shots --models demc-m,oidn-high --temporal --out flicker")]
+  demc eval --test-set pairs --models demc-m --temporal --out scores")]
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,

@@ -46,7 +46,7 @@ fn trials() -> String {
          fails where its RelMSE is above the input's, or its light off by 2% more than the input's.\n\
          Half buffers beside a frame are not used: nfor works on the frame alone.\n\n\
          Examples:\n  demc stability --test-set pairs --models demc-s --out stability\n  \
-         demc stability --test-set hard/manifest.csv --models demc-m,oidn-high --trials as-rendered --out hard_map",
+         demc stability --test-set pairs --models demc-m --trials as-rendered --out scenes",
         lines.concat()
     )
 }
