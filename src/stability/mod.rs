@@ -50,7 +50,7 @@ pub struct Row {
     pub ssim: Option<f64>,
     /// The sum of all values over the reference's; none where that is not positive.
     pub energy: Option<f64>,
-    /// The same over that of the frame as rendered.
+    /// RelMSE over that of the frame as rendered.
     pub ratio: Option<f64>,
     /// RelMSE between this result and that for the frame as rendered.
     pub deviation: Option<f64>,
@@ -168,12 +168,18 @@ pub fn run(
         &out.join("stability_scenes.csv"),
         to_csv(&content::COLUMNS, cases.iter().map(Case::cells)).as_bytes(),
     )?;
-    show(pairs, methods, options, &rows, &cases)?;
+    show(pairs, methods, options, &summary, &cases)?;
     Ok((rows, cases))
 }
 
 /// Draws the maps, and the worst scenes with pictures.
-fn show(pairs: &[Pair], methods: &[Method], options: &Options, rows: &[Row], cases: &[Case]) -> Result<()> {
+fn show(
+    pairs: &[Pair],
+    methods: &[Method],
+    options: &Options,
+    summary: &[Summary],
+    cases: &[Case],
+) -> Result<()> {
     let names: Vec<String> = methods.iter().map(|method| method.name.clone()).collect();
     let mut maps = Vec::new();
     if !cases.is_empty() {
@@ -188,7 +194,7 @@ fn show(pairs: &[Pair], methods: &[Method], options: &Options, rows: &[Row], cas
         maps.push(("Scenes, beside the baseline", map, "map_baseline"));
     }
     if options.trials.iter().any(|trial| *trial != Trial::AsRendered) {
-        let map = map_of_trials(names.clone(), &options.trials, &summarise(rows, methods, &options.trials));
+        let map = map_of_trials(names.clone(), &options.trials, summary);
         maps.push(("Inputs gone wrong", map, "map_trials"));
     }
     let maps = maps.into_iter().map(|(title, map, name)| Ok((title, map.write(&options.out, name)?)));
