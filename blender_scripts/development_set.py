@@ -188,15 +188,14 @@ class Table(Ledger):
             seconds=f"{seconds:.1f}",
             noise=noise,
         )
-        self._write_manifest()
+        self._list_pairs()
 
     def sources(self, file):
         """What a reference is the mean of, empty where there is none."""
         return "" if self.missing(file) else self.rows()[file]["noise_seed"]
 
-    def _write_manifest(self):
-        listed = set(self.rows())
-        rows = [["scene", "noisy", "reference", "spp"]]
+    def _list_pairs(self):
+        listed, rows = set(self.rows()), []
         for view in VIEWS:
             pairs = [
                 (
@@ -209,10 +208,7 @@ class Table(Ledger):
             ]
             pairs.append((view.adaptive, view.noisy(*_DEFAULTS), view.adaptive_reference, _DEFAULTS[0]))
             rows += [pair for pair in pairs if {pair[1], pair[2]} <= listed]
-        partial = os.path.join(self.folder, "manifest.tmp")
-        with open(partial, "w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
-        os.replace(partial, os.path.join(self.folder, "manifest.csv"))
+        self.write_manifest(rows)
 
 
 class Studio:
@@ -253,10 +249,7 @@ class Studio:
     def part(self, which):
         """Renders a part of the reference; returns its processor seconds."""
         with Edits() as edits:
-            edits.set(self.scene.render.image_settings, "color_depth", "32")
-            rendering.combined_only(edits, self.layers)
-            for layer in self.layers:
-                edits.set(layer.cycles, "denoising_store_passes", True)
+            rendering.reference_passes(edits, self.scene, self.layers)
             seed = rendering.mixed_seed(self.view.seed, self.view.name, "reference", which)
             rendering.set_sampling(edits, self.scene, _PART_MOST, seed, _PART_NOISE, _PART_LEAST)
             channels, seconds = self._render()
@@ -264,13 +257,7 @@ class Studio:
         return seconds
 
     def _render(self):
-        partial = os.path.join(self.folder, f"{self.view.name}.tmp")
-        start = time.process_time()
-        rendering.render_to(self.scene, partial)
-        seconds = time.process_time() - start
-        channels = exr.read(partial)
-        os.remove(partial)
-        return channels, seconds
+        return rendering.render_channels(self.scene, os.path.join(self.folder, f"{self.view.name}.tmp"))
 
 
 def join(table, view, parts):

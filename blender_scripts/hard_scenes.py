@@ -18,7 +18,6 @@ samples asked for are others.
 """
 
 import argparse
-import csv
 import os
 import sys
 import time
@@ -117,7 +116,7 @@ class Table(Ledger):
             noise=noise,
         )
 
-    def write_manifest(self):
+    def list_pairs(self):
         """Lists every noisy frame whose scene has its reference."""
         exists = lambda row: os.path.exists(os.path.join(self.folder, row["file"]))
         there = list(filter(exists, self.rows().values()))
@@ -127,15 +126,12 @@ class Table(Ledger):
         noisy.sort(
             key=lambda row: (cases.index(row["kind"]), row["view"], int(row["spp"]), int(row["noise_seed"]))
         )
-        rows = [["scene", "noisy", "reference", "spp"]]
+        pairs = []
         for row in noisy:
             reference = references[row["view"]]
             if row["frame"] == reference["frame"]:
-                rows.append([row["view"], row["file"], reference["file"], row["spp"]])
-        partial = os.path.join(self.folder, "manifest.tmp")
-        with open(partial, "w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
-        os.replace(partial, os.path.join(self.folder, "manifest.csv"))
+                pairs.append([row["view"], row["file"], reference["file"], row["spp"]])
+        self.write_manifest(pairs)
 
 
 def _frame(pair):
@@ -172,10 +168,7 @@ class Studio:
     def part(self, which):
         """Renders a part of the reference; returns its processor seconds."""
         with Edits() as edits:
-            edits.set(self.scene.render.image_settings, "color_depth", "32")
-            rendering.combined_only(edits, self.layers)
-            for layer in self.layers:
-                edits.set(layer.cycles, "denoising_store_passes", True)
+            rendering.reference_passes(edits, self.scene, self.layers)
             seed = rendering.mixed_seed(self.pair.case, "reference", which)
             most = self.options.ref_spp
             rendering.set_sampling(edits, self.scene, most, seed, _PART_NOISE, min(_PART_LEAST, most))
@@ -184,13 +177,7 @@ class Studio:
         return seconds
 
     def _render(self):
-        partial = os.path.join(self.options.out, f"{self.pair.name}.tmp")
-        start = time.process_time()
-        rendering.render_to(self.scene, partial)
-        seconds = time.process_time() - start
-        channels = exr.read(partial)
-        os.remove(partial)
-        return channels, seconds
+        return rendering.render_channels(self.scene, os.path.join(self.options.out, f"{self.pair.name}.tmp"))
 
 
 def join(table, pair, spp):
@@ -224,7 +211,7 @@ def render_pair(options, table, pair):
     joined = ""
     if lacking or table.lacks(pair, pair.reference, options.ref_spp * len(_PARTS)):
         joined = f", noise {join(table, pair, options.ref_spp):.2g} left in the reference"
-    table.write_manifest()
+    table.list_pairs()
     if not (frames or joined):
         return None
     seconds = time.process_time() - start

@@ -49,6 +49,13 @@ class Ledger:
         with open(self.path, "a", encoding="utf-8", newline="") as file:
             file.write(("" if file.tell() else ",".join(COLUMNS) + "\n") + line)
 
+    def write_manifest(self, pairs):
+        """Replaces manifest.csv by these pairs: scene, noisy file, reference, samples."""
+        partial = os.path.join(self.folder, "manifest.tmp")
+        with open(partial, "w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([("scene", "noisy", "reference", "spp"), *pairs])
+        os.replace(partial, os.path.join(self.folder, "manifest.csv"))
+
     def check(self):
         """Compares the files with their hashes; prints a line for each that is missing or differs, and
         returns how many those are."""

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import time
 
 import bpy
 
@@ -182,6 +183,23 @@ def render_to(scene, path, layer=None, attributes=None):
         scene.render.filepath = old
         if os.path.exists(temporary):
             os.remove(temporary)
+
+
+def render_channels(scene, partial):
+    """Renders by way of the file `partial`, which is gone afterwards; returns channels and processor seconds."""
+    start = time.process_time()
+    render_to(scene, partial)
+    seconds = time.process_time() - start
+    channels = exr.read(partial)
+    os.remove(partial)
+    return channels, seconds
+
+
+def reference_passes(edits, scene, layers):
+    """Combined and the denoising guides alone, as 32-bit floats: what a part of a reference holds."""
+    edits.set(scene.render.image_settings, "color_depth", "32")
+    combined_only(edits, layers)
+    store_guides(edits, layers)
 
 
 def mixed_seed(*parts):

@@ -82,9 +82,7 @@ impl Args {
         }
         Ok(methods)
     }
-}
 
-impl Args {
     /// Those of the methods asked for that are this project's own, each with so many frames before and after.
     ///
     /// # Errors

@@ -27,20 +27,6 @@ impl Temporal {
         let optional = model.optional_passes().iter().copied().chain(wanted).collect();
         Self { name: format!("{}{SUFFIX}", model.name()), model, reach, optional }
     }
-
-    fn run(&self, shot: &Shot) -> Result<(Planes, Report)> {
-        let mut report = Report::default();
-        let mut window = Window::new(self.reach);
-        let reach = self.reach as i32;
-        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
-            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
-        }
-        let mut own = Shot::new(shot.passes.clone());
-        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
-        window.enter_shot(0, own, &*self.model);
-        let image = window.denoise_shot(0, &*self.model, &Options::default(), &mut report)?;
-        Ok((image, report))
-    }
 }
 
 impl Denoiser for Temporal {
@@ -69,7 +55,15 @@ impl Denoiser for Temporal {
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
-        self.run(shot).map(|(image, _)| image)
+        let mut window = Window::new(self.reach);
+        let reach = self.reach as i32;
+        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
+            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
+        }
+        let mut own = Shot::new(shot.passes.clone());
+        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
+        window.enter_shot(0, own, &*self.model);
+        window.denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
     }
 
     fn is_warm(&self) -> bool {

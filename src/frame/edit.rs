@@ -22,6 +22,7 @@ use rayon::prelude::*;
 use super::{
     Frame, SampleKind, Stored, StoredChunk,
     bytes::Bytes,
+    chroma,
     decode::row_bytes,
     header::{Attributes, write_tiles},
     zip,
@@ -200,7 +201,7 @@ impl Frame {
             _ => false,
         };
         // Blocks that hold halved chroma are kept as they are: what is added gets a part of its own.
-        let is_subsampled = self.parts[part].channels.iter().any(|c| c.subsampled);
+        let is_subsampled = chroma::is_subsampled(&self.stored[part].layout);
         self.is_multi_part() || is_subsampled || of_its_own(&self.parts[part])
     }
 
@@ -254,7 +255,7 @@ impl Frame {
     /// Adds channels to a part, or replaces those of the same name.
     fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
         self.refuse_undecodable(part)?;
-        if self.parts[part].channels.iter().any(|c| c.subsampled) {
+        if chroma::is_subsampled(&self.stored[part].layout) {
             let why = "holds luminance and chroma, which no colours can replace; leave out --replace, and they are added";
             return Err(Error::invalid(&self.path, why));
         }

@@ -65,14 +65,17 @@ impl Attributes {
 
     /// A matrix of four rows and columns, by rows.
     pub fn matrix(&self, name: &str) -> Option<[f32; 16]> {
-        let numbers = self.value(name, "m44f")?.as_chunks::<4>().0;
-        let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-        numbers.try_into().ok()
+        self.floats(name, "m44f")
     }
 
     /// x and y of red, green, blue and white.
     pub fn chromaticities(&self) -> Option<[f32; 8]> {
-        let numbers = self.value("chromaticities", "chromaticities")?.as_chunks::<4>().0;
+        self.floats("chromaticities", "chromaticities")
+    }
+
+    /// The numbers of an attribute that has so many.
+    fn floats<const N: usize>(&self, name: &str, kind: &str) -> Option<[f32; N]> {
+        let numbers = self.value(name, kind)?.as_chunks::<4>().0;
         let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
         numbers.try_into().ok()
     }

@@ -58,7 +58,7 @@ impl<'a> Followed<'a> {
 }
 
 /// Whether a pair is the frame after another, at the same sample count.
-fn is_next(pair: &Pair, before: &Pair) -> bool {
+pub fn is_next(pair: &Pair, before: &Pair) -> bool {
     let is_same = (&pair.scene, pair.spp) == (&before.scene, before.spp);
     is_same && follows(&pair.noisy, &before.noisy)
 }

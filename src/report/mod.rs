@@ -38,9 +38,9 @@ pub use loss::loss_chart;
 pub(crate) use page::{document, picture_of};
 pub use palette::is_own;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
-pub use run::{Event, Loaded, evaluate, load, load_listed};
+pub use run::{Event, Loaded, evaluate, load, load_listed, sheet_name};
 pub use settings::file_stamp;
-pub use summary::{Method as MethodSummary, geometric_mean, summarise};
+pub use summary::{Method as MethodSummary, geometric_mean, mean, summarise};
 
 use crate::models::Denoiser;
 

@@ -71,7 +71,11 @@ pub fn small(path: &Path) -> Result<Picture> {
     Ok(Picture { address: address(&jpeg), size: (small.width(), small.height()) })
 }
 
-fn open(path: &Path) -> Result<DynamicImage> {
+/// A picture from disk.
+///
+/// # Errors
+/// The file is unreadable.
+pub fn open(path: &Path) -> Result<DynamicImage> {
     ImageReader::open(path)
         .map_err(Error::io("read", path))?
         .decode()

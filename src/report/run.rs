@@ -181,7 +181,7 @@ pub fn evaluate(
 }
 
 /// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
-fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
+pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
     let id = pair.id().replace(['/', '\\'], "_");
     match twins.iter().position(|p| *p == pair) {

@@ -5,17 +5,17 @@
 
 use std::path::{Path, PathBuf};
 
-use image::{ImageReader, Rgb, RgbImage, imageops};
+use image::{RgbImage, imageops};
 use maud::{Markup, html};
-use plotters::prelude::RGBColor;
 
 use super::{
     canvas::{Anchor, Style, draw_on, write_png},
+    followed::is_next,
     page::picture_of,
     picture,
-    sheet::Shown,
+    sheet::{BACKGROUND, Shown, TEXT},
 };
-use crate::{Error, Result, denoise::follows, frame::prepare_folder, planes::Planes, testset::Pair};
+use crate::{Result, frame::prepare_folder, planes::Planes, testset::Pair};
 
 /// Name of the reference among the methods.
 const REFERENCE: &str = "reference";
@@ -23,8 +23,6 @@ const REFERENCE: &str = "reference";
 const ROW: u32 = 10;
 /// Height of a strip's name.
 const NAME: u32 = 22;
-const BACKGROUND: Rgb<u8> = Rgb([24, 24, 27]);
-const TEXT: RGBColor = RGBColor(235, 235, 235);
 /// Bytes that all frames to step through may take in a page.
 const MOST_BYTES: usize = 6_000_000;
 
@@ -39,8 +37,7 @@ pub fn sequences(pairs: &[Pair]) -> Vec<Sequence<'_>> {
     let mut found: Vec<Sequence<'_>> = Vec::new();
     for pair in pairs.iter().filter(|pair| pair.frame.is_some()) {
         let goes_on = |sequence: &&mut Sequence<'_>| {
-            let last = sequence.pairs.last().expect("it begins with a frame");
-            (&last.scene, last.spp) == (&pair.scene, pair.spp) && follows(&pair.noisy, &last.noisy)
+            is_next(pair, sequence.pairs.last().expect("it begins with a frame"))
         };
         match found.iter_mut().find(goes_on) {
             Some(sequence) => sequence.pairs.push(pair),
@@ -128,10 +125,7 @@ fn stack(strips: &[(&str, Vec<RgbImage>)], (width, height): (u32, u32)) -> Resul
 }
 
 fn read(path: &Path) -> Result<RgbImage> {
-    let image = ImageReader::open(path).map_err(Error::io("read", path))?;
-    let image =
-        image.decode().map_err(|e| Error::invalid(path, format!("{e}; run again with --overwrite")))?;
-    Ok(image.to_rgb8())
+    picture::open(path).map(|image| image.to_rgb8())
 }
 
 /// What the page shows of all sequences; nothing where there are none.

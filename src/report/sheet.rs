@@ -51,8 +51,9 @@ const ERROR_COLOURS: [[u8; 3]; 9] = [
     [249, 201, 50],
     [252, 255, 164],
 ];
-const BACKGROUND: Rgb<u8> = Rgb([24, 24, 27]);
-const TEXT: RGBColor = RGBColor(235, 235, 235);
+/// What lies between pictures, and text on it.
+pub const BACKGROUND: Rgb<u8> = Rgb([24, 24, 27]);
+pub const TEXT: RGBColor = RGBColor(235, 235, 235);
 const FAINT: RGBColor = RGBColor(165, 165, 170);
 
 /// An image as a sheet needs it.

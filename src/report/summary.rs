@@ -140,7 +140,8 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
         .collect()
 }
 
-fn mean(values: &[f64]) -> Option<f64> {
+/// The arithmetic mean; none of nothing.
+pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 

@@ -12,7 +12,7 @@ use std::{
 };
 
 use super::{Row, Trial};
-use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean};
+use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean};
 
 /// How far the energy of a result may be from one, beside how far its input's is.
 const ENERGY: f64 = 0.02;
@@ -184,10 +184,6 @@ pub fn map(title: String, methods: &[String], cases: &[Case], value: fn(&Case) -
         groups: counts.iter().map(|spp| format!("{spp} spp")).collect(),
         rows: scenes.iter().map(row).collect(),
     }
-}
-
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 fn spread(values: &[f64]) -> Option<f64> {

@@ -7,7 +7,7 @@ use maud::{PreEscaped, html};
 use super::content::Case;
 use crate::{
     Result,
-    report::{document, picture_of, write_file},
+    report::{document, picture_of, sheet_name, write_file},
     testset::Pair,
 };
 
@@ -20,7 +20,7 @@ pub fn write(out: &Path, maps: &[(&str, String)], cases: &[Case], worst: &[Pair]
     let failed: Vec<&Case> = cases.iter().filter(|case| case.passes() == Some(false)).collect();
     let mut pictures = Vec::new();
     for pair in worst {
-        let sheet = out.join("worst/sheets").join(format!("{}.png", pair.id()));
+        let sheet = out.join("worst/sheets").join(sheet_name(worst, pair));
         if sheet.is_file() {
             pictures.push((pair, picture_of(&sheet, worst.len(), &pair.label())?));
         }
