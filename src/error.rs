@@ -79,26 +79,13 @@ impl fmt::Display for Error {
                     "" => "the file, which has no view layers,".into(),
                     name => format!("view layer '{name}'"),
                 };
-                let mut settings: Vec<String> = passes.iter().map(|pass| renderer.setting(*pass)).collect();
-                settings.dedup();
                 write!(
                     f,
                     "{}: {layer} has no {} {noun}, which {needed_by} needs; {}",
                     path.display(),
                     names.join(", "),
-                    settings.join("; ")
-                )?;
-                if !view_layer.is_empty() {
-                    return Ok(());
-                }
-                // Nothing tells of what program a file is that names nothing.
-                let multilayer = if renderer.is_blender() { "; save as OpenEXR MultiLayer" } else { "" };
-                let guides = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
-                let elsewhere = match passes.iter().all(|pass| guides.contains(pass)) {
-                    true => "; or say where they are: --map albedo=NAME, --albedo FILE, --normal FILE",
-                    false => "; or say what they are called: --map PASS=NAME",
-                };
-                write!(f, "{multilayer}{elsewhere}")
+                    remedy(view_layer, renderer, passes)
+                )
             }
             Self::Usage(message) => f.write_str(message),
             Self::Interrupted => f.write_str("interrupted"),
@@ -107,6 +94,24 @@ impl fmt::Display for Error {
             }
         }
     }
+}
+
+/// What to do about passes that a view layer of a renderer's file lacks.
+pub fn remedy(view_layer: &str, renderer: &Renderer, passes: &[Pass]) -> String {
+    let mut settings: Vec<String> = passes.iter().map(|pass| renderer.setting(*pass)).collect();
+    settings.dedup();
+    let settings = settings.join("; ");
+    if !view_layer.is_empty() {
+        return settings;
+    }
+    // Nothing tells of what program a file is that names nothing.
+    let multilayer = if renderer.is_blender() { "; save as OpenEXR MultiLayer" } else { "" };
+    let guides = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+    let elsewhere = match passes.iter().all(|pass| guides.contains(pass)) {
+        true => "; or say where they are: --map albedo=NAME, --albedo FILE, --normal FILE",
+        false => "; or say what they are called: --map PASS=NAME",
+    };
+    format!("{settings}{multilayer}{elsewhere}")
 }
 
 impl std::error::Error for Error {

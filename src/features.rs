@@ -10,6 +10,7 @@ mod fireflies;
 mod kpcn;
 mod lbf;
 mod shading;
+mod stand_in;
 
 pub use black::keep_black;
 pub use fireflies::{FIREFLY, tame_alike, tame_fireflies};
@@ -19,6 +20,7 @@ pub use kpcn::{
 };
 pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
 pub use shading::Shading;
+pub use stand_in::{lacking, stand_in, with_stand_ins};
 
 use std::ops::Range;
 

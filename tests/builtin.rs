@@ -129,6 +129,44 @@ fn edit(set: &mut PassSet, pass: Pass, change: impl FnOnce(&mut [f32])) {
     set.insert(pass, planes);
 }
 
+/// What is missing is said with its remedy; what is blank holds no more; either guide makes the result better.
+#[test]
+fn guides_may_be_missing() {
+    let all = passes::load(example("house_0004spp.exr"), None).unwrap();
+    let reference = passes::load(example("house_ref.exr"), None).unwrap();
+    let reference = reference.get(Pass::Combined).unwrap();
+    let without = |missing: &[Pass]| {
+        let mut fewer = all.clone();
+        missing.iter().for_each(|pass| drop(fewer.remove(*pass)));
+        let job = Job::new(&fewer);
+        let said = job.command().assert().success().get_output().stderr.clone();
+        (job.denoised(), String::from_utf8(said).unwrap())
+    };
+    let off = |image: &Planes| metrics::error::relmse(image, reference);
+    let noisy = off(all.get(Pass::Combined).unwrap());
+    let (image, said) = without(&features::PREFILTERED_PASSES);
+    assert!(said.contains("done without Denoising Albedo and Denoising Normal"), "{said}");
+    assert!(said.contains("Passes > Data > Denoising Data"), "{said}");
+    let neither = off(&image);
+    let both = off(&denoise(&all));
+    let mut blank = all.clone();
+    for pass in features::PREFILTERED_PASSES {
+        blank.insert(pass, Planes::new(3, all.width, all.height));
+    }
+    let job = Job::new(&blank);
+    job.command().assert().success();
+    assert_eq!(job.denoised(), image, "blank guides are as good as none");
+    for (pass, kept) in [(Pass::DenoisingAlbedo, "Normal"), (Pass::DenoisingNormal, "Albedo")] {
+        let (image, said) = without(&[pass]);
+        assert!(said.contains(&format!("done without {pass},")), "{said}");
+        let one = off(&image);
+        assert!(
+            both < one && one < neither && neither < 0.2 * noisy,
+            "{kept}: {both} {one} {neither} {noisy}"
+        );
+    }
+}
+
 #[test]
 fn the_readme_s_command_denoises_and_keeps_every_layer() {
     let dir = tempfile::tempdir().unwrap();

@@ -369,6 +369,7 @@ fn facts() -> Facts {
         lr: (1.0, 1.0),
         loss: "both".into(),
         raw_references: false,
+        guide_dropout: 0.0,
         optimizer: "adam".into(),
         weight_decay: 0.0,
         precision: None,

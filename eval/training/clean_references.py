@@ -2,9 +2,11 @@
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
-Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with the albedo and normal of the
-scene's noisy frame as guides, denoised first, and keeps what it was as Noisy Image. Noisy frames are
-copied as they are. What is there already is kept.
+Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with its own albedo and normal as
+guides, or those of the scene's noisy frame where it has none, denoised first, and keeps what it was as Noisy
+Image. Noisy frames are copied as they are. What is there already is kept. With --join N, the reference is first
+averaged with the scene's frame of N samples, for references that have as many: that frame is then no longer
+one of the pairs, since a network would learn to keep the noise that both share.
 """
 
 import argparse
@@ -88,24 +90,35 @@ def clean(oidn, folder, radiance, frame):
     return denoise(oidn, folder, "clean", "--clean_aux", **{"--hdr": radiance}, **guides)
 
 
+def joined(noisy, samples):
+    """Of a scene's noisy frames, those to copy, and those of so many samples."""
+    is_joined = lambda path: samples is not None and re.search(rf"_0*{samples}spp\b", os.path.basename(path))
+    return [path for path in noisy if not is_joined(path)], [path for path in noisy if is_joined(path)]
+
+
 def main():
     """Entry point of the script."""
     parser = argparse.ArgumentParser(prog="clean_references.py", description="Denoises the references of a folder of pairs.")
     parser.add_argument("pairs", help="folder of <scene>_<spp>spp.exr and <scene>_ref.exr")
     parser.add_argument("out", help="folder for the pairs with clean references")
     parser.add_argument("--oidn", default=os.environ.get("OIDN_DENOISE", "oidnDenoise"), help="the program oidnDenoise")
+    parser.add_argument("--join", type=int, metavar="N", help="average references with the frames of N samples")
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for scene, source, noisy in pairs(options.pairs):
             target = os.path.join(options.out, os.path.basename(source))
-            if os.path.exists(target) or not noisy:
+            if os.path.exists(target) or not joined(noisy, options.join)[0]:
                 continue
+            noisy, others = joined(noisy, options.join)
             for path in noisy:
                 shutil.copy(path, options.out)
             channels = exr.read(source)
             reference, names = planes(channels, "Combined", "RGB")
-            cleaned = clean(options.oidn, folder, reference, exr.read(noisy[0]))
+            renders = [reference, *(planes(exr.read(path), "Combined", "RGB")[0] for path in others)]
+            reference = np.mean(renders, axis=0)
+            has_guides = any(name.endswith("Denoising Albedo.R") for name in channels)
+            cleaned = clean(options.oidn, folder, reference, channels if has_guides else exr.read(noisy[0]))
             for c, name in enumerate(names):
                 channels.update({name: cleaned[..., c], name.replace("Combined", "Noisy Image"): reference[..., c]})
             exr.write_half(target, channels)

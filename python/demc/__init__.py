@@ -43,7 +43,7 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
 
     color: noisy linear radiance (Combined), shape (H, W, 3), float32 or float16.
     albedo, normal: Cycles' Denoising Albedo (0 to 1) and Denoising Normal (-1 to 1, camera space), of the same
-        shape, float32 or float16. The built-in networks need both.
+        shape, float32 or float16. The built-in networks do without either, at a loss of detail.
     model: a name that `demc models` lists, or a weights file.
     samples: samples per pixel of the render. Some models decide by it how much they trust a pixel; files tell it
         in their metadata, arrays cannot.

@@ -118,7 +118,8 @@ fn argument(pass: Pass) -> Option<&'static str> {
 
 /// Whether the arrays that are there do for the model.
 fn check_passes(model: &dyn Denoiser, set: &PassSet) -> demc::Result<()> {
-    let missing: Vec<Pass> = model.passes().iter().copied().filter(|pass| set.get(*pass).is_none()).collect();
+    let needed = model.passes().iter().filter(|pass| !model.dispensable().contains(pass));
+    let missing: Vec<Pass> = needed.copied().filter(|pass| set.get(*pass).is_none()).collect();
     let name = model.name();
     if let Some(pass) = missing.iter().find(|pass| argument(**pass).is_none()) {
         return Err(Failure::Usage(format!(

@@ -99,6 +99,13 @@ class Package(unittest.TestCase):
         self.assertEqual(demc.compare(ROOM, REFERENCE), said)
         self.assertGreater(said["relmse"], 0)
 
+    def test_guides_may_be_left_out(self):
+        color, albedo, normal, _ = self.arrays()
+        alike = lambda *guides: demc.denoise(color, *guides, model="demc-s")
+        # What is blank holds as little as what is not there.
+        np.testing.assert_array_equal(alike(), alike(np.zeros_like(albedo), np.zeros_like(normal)))
+        self.assertFalse(np.array_equal(alike(albedo), alike()))
+
     def test_what_is_wrong_is_said(self):
         color, albedo, normal, _ = self.arrays()
         for words, arguments in [
@@ -106,7 +113,7 @@ class Package(unittest.TestCase):
             ("float64; give float32", (color.astype(np.float64),)),
             ("is a list", ([1.0],)),
             ("arrays of one render", (color, albedo[:-1], normal)),
-            ("needs normal and albedo", (color,)),
+            ("demc needs the pass Normal", (color, albedo, normal, "demc")),
             ("no model 'nosuch'", (color, albedo, normal, "nosuch")),
         ]:
             with self.subTest(words), self.assertRaisesRegex(ValueError, words):

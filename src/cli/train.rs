@@ -65,6 +65,9 @@ pub struct Args {
     /// where they hold that (generate_scenes.py --denoise-references)
     #[arg(long)]
     raw_references: bool,
+    /// Share of the crops that lack guides: the albedo, the normal, or both, so that a network learns to do without
+    #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
+    guide_dropout: f64,
     /// How gradients become updates: adam, or muon, which needs fewer steps
     #[arg(long, default_value = "adam", value_parser = parse_rule)]
     optimizer: Rule,
@@ -100,7 +103,7 @@ pub struct Args {
     /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for more steps, edit
     /// them there
     #[arg(long, conflicts_with_all = [
-        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "optimizer",
+        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "optimizer",
         "weight_decay", "precision", "average", "val", "every", "seed", "init", "only", "prefilter",
     ])]
     resume: bool,
@@ -118,6 +121,11 @@ fn parse_rates(text: &str) -> Result<(f64, f64), String> {
         Some((first, last)) if first > 0.0 && last > 0.0 => Ok((first, last)),
         _ => Err("expected FIRST:LAST, two positive numbers such as 1e-4:5e-6".into()),
     }
+}
+
+fn parse_share(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| "expected a share from 0 to 1".into())
 }
 
 /// The one of `all` that is called `text`.
@@ -252,6 +260,7 @@ impl Args {
             lr: self.lr,
             loss: self.loss,
             raw_references: self.raw_references,
+            guide_dropout: self.guide_dropout,
             optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest_trained),
             weight_decay: self.weight_decay,

@@ -183,7 +183,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
             );
         }
         // Before any work: a missing pass is the user's commonest mistake.
-        shot.passes.require_all(needed.iter().copied(), model.name())?;
+        model.check(&shot.passes)?;
         if model.reads_halves() {
             shot.read_halves()?;
         }
@@ -263,7 +263,7 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
 /// # Errors
 /// A pass is missing, or the model cannot denoise the frame.
 pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Planes> {
-    shot.passes.require_all(model.passes().iter().copied(), model.name())?;
+    model.check(&shot.passes)?;
     let mut report = Report::default();
     rayon::scope(|_| {
         let radiance = run(shot, &mut [], model, options, &mut report)?;

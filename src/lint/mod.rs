@@ -91,7 +91,7 @@ const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 
 fn missing(renderer: &Renderer, about: &About, findings: &mut Vec<Finding>) {
     for pass in &about.missing {
-        let message = format!("{pass} is missing, which {} needs", about.model);
+        let message = format!("{pass} is missing, without which {} loses detail", about.model);
         findings.push(Finding::new("missing-pass", message, renderer.setting(*pass)));
     }
 }

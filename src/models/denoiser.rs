@@ -2,7 +2,13 @@
 
 use std::time::Instant;
 
-use crate::{Error, Result, companion::Companion, passes::Pass, planes::Planes, shot::Shot};
+use crate::{
+    Error, Result,
+    companion::Companion,
+    passes::{Pass, PassSet},
+    planes::Planes,
+    shot::Shot,
+};
 
 /// One way to remove noise from a frame.
 pub trait Denoiser: Send + Sync {
@@ -11,6 +17,20 @@ pub trait Denoiser: Send + Sync {
 
     /// The passes it needs.
     fn passes(&self) -> &[Pass];
+
+    /// Those of them that it can do without, at a price that [`Denoiser::notes`] tells.
+    fn dispensable(&self) -> &[Pass] {
+        &[]
+    }
+
+    /// Whether a frame has the passes that it cannot do without.
+    ///
+    /// # Errors
+    /// Some are missing: all of those are named, each with its remedy.
+    fn check(&self, passes: &PassSet) -> Result<()> {
+        let needed = self.passes().iter().copied().filter(|pass| !self.dispensable().contains(pass));
+        passes.require_all(needed, self.name())
+    }
 
     /// Passes it makes use of where a file holds them.
     fn optional_passes(&self) -> &[Pass] {

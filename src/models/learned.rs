@@ -12,7 +12,8 @@ use crate::{
     Error, Result,
     augment::Augment,
     companion::{Companion, Kind},
-    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike},
+    error::remedy,
+    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, lacking, tame_alike, with_stand_ins},
     filters::shrinkage::{Render, shrink, take_back},
     nn::Precision,
     passes::{Pass, PassSet},
@@ -138,8 +139,28 @@ impl Denoiser for Learned {
         self.network.optional_passes()
     }
 
-    fn notes(&self, _: &Shot) -> Option<String> {
-        self.network.notes().map(|note| format!("{}: {note}", self.name))
+    fn dispensable(&self) -> &[Pass] {
+        match self.metadata.network.architecture {
+            Architecture::Pyramid => &PREFILTERED_PASSES,
+            _ => &[],
+        }
+    }
+
+    fn notes(&self, shot: &Shot) -> Option<String> {
+        if let Some(note) = self.network.notes() {
+            return Some(format!("{}: {note}", self.name));
+        }
+        let PassSet { view_layer, renderer, .. } = &shot.passes;
+        let mut missed = lacking(&shot.passes);
+        missed.retain(|pass| self.dispensable().contains(pass));
+        let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
+        (!missed.is_empty()).then(|| {
+            format!(
+                "done without {}, at a loss of detail; {}",
+                names.join(" and "),
+                remedy(view_layer, renderer, &missed)
+            )
+        })
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
@@ -187,6 +208,7 @@ impl Learned {
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
+        let passes = &*with_stand_ins(passes);
         let mut image = self.looks(passes, companions, tile)?;
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;

@@ -11,7 +11,7 @@ use std::{
 };
 
 use super::{Denoiser, Run};
-use crate::{Error, Result, passes::Pass, planes::Planes, shot::Shot};
+use crate::{Error, Result, features::PREFILTERED_PASSES, passes::Pass, planes::Planes, shot::Shot};
 
 /// Names of the methods, fastest first.
 pub const NAMES: [&str; 4] = ["oidn-fast", "oidn-balanced", "oidn-high", "oidn-high-prefilter"];
@@ -19,6 +19,11 @@ pub const NAMES: [&str; 4] = ["oidn-fast", "oidn-balanced", "oidn-high", "oidn-h
 pub const VARIABLE: &str = "OIDN_DENOISE";
 /// The program's name on the search path.
 const PROGRAM: &str = "oidnDenoise";
+/// The guides: option, pass, file as rendered, file once denoised.
+const GUIDES: [(&str, Pass, &str, &str); 2] = [
+    ("--alb", Pass::DenoisingAlbedo, "albedo.pfm", "clean_albedo.pfm"),
+    ("--nrm", Pass::DenoisingNormal, "normal.pfm", "clean_normal.pfm"),
+];
 /// Runs of the filter in one start of the program: the first warms it up, the last is timed.
 const RUNS: usize = 2;
 
@@ -123,6 +128,10 @@ impl Denoiser for Oidn {
         &[Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal]
     }
 
+    fn dispensable(&self) -> &[Pass] {
+        &PREFILTERED_PASSES
+    }
+
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
         Ok(self.denoise_timed(shot)?.image)
     }
@@ -131,36 +140,22 @@ impl Denoiser for Oidn {
         let passes = &shot.passes;
         let temporary = tempfile::tempdir().map_err(Error::io("create", std::env::temp_dir()))?;
         let folder = temporary.path();
-        let inputs = [
-            ("color.pfm", Pass::Combined),
-            ("albedo.pfm", Pass::DenoisingAlbedo),
-            ("normal.pfm", Pass::DenoisingNormal),
-        ];
-        for (file, pass) in inputs {
-            write_pfm(&folder.join(file), passes.require(pass, self.name)?)?;
+        write_pfm(&folder.join("color.pfm"), passes.require(Pass::Combined, self.name)?)?;
+        // A guide that the frame lacks is not given, nor a normal without an albedo, which the program does not take.
+        let mut runs = Vec::new();
+        let mut inputs = vec!["--hdr", "color.pfm"];
+        for (option, pass, noisy, clean) in GUIDES {
+            let Some(planes) = passes.get(pass) else { break };
+            write_pfm(&folder.join(noisy), planes)?;
+            if self.prefilters() {
+                runs.push(self.filter(folder, &[option, noisy], clean)?);
+            }
+            inputs.extend([option, if self.prefilters() { clean } else { noisy }]);
         }
-        let runs = if self.prefilters() {
-            vec![
-                self.filter(folder, &["--alb", "albedo.pfm"], "clean_albedo.pfm")?,
-                self.filter(folder, &["--nrm", "normal.pfm"], "clean_normal.pfm")?,
-                self.filter(
-                    folder,
-                    &[
-                        "--hdr",
-                        "color.pfm",
-                        "--alb",
-                        "clean_albedo.pfm",
-                        "--nrm",
-                        "clean_normal.pfm",
-                        "--clean_aux",
-                    ],
-                    "output.pfm",
-                )?,
-            ]
-        } else {
-            let inputs = ["--hdr", "color.pfm", "--alb", "albedo.pfm", "--nrm", "normal.pfm"];
-            vec![self.filter(folder, &inputs, "output.pfm")?]
-        };
+        if !runs.is_empty() {
+            inputs.push("--clean_aux");
+        }
+        runs.push(self.filter(folder, &inputs, "output.pfm")?);
         let image = read_pfm(&folder.join("output.pfm"))?;
         if (image.width, image.height) != (passes.width, passes.height) {
             return Err(Error::invalid(&self.program, "returned an image of another size"));

@@ -35,6 +35,9 @@ pub struct Facts {
     /// Whether squared errors were against references as they were before they were denoised.
     #[serde(default)]
     pub raw_references: bool,
+    /// Share of the crops that lacked guides.
+    #[serde(default)]
+    pub guide_dropout: f64,
     /// How gradients became updates; files from before there was a choice do not say.
     #[serde(default = "adam")]
     pub optimizer: String,

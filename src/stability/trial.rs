@@ -35,6 +35,12 @@ pub enum Trial {
     BlankAlbedo,
     /// Normals hold nothing.
     BlankNormals,
+    /// The frame has no guides at all.
+    WithoutGuides,
+    /// The frame has no albedo.
+    WithoutAlbedo,
+    /// The frame has no normals.
+    WithoutNormals,
     /// Albedo is any value in 0..1 in each pixel, as of a layer of the wrong name.
     RandomAlbedo,
     /// Albedo is twice as high, above one: of renderers that add coats to it.
@@ -69,7 +75,7 @@ const SHIFT: usize = 2;
 
 impl Trial {
     /// Every trial, the unchanged frame first.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 21] = [
         Self::AsRendered,
         Self::Darker,
         Self::Brighter,
@@ -83,6 +89,9 @@ impl Trial {
         Self::BlankGuides,
         Self::BlankAlbedo,
         Self::BlankNormals,
+        Self::WithoutGuides,
+        Self::WithoutAlbedo,
+        Self::WithoutNormals,
         Self::RandomAlbedo,
         Self::BrightAlbedo,
         Self::SrgbAlbedo,
@@ -106,6 +115,9 @@ impl Trial {
             Self::BlankGuides => "blank-guides",
             Self::BlankAlbedo => "blank-albedo",
             Self::BlankNormals => "blank-normals",
+            Self::WithoutGuides => "without-guides",
+            Self::WithoutAlbedo => "without-albedo",
+            Self::WithoutNormals => "without-normals",
             Self::RandomAlbedo => "random-albedo",
             Self::BrightAlbedo => "bright-albedo",
             Self::SrgbAlbedo => "srgb-albedo",
@@ -130,6 +142,9 @@ impl Trial {
             Self::BlankGuides => "guides hold nothing",
             Self::BlankAlbedo => "albedo holds nothing",
             Self::BlankNormals => "normals hold nothing",
+            Self::WithoutGuides => "there are no guides",
+            Self::WithoutAlbedo => "there is no albedo",
+            Self::WithoutNormals => "there are no normals",
             Self::RandomAlbedo => "albedo is any value in 0..1 in each pixel",
             Self::BrightAlbedo => "albedo is twice as high",
             Self::SrgbAlbedo => "albedo is encoded by the curve of sRGB",
@@ -205,6 +220,9 @@ impl Trial {
             Self::BlankGuides => guides(passes, |_| true, blank),
             Self::BlankAlbedo => guides(passes, is_albedo, blank),
             Self::BlankNormals => guides(passes, is_normal, blank),
+            Self::WithoutGuides => without(passes, |_| true),
+            Self::WithoutAlbedo => without(passes, is_albedo),
+            Self::WithoutNormals => without(passes, is_normal),
             Self::RandomAlbedo => guides(passes, is_albedo, |planes| {
                 let noise = planes.data.iter_mut().enumerate();
                 noise.for_each(|(at, v)| *v = hash(at) as f32 / u32::MAX as f32);
@@ -271,6 +289,15 @@ fn guides(passes: &PassSet, is_it: impl Fn(Pass) -> bool, change: impl Fn(&mut P
     })
 }
 
+/// A frame that lacks those of the passes without radiance that are chosen.
+fn without(passes: &PassSet, is_it: impl Fn(Pass) -> bool) -> PassSet {
+    let mut kept = passes.clone();
+    for (pass, _) in passes.iter().filter(|(pass, _)| !pass.carries_radiance() && is_it(*pass)) {
+        kept.remove(pass);
+    }
+    kept
+}
+
 fn is_albedo(pass: Pass) -> bool {
     pass.quantity() == Quantity::Colour
 }
@@ -329,8 +356,8 @@ mod tests {
             let image = trial.undo(after.get(Pass::Combined).unwrap().clone());
             let same = image == trial.seen(radiance);
             assert_eq!(same, !matches!(trial, Trial::Fireflies | Trial::NonFinite), "{}", trial.name());
-            let albedo = after.get(Pass::DenoisingAlbedo).unwrap();
-            let kept = *albedo == trial.seen(before.get(Pass::DenoisingAlbedo).unwrap());
+            let albedo = after.get(Pass::DenoisingAlbedo);
+            let kept = albedo == Some(&trial.seen(before.get(Pass::DenoisingAlbedo).unwrap()));
             let changed = matches!(
                 trial,
                 Trial::Mirrored
@@ -338,6 +365,8 @@ mod tests {
                     | Trial::ShiftedGuides
                     | Trial::BlankGuides
                     | Trial::BlankAlbedo
+                    | Trial::WithoutGuides
+                    | Trial::WithoutAlbedo
                     | Trial::RandomAlbedo
                     | Trial::BrightAlbedo
                     | Trial::SrgbAlbedo

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::{
     Error, Result,
     augment::Augment,
+    features::{PREFILTERED_PASSES, stand_in},
     frame::HALF_MAX,
     metrics::pairing,
     passes::{self, Pass, PassSet},
@@ -144,8 +145,9 @@ impl Dataset {
     /// often as it is large, one that is too small never. Where there are more renders of it with as many samples, each pixel
     /// comes from one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
     /// and no network gets to learn the noise of those that there are by heart.
+    /// `guide_dropout` is the share of crops that lack guides.
     /// A frame of `side` pixels must be there, as it is for a side from [`Self::draw_side`].
-    pub fn draw(&self, side: usize, rng: &mut Rng) -> Sample {
+    pub fn draw(&self, side: usize, guide_dropout: f64, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
             if drawn.1.side() >= side {
@@ -160,6 +162,7 @@ impl Dataset {
             let other = other.passes(&other.passes, (x, y), (side, side));
             sample.passes = mixed(&sample.passes, &other, rng);
         }
+        drop_guides(&mut sample.passes, guide_dropout, rng);
         let augment = Augment::draw(rng);
         Sample {
             passes: augment.passes(&sample.passes),
@@ -189,6 +192,18 @@ fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     let others =
         |(index, frame)| groups[&key(frame)].iter().copied().filter(|other| *other != index).collect();
     frames.iter().enumerate().map(others).collect()
+}
+
+/// Puts what [stands in](stand_in) for them in the place of the albedo, the normal, or both, of a share of crops.
+fn drop_guides(passes: &mut PassSet, share: f64, rng: &mut Rng) {
+    if share == 0.0 || f64::from(rng.uniform()) >= share {
+        return;
+    }
+    let dropped = [&PREFILTERED_PASSES[..1], &PREFILTERED_PASSES[1..], &PREFILTERED_PASSES][rng.below(3)];
+    let size = (passes.width, passes.height);
+    for pass in dropped.iter().filter(|pass| passes.get(**pass).is_some()).copied().collect::<Vec<_>>() {
+        passes.insert(pass, stand_in(pass, size));
+    }
 }
 
 /// Takes each pixel, all passes of it, from either of two crops.
@@ -328,7 +343,7 @@ mod tests {
         let mut rng = Rng::new(1, 0);
         let mut met = BTreeSet::new();
         for _ in 0..64 {
-            let sample = data.draw(8, &mut rng);
+            let sample = data.draw(8, 0.0, &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             let values: BTreeSet<u32> = depth.iter().map(|v| *v as u32).collect();
             // All passes of a pixel come from one render; exposure alone may scale radiance.
@@ -350,7 +365,7 @@ mod tests {
         for _ in 0..400 {
             let side = data.draw_side(16, 8, &mut rng);
             sides[[8, 16].iter().position(|s| *s == side).expect("a multiple of 8")] += 1;
-            let sample = data.draw(side, &mut rng);
+            let sample = data.draw(side, 0.0, &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             assert_eq!(depth.len(), side * side);
             assert!(side == 8 || depth[0] == 2.0, "a frame of 12x12 holds no crop of 16x16");

@@ -9,7 +9,7 @@ use crate::{
     Error, Result,
     models::{
         self,
-        network::{Config, Network},
+        network::{Architecture, Config, Network},
     },
     nn::Precision,
     testset::Pair,
@@ -38,6 +38,9 @@ pub struct Options {
     /// Whether squared errors are against references as they were before they were denoised.
     #[serde(default)]
     pub raw_references: bool,
+    /// Share of the crops that lack albedo, normal, or both, see [`Denoiser::dispensable`](crate::models::Denoiser::dispensable).
+    #[serde(default)]
+    pub guide_dropout: f64,
     /// How gradients become updates.
     #[serde(default)]
     pub optimizer: Rule,
@@ -101,6 +104,13 @@ impl Options {
         if !network.makes_radiance() && self.raw_references {
             let reason = "makes no radiance, of which alone references hold what it was before; leave it out";
             return refuse("raw_references", format!("{name} {reason}"));
+        }
+        if self.guide_dropout > 0.0 && architecture != Architecture::Pyramid {
+            let reason = "cannot do without its guides; leave it out";
+            return refuse("guide_dropout", format!("{name} {reason}"));
+        }
+        if !(0.0..=1.0).contains(&self.guide_dropout) {
+            return refuse("guide_dropout", format!("{}: must be from 0 to 1", self.guide_dropout));
         }
         if !network.makes_radiance() && self.loss.needs_radiance() {
             let reason = "makes no radiance that a display would show; take geomean";

@@ -214,7 +214,8 @@ fn draw(dataset: &Dataset, options: &Options, multiple: usize, step: usize) -> V
     let rng = &mut Rng::new(options.seed, 1 + step as u64);
     let side = dataset.draw_side(options.patch, multiple, rng);
     let (count, seed) = (options.batch * options.patch.pow(2) / side.pow(2), rng.next_u64());
-    (0..count as u64).into_par_iter().map(|crop| dataset.draw(side, &mut Rng::new(seed, crop))).collect()
+    let crop = |crop| dataset.draw(side, options.guide_dropout, &mut Rng::new(seed, crop));
+    (0..count as u64).into_par_iter().map(crop).collect()
 }
 
 /// Steps in which the learning rate grows to its largest, a tenth of all at most: moments are young then.
@@ -320,6 +321,7 @@ fn facts(options: &Options, row: &log::Row) -> Facts {
         lr: options.lr,
         loss: options.loss.to_string(),
         raw_references: options.raw_references,
+        guide_dropout: options.guide_dropout,
         optimizer: options.optimizer.to_string(),
         weight_decay: options.weight_decay,
         precision: Some(options.precision),

@@ -76,31 +76,36 @@ pub struct PassReport {
 #[derive(Serialize)]
 pub struct ModelReport {
     pub model: String,
+    /// Whether it can denoise the layer: what is missing it can do without.
+    pub works: bool,
     pub missing: Vec<Missing>,
 }
 
-#[derive(Serialize, Clone)]
+#[derive(Serialize, Clone, PartialEq)]
 pub struct Missing {
     pub pass: String,
     pub remedy: String,
 }
 
-/// A method and the passes it needs.
+/// A method, the passes it reads, and those of them that it can do without.
 pub struct Method {
     name: String,
     passes: Vec<Pass>,
+    dispensable: Vec<Pass>,
 }
 
 /// The methods there are, with the passes they need: networks with weights, classical methods, peers.
 pub fn methods() -> Vec<Method> {
     let listed = METHODS.iter().filter(|method| method.family != Family::Noisy);
-    let passes = |method: &catalogue::Method| match method.kind {
-        Kind::Fixed(make) => Some(make().passes().to_vec()),
-        // Its weights are not packed, since nothing is denoised here.
-        _ => Some(method.learned().ok()?.passes().to_vec()),
+    let method = |method: &catalogue::Method| {
+        let denoiser: Box<dyn Denoiser> = match method.kind {
+            Kind::Fixed(make) => make(),
+            // Its weights are not packed, since nothing is denoised here.
+            _ => Box::new(method.learned().ok()?),
+        };
+        let (passes, dispensable) = (denoiser.passes().to_vec(), denoiser.dispensable().to_vec());
+        Some(Method { name: method.name.into(), passes, dispensable })
     };
-    let method =
-        |method: &catalogue::Method| Some(Method { name: method.name.into(), passes: passes(method)? });
     listed.filter_map(method).collect()
 }
 
@@ -213,14 +218,14 @@ fn examine_layer(
     }
     passes.extend(others.into_iter().map(describe));
     let has_beauty = decodable.contains(&Pass::Combined);
-    let models = methods.iter().filter(|_| has_beauty).map(|m| ModelReport {
-        model: m.name.clone(),
-        missing: m
-            .passes
-            .iter()
-            .filter(|p| !layer.passes.contains_key(p))
-            .map(|p| Missing { pass: p.to_string(), remedy: layer.renderer.setting(*p) })
-            .collect(),
+    let models = methods.iter().filter(|_| has_beauty).map(|method| {
+        let missing = method.passes.iter().filter(|pass| !layer.passes.contains_key(pass));
+        let described = |p: &Pass| Missing { pass: p.to_string(), remedy: layer.renderer.setting(*p) };
+        ModelReport {
+            model: method.name.clone(),
+            works: missing.clone().all(|pass| method.dispensable.contains(pass)),
+            missing: missing.map(described).collect(),
+        }
     });
     let report = LayerReport {
         name: layer.name.clone(),

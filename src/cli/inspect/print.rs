@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::examine::{FileReport, LayerReport, Missing};
+use super::examine::{FileReport, LayerReport, ModelReport};
 use crate::lint::Finding;
 
 /// The whole report; the caller ends the last line.
@@ -75,24 +75,25 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
 
 /// Models that are ready in one line, then what each of the others misses, those alike together.
 fn write_models(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
-    let mut groups: Vec<(Vec<&str>, &[Missing])> = Vec::new();
+    let mut groups: Vec<(Vec<&str>, &ModelReport)> = Vec::new();
     for model in &layer.models {
-        let alike = |(_, m): &&mut (Vec<&str>, &[Missing])| {
-            m.iter().map(|m| &m.pass).eq(model.missing.iter().map(|m| &m.pass))
+        let alike = |(_, other): &&mut (Vec<&str>, &ModelReport)| {
+            (other.works, &other.missing) == (model.works, &model.missing)
         };
         match groups.iter_mut().find(alike) {
             Some((names, _)) => names.push(&model.model),
-            None => groups.push((vec![&model.model], &model.missing)),
+            None => groups.push((vec![&model.model], model)),
         }
     }
-    groups.sort_by_key(|(_, missing)| missing.len());
-    for (names, missing) in groups {
-        if missing.is_empty() {
-            writeln!(out, "    ready for {}", names.join(", "))?;
-            continue;
+    groups.sort_by_key(|(_, model)| (!model.works, model.missing.len()));
+    for (names, model) in groups {
+        let names = names.join(", ");
+        match (model.works, model.missing.is_empty()) {
+            (_, true) => writeln!(out, "    ready for {names}")?,
+            (true, _) => writeln!(out, "    enough for {names}, which would do better with more:")?,
+            (false, _) => writeln!(out, "    not ready for {names}:")?,
         }
-        writeln!(out, "    not ready for {}:", names.join(", "))?;
-        for m in missing {
+        for m in &model.missing {
             writeln!(out, "      no {}: {}", m.pass, m.remedy)?;
         }
     }
