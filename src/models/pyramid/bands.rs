@@ -8,47 +8,66 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Encoder, Finish, KERNEL, LEVELS, Prediction, Pyramid};
+use super::trunk::{Encoder, Finish, KERNEL, LEVELS, MULTIPLE, Prediction, Trunk};
 use crate::{
     Result,
-    companion::Kind,
-    features::Inputs,
     kernels::{Shape, blend::Place},
-    models::network::Network,
     nn::{Activation, Conv, Line, MaxPool},
     planes::Planes,
 };
 
 type Maps = Activation<NoneTape>;
-type Field = crate::nn::Field<NoneTape>;
+pub type Field = crate::nn::Field<NoneTape>;
+
+/// Images that a trunk's kernels filter: light, or guides.
+pub trait Subject {
+    /// What is read of some rows.
+    type Inputs;
+
+    /// How many images there are.
+    fn images(&self) -> usize;
+
+    /// Takes in the next rows, and returns the encoders' inputs; `images` are those of full resolution.
+    fn push(&mut self, inputs: Self::Inputs, images: &mut [Filtered]) -> [Planes; 2];
+
+    /// Takes in what the head of full resolution says of `rows`, and returns the logits of the gains.
+    fn predicted(&mut self, rows: Range<usize>, finish: Finish<NoneTape>, images: &mut [Filtered]) -> Field;
+
+    /// What becomes of `rows` once their images are filtered, each (3, R, W).
+    fn finish(&self, rows: Range<usize>, filtered: Vec<Field>, gain: Field) -> Vec<Field>;
+
+    /// Lets go of the rows of which everything is `predicted`, and of those that are `finished`.
+    fn forget(&mut self, predicted: usize, finished: usize);
+}
+
+/// Planes as a field.
+pub fn of_planes(planes: Planes) -> Field {
+    Field::from_buffer((1, planes.channels, planes.height, planes.width), planes.data)
+}
 
 /// A frame that comes in band by band and leaves denoised.
-pub struct Feed<'a> {
-    frame: Frame<'a>,
+pub struct Feed<'a, S> {
+    frame: Frame<'a, S>,
     /// Columns and rows of the frame.
     size: (usize, usize),
 }
 
-impl<'a> Feed<'a> {
-    /// A frame of `size` columns and rows, of which no step takes more than `band` rows.
-    pub fn new(network: &'a Pyramid, size: (usize, usize), band: usize, companions: &[Kind]) -> Self {
-        let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band, companions);
-        Self { frame, size }
+impl<'a, S: Subject> Feed<'a, S> {
+    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made for as many rows
+    /// as [`padded`] has.
+    pub fn new(trunk: &'a Trunk, subject: S, size: (usize, usize), band: usize) -> Self {
+        Self { frame: Frame::new(trunk, subject, padded(size.1), band), size }
     }
 
-    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, each (3, R, W), and
-    /// its first row: radiance, in its scale, the normal, what radiance was divided by, and the companions, which come in divided
-    /// alike; of a prefilter albedo and normal, in their scale.
+    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, times `scale`,
+    /// and its first row.
     pub fn push(
         &mut self,
-        Inputs { planes, scale }: Inputs,
-        companions: Vec<Planes>,
+        inputs: S::Inputs,
+        scale: f32,
         done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
     ) -> Result<()> {
         let (width, height) = self.size;
-        // What goes with radiance has none.
-        let others = if self.frame.network.denoises_guides() { scale } else { 1.0 };
-        let scales = || std::iter::once(scale).chain(std::iter::repeat(others));
         let mut result = Ok(());
         let mut hand_out = |first: usize, fields: &[Field]| {
             let (_, _, h, w) = fields[0].extent();
@@ -56,16 +75,16 @@ impl<'a> Feed<'a> {
             if rows == 0 || result.is_err() {
                 return;
             }
-            let part = |(field, scale): (&Field, f32)| {
+            let part = |field: &Field| {
                 let values = field.values();
                 Planes::from_rows(3, (width, rows), |c, y, into| {
                     let from = &values[(c * h + y) * w..];
                     into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
                 })
             };
-            result = done(first, fields.iter().zip(scales()).map(part).collect());
+            result = done(first, fields.iter().map(part).collect());
         };
-        self.frame.push(planes, companions);
+        self.frame.push(inputs);
         self.frame.advance(&mut hand_out);
         while self.frame.is_whole() && !self.frame.is_done() {
             self.frame.advance(&mut hand_out);
@@ -74,9 +93,15 @@ impl<'a> Feed<'a> {
     }
 }
 
+/// The rows that a frame of so many is grown to.
+pub fn padded(rows: usize) -> usize {
+    rows.next_multiple_of(MULTIPLE)
+}
+
 /// All that is under way in a frame.
-struct Frame<'a> {
-    network: &'a Pyramid,
+struct Frame<'a, S> {
+    trunk: &'a Trunk,
+    subject: S,
     /// Rows that one step may take: without it, the last step would take all that is behind.
     band: usize,
     encoders: [Vec<Encoded>; 2],
@@ -84,17 +109,6 @@ struct Frame<'a> {
     decoder: Vec<Decoded>,
     /// Full resolution first.
     scales: Vec<Scale>,
-    albedo: Line<Field>,
-    /// For a refit.
-    normal: Line<Field>,
-    /// What was divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is
-    /// to divide.
-    quotient: Line<Field>,
-    ratio: Line<Field>,
-    /// Companions wait for the same. They are the images of each scale after the first.
-    companions: Vec<(Kind, Line<Field>)>,
-    /// What normals tell of the light, until the network says how far to follow it.
-    shading: Line<Field>,
     /// Logits of the gains, a field for each kernel of full resolution.
     gains: VecDeque<Field>,
 }
@@ -115,7 +129,7 @@ struct Decoded {
 
 /// A level of the pyramid.
 struct Scale {
-    /// What is filtered: radiance and its companions, or albedo and normal.
+    /// What is filtered.
     images: Vec<Filtered>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet blended, and for those not yet filtered.
@@ -126,16 +140,16 @@ struct Scale {
 }
 
 /// A level of an image.
-struct Filtered {
-    image: Line<Field>,
+pub struct Filtered {
+    pub image: Line<Field>,
     /// That blended with the level below.
     blended: Line<Field>,
     /// What the level above takes in.
     smooth: Line<Field>,
 }
 
-impl<'a> Frame<'a> {
-    fn new(network: &'a Pyramid, height: usize, band: usize, companions: &[Kind]) -> Self {
+impl<'a, S: Subject> Frame<'a, S> {
+    fn new(trunk: &'a Trunk, subject: S, height: usize, band: usize) -> Self {
         let rows = |level: usize| height >> (level + 1);
         let encoder = || {
             let level = |l| Encoded {
@@ -152,50 +166,29 @@ impl<'a> Frame<'a> {
             blended: Line::new(height >> s),
             smooth: Line::new(height >> s),
         };
-        let images = if network.denoises_guides() { 2 } else { 1 + companions.len() };
         let scale = |s: usize| Scale {
-            images: (0..images).map(|_| filtered(s)).collect(),
+            images: (0..subject.images()).map(|_| filtered(s)).collect(),
             confidence: Line::new(height >> s),
             masks: VecDeque::new(),
             kernels: VecDeque::new(),
             filtered: 0,
         };
         Self {
-            network,
+            trunk,
             band,
             encoders: [encoder(), encoder()],
             decoder: (0..LEVELS).map(decoded).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
-            albedo: Line::new(height),
-            normal: Line::new(height),
-            quotient: Line::new(height),
-            ratio: Line::new(height),
-            companions: companions.iter().map(|kind| (*kind, Line::new(height))).collect(),
-            shading: Line::new(height),
+            subject,
             gains: VecDeque::new(),
         }
     }
 
     /// Adds the inputs of the next rows.
-    fn push(&mut self, inputs: Vec<Planes>, companions: Vec<Planes>) {
-        let mut inputs = inputs.into_iter();
-        let mut next = || inputs.next().expect("`guides` makes seven planes, `noisy_guides` four");
-        let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
-        let [image, second, radiance, guide] = std::array::from_fn(|_| next());
-        if self.network.denoises_guides() {
-            let images = self.scales[0].images.iter_mut().zip([image, second]);
-            images.for_each(|(filtered, planes)| filtered.image.push(field(planes)));
-        } else {
-            self.quotient.push(field(image));
-            self.albedo.push(field(second));
-            self.ratio.push(field(next()));
-            self.shading.push(field(next()));
-            self.normal.push(field(next()));
-            let lines = self.companions.iter_mut().zip(companions);
-            lines.for_each(|((_, line), planes)| line.push(field(planes)));
-        }
-        let layers = self.network.encoders.iter().map(|encoder| &encoder.levels[0][0]);
-        for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip([radiance, guide]) {
+    fn push(&mut self, inputs: S::Inputs) {
+        let inputs = self.subject.push(inputs, &mut self.scales[0].images);
+        let layers = self.trunk.encoders.iter().map(|encoder| &encoder.levels[0][0]);
+        for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip(inputs) {
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
             encoder[0].input.push(layer.input_halved(shape, &planes.data));
         }
@@ -227,13 +220,13 @@ impl<'a> Frame<'a> {
     /// Both encoders side by side: their layers need not wait for each other.
     fn encode(&mut self) {
         let ([radiance, guide], band) = (&mut self.encoders, self.band);
-        let [of_radiance, of_guide] = &self.network.encoders;
+        let [of_radiance, of_guide] = &self.trunk.encoders;
         rayon::join(|| encode(of_radiance, radiance, band), || encode(of_guide, guide, band));
     }
 
     fn decode(&mut self) {
         // The decoder's layers, coarsest level first; its lines, finest first.
-        for (level, layers) in (0..LEVELS).rev().zip(&self.network.decoder) {
+        for (level, layers) in (0..LEVELS).rev().zip(&self.trunk.decoder) {
             let (finer, coarser) = self.decoder.split_at_mut(level + 1);
             let Decoded { up, fused, refined } = &mut finer[level];
             if let (Some(layer), Some(below)) = (&layers.up, coarser.first()) {
@@ -261,29 +254,17 @@ impl<'a> Frame<'a> {
                 continue;
             }
             let fine = [refined.rows(rows.clone())];
-            let head = self.network.heads[level].forward_planes(&fine, 1);
+            let head = self.trunk.heads[level].forward_planes(&fine, 1);
             let prediction = Prediction::split(KERNEL, |first, count| head.channels(first, count));
             self.scales[level + 1].predicted(rows.clone(), prediction);
             if level == 0 {
-                let head = self.network.full.forward_planes(&fine, 2);
+                let head = self.trunk.full.forward_planes(&fine, 2);
                 let planes = |first, count| head.channels(first, count);
-                let (prediction, Finish { mut gain, refined }) =
-                    Prediction::split_full(self.network.kernel(0), head.extent().1, planes);
+                let (prediction, finish) =
+                    Prediction::split_full(self.trunk.kernel(0), head.extent().1, planes);
                 let rows = 2 * rows.start..2 * rows.end;
-                if let Some((divisor, shade)) = refined {
-                    let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
-                    let (beauty, others) = self.scales[0].images.split_at_mut(1);
-                    for (filtered, (kind, line)) in others.iter_mut().zip(&self.companions) {
-                        let planes = line.rows(rows.clone());
-                        filtered.image.push(match kind {
-                            Kind::Light | Kind::Colour => planes.redivide(ratio.fork(), divisor.fork()),
-                            Kind::Share => planes,
-                        });
-                    }
-                    beauty[0].image.push(quotient.redivide(ratio, divisor));
-                    gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
-                }
-                self.gains.push_back(gain);
+                let images = &mut self.scales[0].images;
+                self.gains.push_back(self.subject.predicted(rows.clone(), finish, images));
                 self.scales[0].predicted(rows, prediction);
             }
         }
@@ -328,7 +309,7 @@ impl<'a> Frame<'a> {
 
     /// Filters the images; at full resolution, hands out what becomes of them.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
-        let reach = self.network.kernel(scale) / 2;
+        let reach = self.trunk.kernel(scale) / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
         while let Some((rows, _)) = kernels.front() {
             let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
@@ -346,28 +327,14 @@ impl<'a> Frame<'a> {
                 [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
                 images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
             };
-            let mut outputs = sources.chunks(3).flat_map(filtered_together);
+            let outputs = sources.chunks(3).flat_map(filtered_together);
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let image = outputs.next().expect("something is filtered");
-            if self.network.denoises_guides() {
-                let normal = outputs.next().expect("guides are two");
-                done(rows.start, &[image.amplify(gain), normal]);
-                continue;
-            }
-            let [normal, albedo] = [&self.normal, &self.albedo].map(|line| line.rows(rows.clone()));
-            let companions = outputs.zip(&self.companions).map(|(planes, (kind, _))| match kind {
-                Kind::Light => planes.product(albedo.fork()).amplify(gain.fork()),
-                Kind::Colour => planes.product(albedo.fork()),
-                Kind::Share => planes,
-            });
-            let companions: Vec<Field> = companions.collect();
-            let beauty = [image.product(albedo.fork()).amplify(gain), normal, albedo];
-            done(rows.start, &beauty.into_iter().chain(companions).collect::<Vec<_>>());
+            done(rows.start, &self.subject.finish(rows, outputs.collect(), gain));
         }
     }
 
@@ -395,7 +362,7 @@ impl<'a> Frame<'a> {
             let above =
                 scale.checked_sub(1).map_or(0, |above| self.scales[above].images[0].blended.end() / 2);
             let Scale { images, confidence, filtered, .. } = &mut self.scales[scale];
-            let reach = filtered.saturating_sub(self.network.kernel(scale) / 2);
+            let reach = filtered.saturating_sub(self.trunk.kernel(scale) / 2);
             confidence.forget(reach.min(reduced));
             for Filtered { image, blended, smooth } in images {
                 image.forget(reach.min(reduced));
@@ -404,13 +371,7 @@ impl<'a> Frame<'a> {
             }
         }
         let Scale { images, filtered, .. } = &self.scales[0];
-        let divided = images[0].image.end();
-        self.quotient.forget(divided);
-        self.companions.iter_mut().for_each(|(_, line)| line.forget(divided));
-        self.ratio.forget(divided);
-        self.shading.forget(divided);
-        self.albedo.forget(*filtered);
-        self.normal.forget(*filtered);
+        self.subject.forget(images[0].image.end(), *filtered);
     }
 }
 
