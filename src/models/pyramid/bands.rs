@@ -8,11 +8,11 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::trunk::{Encoder, Finish, KERNEL, LEVELS, MULTIPLE, Prediction, Trunk};
+use super::trunk::{ENCODER, Finish, KERNEL, LEVELS, Layer, MULTIPLE, Prediction, Trunk};
 use crate::{
     Result,
-    kernels::{Shape, blend::Place},
-    nn::{Activation, Conv, Line, MaxPool},
+    kernels::{Shape, blend::Place, conv::Geometry},
+    nn::{Activation, Line, MaxPool},
     planes::Planes,
 };
 
@@ -104,27 +104,12 @@ struct Frame<'a, S> {
     subject: S,
     /// Rows that one step may take: without it, the last step would take all that is behind.
     band: usize,
-    encoders: [Vec<Encoded>; 2],
-    /// Finest level first.
-    decoder: Vec<Decoded>,
+    /// What each layer makes.
+    lines: Vec<Line<Maps>>,
     /// Full resolution first.
     scales: Vec<Scale>,
     /// Logits of the gains, a field for each kernel of full resolution.
     gains: VecDeque<Field>,
-}
-
-/// A level of an encoder.
-struct Encoded {
-    input: Line<Maps>,
-    middle: Line<Maps>,
-    output: Line<Maps>,
-}
-
-/// A level of the decoder.
-struct Decoded {
-    up: Line<Maps>,
-    fused: Line<Maps>,
-    refined: Line<Maps>,
 }
 
 /// A level of the pyramid.
@@ -150,17 +135,6 @@ pub struct Filtered {
 
 impl<'a, S: Subject> Frame<'a, S> {
     fn new(trunk: &'a Trunk, subject: S, height: usize, band: usize) -> Self {
-        let rows = |level: usize| height >> (level + 1);
-        let encoder = || {
-            let level = |l| Encoded {
-                input: Line::new(rows(l)),
-                middle: Line::new(rows(l)),
-                output: Line::new(rows(l)),
-            };
-            (0..LEVELS).map(level).collect()
-        };
-        let decoded =
-            |l| Decoded { up: Line::new(rows(l)), fused: Line::new(rows(l)), refined: Line::new(rows(l)) };
         let filtered = |s: usize| Filtered {
             image: Line::new(height >> s),
             blended: Line::new(height >> s),
@@ -176,8 +150,7 @@ impl<'a, S: Subject> Frame<'a, S> {
         Self {
             trunk,
             band,
-            encoders: [encoder(), encoder()],
-            decoder: (0..LEVELS).map(decoded).collect(),
+            lines: trunk.layers.iter().map(|layer| Line::new(height >> layer.level)).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
             subject,
             gains: VecDeque::new(),
@@ -187,16 +160,16 @@ impl<'a, S: Subject> Frame<'a, S> {
     /// Adds the inputs of the next rows.
     fn push(&mut self, inputs: S::Inputs) {
         let inputs = self.subject.push(inputs, &mut self.scales[0].images);
-        let layers = self.trunk.encoders.iter().map(|encoder| &encoder.levels[0][0]);
-        for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip(inputs) {
+        for (first, planes) in [0, ENCODER].into_iter().zip(inputs) {
+            let reader = self.trunk.layers[first + 1].conv().expect("a convolution reads an input");
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
-            encoder[0].input.push(layer.input_halved(shape, &planes.data));
+            self.lines[first].push(reader.input_halved(shape, &planes.data));
         }
     }
 
     /// Whether all inputs are there.
     fn is_whole(&self) -> bool {
-        self.encoders[0][0].input.end() == self.encoders[0][0].input.total()
+        self.lines[0].end() == self.lines[0].total()
     }
 
     /// Whether everything is computed.
@@ -219,55 +192,42 @@ impl<'a, S: Subject> Frame<'a, S> {
 
     /// Both encoders side by side: their layers need not wait for each other.
     fn encode(&mut self) {
-        let ([radiance, guide], band) = (&mut self.encoders, self.band);
-        let [of_radiance, of_guide] = &self.trunk.encoders;
-        rayon::join(|| encode(of_radiance, radiance, band), || encode(of_guide, guide, band));
+        let layers = &self.trunk.layers;
+        let (radiance, rest) = self.lines.split_at_mut(ENCODER);
+        let encode = |first: usize, lines: &mut [Line<Maps>]| {
+            for i in 0..ENCODER {
+                let (before, line) = lines.split_at_mut(i);
+                layers[first + i].advance(|source| &before[source - first], &mut line[0], self.band);
+            }
+        };
+        rayon::join(|| encode(0, radiance), || encode(ENCODER, &mut rest[..ENCODER]));
     }
 
     fn decode(&mut self) {
-        // The decoder's layers, coarsest level first; its lines, finest first.
-        for (level, layers) in (0..LEVELS).rev().zip(&self.trunk.decoder) {
-            let (finer, coarser) = self.decoder.split_at_mut(level + 1);
-            let Decoded { up, fused, refined } = &mut finer[level];
-            if let (Some(layer), Some(below)) = (&layers.up, coarser.first()) {
-                let from = up.end() / 2;
-                let to = below.refined.settled(1).min(from + (self.band >> (level + 2)));
-                if from < to {
-                    up.push(layer.forward(vec![below.refined.rows_and_border(from..to)]));
+        for (i, layer) in self.trunk.layers.iter().enumerate().skip(2 * ENCODER) {
+            let (before, line) = self.lines.split_at_mut(i);
+            let from = line[0].end();
+            layer.advance(|source| &before[source], &mut line[0], self.band);
+            let rows = from..line[0].end();
+            for (level, head) in self.trunk.heads.iter().enumerate().rev() {
+                if head.source == i && !rows.is_empty() {
+                    let planes = head.conv.forward_planes(&[self.lines[i].rows(rows.clone())], head.factor);
+                    self.predicted(level, head.factor * rows.start..head.factor * rows.end, &planes);
                 }
-            }
-            // A band of the skips at a time, which so need no copy.
-            let skips = self.encoders.each_ref().map(|encoder| &encoder[level].output);
-            while let Some(to) = skips[0].band_end(fused.end()) {
-                let rows = fused.end()..to;
-                if layers.up.is_some() && up.end() < to {
-                    break;
-                }
-                let mut sources: Vec<Maps> = skips.iter().map(|skip| skip.rows(rows.clone())).collect();
-                sources.extend(layers.up.iter().map(|_| up.rows(rows.clone())));
-                fused.push(layers.fuse.forward(sources));
-            }
-            let from = refined.end();
-            convolve(&layers.refine, fused, refined, self.band >> (level + 1));
-            let rows = from..refined.end();
-            if rows.is_empty() {
-                continue;
-            }
-            let fine = [refined.rows(rows.clone())];
-            let head = self.trunk.heads[level].forward_planes(&fine, 1);
-            let prediction = Prediction::split(KERNEL, |first, count| head.channels(first, count));
-            self.scales[level + 1].predicted(rows.clone(), prediction);
-            if level == 0 {
-                let head = self.trunk.full.forward_planes(&fine, 2);
-                let planes = |first, count| head.channels(first, count);
-                let (prediction, finish) =
-                    Prediction::split_full(self.trunk.kernel(0), head.extent().1, planes);
-                let rows = 2 * rows.start..2 * rows.end;
-                let images = &mut self.scales[0].images;
-                self.gains.push_back(self.subject.predicted(rows.clone(), finish, images));
-                self.scales[0].predicted(rows, prediction);
             }
         }
+    }
+
+    /// Takes in what the head of a level predicted for `rows`.
+    fn predicted(&mut self, level: usize, rows: Range<usize>, head: &Field) {
+        let planes = |first, count| head.channels(first, count);
+        if level > 0 {
+            return self.scales[level].predicted(rows, Prediction::split(KERNEL, planes));
+        }
+        let (prediction, finish) = Prediction::split_full(self.trunk.kernel(0), head.extent().1, planes);
+        let images = &mut self.scales[0].images;
+        self.gains.push_back(self.subject.predicted(rows.clone(), finish, images));
+        self.scales[0].predicted(rows, prediction);
     }
 
     /// Builds the pyramid.
@@ -340,21 +300,13 @@ impl<'a, S: Subject> Frame<'a, S> {
 
     /// Lets go of every row that nothing needs any more.
     fn forget(&mut self) {
-        for level in 0..LEVELS {
-            let pooled = (level + 1 < LEVELS).then(|| level + 1);
-            for encoder in &mut self.encoders {
-                let below = pooled.map_or(usize::MAX, |below| 2 * encoder[below].input.end());
-                let Encoded { input, middle, output } = &mut encoder[level];
-                input.forget(middle.end().saturating_sub(1));
-                middle.forget(output.end().saturating_sub(1));
-                output.forget(below.min(self.decoder[level].fused.end()));
+        let mut needed = vec![usize::MAX; self.lines.len()];
+        for (layer, line) in self.trunk.layers.iter().zip(&self.lines) {
+            for source in &layer.sources {
+                needed[*source] = needed[*source].min(layer.first_read(line.end()));
             }
-            let above = level.checked_sub(1).map_or(usize::MAX, |above| self.decoder[above].up.end() / 2);
-            let Decoded { up, fused, refined } = &mut self.decoder[level];
-            up.forget(fused.end());
-            fused.forget(refined.end().saturating_sub(1));
-            refined.forget(above.min(refined.end()).saturating_sub(1));
         }
+        self.lines.iter_mut().zip(needed).for_each(|(line, row)| line.forget(row));
         for scale in 0..=LEVELS {
             // Of several images all are as far on.
             let reduced =
@@ -393,28 +345,48 @@ impl Scale {
     }
 }
 
-/// Takes the levels of an encoder as far as they can go, by at most `band` rows of the frame.
-fn encode(encoder: &Encoder, levels: &mut [Encoded], band: usize) {
-    for (level, [first, second]) in encoder.levels.iter().enumerate() {
-        let (above, rest) = levels.split_at_mut(level);
-        let Encoded { input, middle, output } = &mut rest[0];
-        if let Some(above) = above.last() {
-            let (from, to) = (input.end(), above.output.end() / 2);
-            if from < to {
-                input.push(MaxPool.forward(above.output.rows(2 * from..2 * to)));
+impl Layer {
+    /// Makes the next rows of `line`, by at most `band` rows of the frame, as far as the sources are there.
+    fn advance<'a>(&self, source: impl Fn(usize) -> &'a Line<Maps>, line: &mut Line<Maps>, band: usize) {
+        let Some(&first) = self.sources.first() else { return };
+        let (first, end, most) = (source(first), line.end(), band >> self.level);
+        let Some(conv) = self.conv() else {
+            let to = first.end() / 2;
+            if end < to {
+                line.push(MaxPool.forward(first.rows(2 * end..2 * to)));
+            }
+            return;
+        };
+        match conv.arithmetic().geometry {
+            // A band of the first source at a time, which so needs no copy.
+            Geometry::Same(1) => {
+                while let Some(to) = first.band_end(line.end()) {
+                    let sources = || self.sources.iter().map(|i| source(*i));
+                    if sources().any(|source| source.end() < to) {
+                        break;
+                    }
+                    let rows = line.end()..to;
+                    line.push(conv.forward(sources().map(|source| source.rows(rows.clone())).collect()));
+                }
+            }
+            geometry => {
+                let spread = if geometry == Geometry::Transposed { 2 } else { 1 };
+                let from = end / spread;
+                let to = first.settled(1).min(from + most / spread);
+                if from < to {
+                    line.push(conv.forward(vec![first.rows_and_border(from..to)]));
+                }
             }
         }
-        let most = band >> (level + 1);
-        convolve(first, input, middle, most);
-        convolve(second, middle, output, most);
     }
-}
 
-/// A 3x3 convolution of at most `most` rows whose neighbours are there.
-fn convolve(layer: &Conv, from: &Line<Maps>, to: &mut Line<Maps>, most: usize) {
-    let rows = to.end()..from.settled(1).min(to.end() + most);
-    if !rows.is_empty() {
-        to.push(layer.forward(vec![from.rows_and_border(rows)]));
+    /// The first row of its sources that it needs to go on from row `end` of its own.
+    fn first_read(&self, end: usize) -> usize {
+        match self.conv().map(|conv| conv.arithmetic().geometry) {
+            None => 2 * end,
+            Some(Geometry::Same(k)) => end.saturating_sub(k / 2),
+            Some(_) => (end / 2).saturating_sub(1),
+        }
     }
 }
 

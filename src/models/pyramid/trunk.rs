@@ -1,10 +1,13 @@
-//! What the built-in network and its prefilter have in common: the dual encoder, the decoder, and the kernels that their heads
+//! What the built-in network and its prefilter have in common: two encoders, a decoder, and the kernels that their heads
 //! predict. Two inputs at full resolution come in; logits for every level of a pyramid of images go out.
+//!
+//! [`Trunk::new`] declares its layers, and what each reads. All else follows from that list: the run on a tape here, that
+//! [band by band](super::bands), parameters, arithmetic, reach, and how layers are frozen.
 
 use dfdx::tensor::{Cpu, Merge, Tape};
 
 use crate::{
-    kernels::{blend::CORNERS, narrow::Steps},
+    kernels::{blend::CORNERS, conv::Geometry, narrow::Steps},
     models::network::Stacked,
     nn::{Activation, Conv, Field, Init, MaxPool, Precision},
     rng::Rng,
@@ -31,12 +34,10 @@ const DECODER_EXTRA: usize = 16;
 /// Heads begin this much smaller than Xavier: kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
-/// Channels of the radiance encoder's input, before space to depth.
-const RADIANCE_CHANNELS: usize = 3;
-
-/// The values that the radiance encoder's and the guide encoder's inputs may have in 8 bits: logarithms up to 300 times white,
-/// beyond which brightness decides on no kernel; and all that albedo and normals are.
-const INPUT_STEPS: [Steps; 2] = [Steps::to(3.0), Steps::within(1.0)];
+/// What inputs may be in 8 bits: logarithms up to 300 times white, beyond which brightness decides on no kernel; and all that
+/// albedo and normals are.
+const LOGARITHMS: Steps = Steps::to(3.0);
+const GUIDES: Steps = Steps::within(1.0);
 
 /// What sets the trunk of the network apart from that of its prefilter.
 pub struct Variant<'a> {
@@ -53,30 +54,254 @@ pub struct Variant<'a> {
 /// The layers of a network or of its prefilter.
 #[derive(Clone)]
 pub struct Trunk {
-    pub encoders: [Encoder; 2],
-    /// Coarsest level first.
-    pub decoder: Vec<Level>,
-    /// Full resolution: kernels, confidence, mask, corners, gains and, but for a prefilter, divisors and shades of four pixels.
-    pub full: Conv,
-    /// One head a trunk level, finest first.
-    pub heads: Vec<Conv>,
+    /// Each after those that it reads: those of the radiance encoder, of the guide encoder, of the decoder.
+    pub layers: Vec<Layer>,
+    /// One for each level of the pyramid of images, full resolution first, which predicts the rest of a frame besides.
+    pub heads: Vec<Head>,
     /// Rows and columns of the kernels of full resolution.
     full_kernel: usize,
 }
 
-/// Two convolutions a level, with a pool between levels.
+/// Layers of an encoder: its input, two convolutions a level, and a pool between levels.
+pub const ENCODER: usize = 3 * LEVELS;
+
+/// One layer of the encoders or the decoder.
 #[derive(Clone)]
-pub struct Encoder {
-    pub levels: Vec<[Conv; 2]>,
+pub struct Layer {
+    pub step: Step,
+    /// The layers that it reads.
+    pub sources: Vec<usize>,
+    /// It writes at `1/2^level` of the frame's resolution.
+    pub level: usize,
+    /// Channels that it writes.
+    channels: usize,
 }
 
-/// One level of the decoder.
+/// What a layer does.
 #[derive(Clone)]
-pub struct Level {
-    /// From the level below; the coarsest has none.
-    pub up: Option<Conv>,
-    pub fuse: Conv,
-    pub refine: Conv,
+pub enum Step {
+    /// Makes channels of the 2x2 squares of an input, which in 8 bits may have these values.
+    Input(Steps),
+    /// Halves rows and columns.
+    Pool,
+    Conv(Conv),
+}
+
+/// What predicts a level of the pyramid of images.
+#[derive(Clone)]
+pub struct Head {
+    pub conv: Conv,
+    /// The layer that it reads.
+    pub source: usize,
+    /// Rows and columns of pixels that share a pixel of that layer.
+    pub factor: usize,
+}
+
+impl Layer {
+    /// Its convolution, if it is one.
+    pub fn conv(&self) -> Option<&Conv> {
+        if let Step::Conv(conv) = &self.step { Some(conv) } else { None }
+    }
+
+    /// How far it sees in what it reads, in pixels of the frame.
+    fn reach(&self) -> usize {
+        match self.conv().map(|conv| conv.arithmetic().geometry) {
+            Some(Geometry::Same(k)) => (k / 2) << self.level,
+            // Half a pixel of the coarser level, as a pool.
+            Some(_) => 1 << self.level,
+            None => 1 << (self.level - 1),
+        }
+    }
+}
+
+/// A trunk while its layers are declared.
+struct Builder<'a> {
+    prefix: &'a str,
+    rng: &'a mut Rng,
+    layers: Vec<Layer>,
+}
+
+impl Builder<'_> {
+    fn add(&mut self, step: Step, sources: &[usize], level: usize, channels: usize) -> usize {
+        self.layers.push(Layer { step, sources: sources.into(), level, channels });
+        self.layers.len() - 1
+    }
+
+    fn pool(&mut self, source: usize) -> usize {
+        let Layer { level, channels, .. } = self.layers[source];
+        self.add(Step::Pool, &[source], level + 1, channels)
+    }
+
+    /// A k x k convolution to `width` channels.
+    fn conv(&mut self, name: &str, sources: &[usize], width: usize, k: usize) -> usize {
+        let inputs: Vec<usize> = sources.iter().map(|source| self.layers[*source].channels).collect();
+        let name = format!("{}{name}", self.prefix);
+        let conv = Conv::new(self.rng, &name, &inputs, width, k, Init::Xavier);
+        self.add(Step::Conv(conv), sources, self.layers[sources[0]].level, width)
+    }
+
+    /// A transposed convolution, which doubles rows and columns.
+    fn up(&mut self, name: &str, source: usize, width: usize) -> usize {
+        let Layer { level, channels, .. } = self.layers[source];
+        let conv = Conv::transposed(self.rng, &format!("{}{name}", self.prefix), channels, width);
+        self.add(Step::Conv(conv), &[source], level - 1, width)
+    }
+
+    /// A head of so many channels a pixel.
+    fn head(&mut self, name: &str, source: usize, channels: usize, factor: usize) -> Head {
+        let (name, inputs) = (format!("{}head.{name}", self.prefix), [self.layers[source].channels]);
+        let outputs = factor * factor * channels;
+        let conv = Conv::new(self.rng, &name, &inputs, outputs, 1, Init::Scaled(HEAD_GAIN)).head();
+        Head { conv, source, factor }
+    }
+}
+
+impl Trunk {
+    /// Layers with fresh weights; `widths` are the encoders', finest first.
+    ///
+    /// # Panics
+    /// If `widths` does not hold one width a level.
+    pub fn new(widths: &[usize], variant: &Variant, rng: &mut Rng) -> Self {
+        assert_eq!(widths.len(), LEVELS, "one width a level");
+        let &Variant { prefix, guides, full_kernel, refines } = variant;
+        let mut build = Builder { prefix, rng, layers: Vec::new() };
+        let mut skips = [const { Vec::new() }; LEVELS];
+        for (encoder, channels, steps) in [("radiance", 3, LOGARITHMS), ("guide", guides, GUIDES)] {
+            // (N, C, H, W) -> (N, 4C, H/2, W/2)
+            let mut x = build.add(Step::Input(steps), &[], 1, 4 * channels);
+            for (level, &width) in widths.iter().enumerate() {
+                if level > 0 {
+                    x = build.pool(x); // (N, K, H, W) -> (N, K, H/2, W/2)
+                }
+                for i in 0..2 {
+                    x = build.conv(&format!("encoder.{encoder}.{level}.{i}"), &[x], width, 3);
+                }
+                skips[level].push(x);
+            }
+        }
+        let (mut below, mut refined) = (None, [0; LEVELS]);
+        for level in (0..LEVELS).rev() {
+            let (width, name) = (widths[level] + DECODER_EXTRA, format!("decoder.{level}"));
+            let mut sources = skips[level].clone();
+            if let Some(below) = below {
+                // (N, K', H, W) -> (N, K, 2H, 2W)
+                sources.push(build.up(&format!("{name}.up"), below, width));
+            }
+            let fused = build.conv(&format!("{name}.fuse"), &sources, width, 1);
+            refined[level] = build.conv(&format!("{name}.refine"), &[fused], width, 3);
+            below = Some(refined[level]);
+        }
+        let finish = GAINS + if refines { DIVISOR + SHADE } else { 0 };
+        let mut heads = vec![build.head("full", refined[0], head_of(full_kernel) + finish, 2)];
+        for (level, &source) in refined.iter().enumerate() {
+            heads.push(build.head(&level.to_string(), source, head_of(KERNEL), 1));
+        }
+        Self { layers: build.layers, heads, full_kernel }
+    }
+
+    /// Rows and columns of the kernels of a level of the pyramid that is filtered, 0 the finest.
+    pub fn kernel(&self, level: usize) -> usize {
+        if level == 0 { self.full_kernel } else { KERNEL }
+    }
+
+    /// What is predicted for every pyramid level, full resolution first, from the encoders' inputs.
+    pub fn predict<T: Tape<f32, Cpu> + Merge<T>>(
+        &self,
+        inputs: [&Stacked; 2],
+    ) -> (Vec<Prediction<T>>, Finish<T>) {
+        // How many still read each layer: the tape so far goes with the last of them.
+        let mut readers = vec![0; self.layers.len()];
+        let reads = self.layers.iter().flat_map(|layer| &layer.sources);
+        reads.chain(self.heads.iter().map(|head| &head.source)).for_each(|source| readers[*source] += 1);
+        let mut outputs: Vec<Option<Activation<T>>> = Vec::with_capacity(self.layers.len());
+        let mut read = |outputs: &mut Vec<Option<Activation<T>>>, source: usize| {
+            readers[source] -= 1;
+            let output = if readers[source] > 0 {
+                outputs[source].as_ref().map(Activation::fork)
+            } else {
+                outputs[source].take()
+            };
+            output.expect("layers come after those that they read")
+        };
+        let mut inputs = inputs.into_iter();
+        let mut heads = Vec::with_capacity(self.heads.len());
+        for (i, layer) in self.layers.iter().enumerate() {
+            let mut sources = layer.sources.iter().map(|source| read(&mut outputs, *source));
+            let output = match &layer.step {
+                Step::Input(_) => {
+                    let (shape, values) = inputs.next().expect("one for each encoder");
+                    Activation::input_halved(*shape, values)
+                }
+                Step::Pool => MaxPool.forward(sources.next().expect("a pool has a source")),
+                Step::Conv(conv) => conv.forward(sources.collect()),
+            };
+            outputs.push(Some(output));
+            for head in self.heads.iter().rev().filter(|head| head.source == i) {
+                heads.push((head.factor, head.conv.forward(vec![read(&mut outputs, i)])));
+            }
+        }
+        let (_, full) = heads.pop().expect("full resolution has a head");
+        let count = full.shape().c / 4;
+        let (finest, finish) = Prediction::split_full(self.kernel(0), count, planes_of(full, 2));
+        let coarser = heads.into_iter().rev().map(|(f, head)| Prediction::split(KERNEL, planes_of(head, f)));
+        (std::iter::once(finest).chain(coarser).collect(), finish)
+    }
+
+    /// How far it sees in its inputs, and in the images that are filtered.
+    pub fn reach(&self) -> usize {
+        let mut reaches: Vec<usize> = Vec::with_capacity(self.layers.len());
+        for layer in &self.layers {
+            let before = layer.sources.iter().map(|source| reaches[*source]).max();
+            reaches.push(before.unwrap_or(0) + layer.reach());
+        }
+        // The head of full resolution leaves half a pixel of the finest level behind. Then come the kernels, and below full
+        // resolution a pixel for the corners of an upsampling and half a one for the squares of an image.
+        let layers = reaches.into_iter().max().unwrap_or(0) + 1;
+        let kernels: usize = (0..=LEVELS).map(|level| (self.kernel(level) / 2) << level).sum();
+        let pyramid: usize = (1..=LEVELS).map(|level| 3 << (level - 1)).sum();
+        layers + kernels + pyramid
+    }
+
+    /// Multiply-accumulates for one pixel of the frame, of which `images` are filtered.
+    pub fn macs_per_pixel(&self, images: usize) -> f64 {
+        let each = |macs: usize, level: usize| macs as f64 / 4f64.powi(level as i32);
+        let layers = self.layers.iter().filter_map(|layer| Some((layer.conv()?, layer.level)));
+        let heads = self.heads.iter().map(|head| (&head.conv, self.layers[head.source].level));
+        let convolutions = layers.chain(heads).map(|(conv, level)| each(conv.macs_per_output_pixel(), level));
+        // Three channels of each image and the sum of weights, at every pyramid level.
+        let filters = (0..=LEVELS).map(|level| each(4 * images * self.kernel(level).pow(2), level));
+        convolutions.sum::<f64>() + filters.sum::<f64>()
+    }
+
+    /// Its convolutions, in a fixed order.
+    pub fn convolutions(&mut self) -> impl Iterator<Item = &mut Conv> {
+        let layers = self.layers.iter_mut().filter_map(|layer| match &mut layer.step {
+            Step::Conv(conv) => Some(conv),
+            _ => None,
+        });
+        layers.chain(self.heads.iter_mut().map(|head| &mut head.conv))
+    }
+
+    /// Plans for inference: packs weights once.
+    pub fn freeze(&mut self) {
+        if self.heads[0].conv.arithmetic().precision != Precision::Int8 {
+            return self.convolutions().for_each(|conv| conv.freeze(&[]));
+        }
+        // Every layer takes in the steps of what it reads.
+        let mut steps: Vec<Steps> = Vec::with_capacity(self.layers.len());
+        for layer in &mut self.layers {
+            let sources: Vec<Steps> = layer.sources.iter().map(|source| steps[*source]).collect();
+            steps.push(match &mut layer.step {
+                Step::Input(steps) => *steps,
+                Step::Pool => sources[0],
+                Step::Conv(conv) => {
+                    conv.freeze(&sources);
+                    conv.steps()
+                }
+            });
+        }
+        self.heads.iter_mut().for_each(|head| head.conv.freeze(&[steps[head.source]]));
+    }
 }
 
 /// Channels of a level's head for one pixel: k x k kernel, confidence, the mask that blends the level below, and the
@@ -149,190 +374,6 @@ fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
         let rest = head.fork();
         let head = std::mem::replace(&mut head, rest);
         Field::from_activation(head, area * first, area * count, factor)
-    }
-}
-
-impl Encoder {
-    fn new(rng: &mut Rng, name: &str, channels: usize, widths: &[usize]) -> Self {
-        let mut from = 4 * channels;
-        let levels = widths.iter().enumerate().map(|(level, &width)| {
-            let first = Conv::new(rng, &format!("{name}.{level}.0"), &[from], width, 3, Init::Xavier);
-            from = width;
-            [first, Conv::new(rng, &format!("{name}.{level}.1"), &[width], width, 3, Init::Xavier)]
-        });
-        Self { levels: levels.collect() }
-    }
-
-    /// The output of every level, finest first.
-    fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, input: Activation<T>) -> Vec<Activation<T>> {
-        let mut skips: Vec<Activation<T>> = Vec::with_capacity(self.levels.len());
-        let mut x = input;
-        for (level, [first, second]) in self.levels.iter().enumerate() {
-            if level > 0 {
-                x = MaxPool.forward(x); // (N, K, H, W) -> (N, K, H/2, W/2)
-            }
-            x = second.forward(vec![first.forward(vec![x])]);
-            skips.push(x.fork());
-        }
-        // The tape so far travels with the coarsest output.
-        skips.pop();
-        skips.push(x);
-        skips
-    }
-}
-
-impl Trunk {
-    /// Layers with fresh weights; `widths` are the encoders', finest first.
-    ///
-    /// # Panics
-    /// If `widths` does not hold one width a level.
-    pub fn new(widths: &[usize], variant: &Variant, rng: &mut Rng) -> Self {
-        assert_eq!(widths.len(), LEVELS, "one width a level");
-        let &Variant { prefix, guides, full_kernel, refines } = variant;
-        let encoders = [
-            Encoder::new(rng, &format!("{prefix}encoder.radiance"), RADIANCE_CHANNELS, widths),
-            Encoder::new(rng, &format!("{prefix}encoder.guide"), guides, widths),
-        ];
-        let decoder_width = |level: usize| widths[level] + DECODER_EXTRA;
-        let decoder = (0..LEVELS).rev().map(|level| {
-            let (width, skip) = (decoder_width(level), widths[level]);
-            let up = (level + 1 < LEVELS).then(|| {
-                let name = format!("{prefix}decoder.{level}.up");
-                Conv::transposed(rng, &name, decoder_width(level + 1), width)
-            });
-            let mut sources = vec![skip, skip];
-            sources.extend(up.iter().map(|_| width));
-            let name = format!("{prefix}decoder.{level}");
-            Level {
-                up,
-                fuse: Conv::new(rng, &format!("{name}.fuse"), &sources, width, 1, Init::Xavier),
-                refine: Conv::new(rng, &format!("{name}.refine"), &[width], width, 3, Init::Xavier),
-            }
-        });
-        let decoder = decoder.collect();
-        let mut head = |name: String, width: usize, channels: usize| {
-            Conv::new(rng, &format!("{prefix}{name}"), &[width], channels, 1, Init::Scaled(HEAD_GAIN)).head()
-        };
-        let finish = GAINS + if refines { DIVISOR + SHADE } else { 0 };
-        Self {
-            full: head("head.full".into(), decoder_width(0), 4 * (head_of(full_kernel) + finish)),
-            heads: (0..LEVELS)
-                .map(|l| head(format!("head.{l}"), decoder_width(l), head_of(KERNEL)))
-                .collect(),
-            encoders,
-            decoder,
-            full_kernel,
-        }
-    }
-
-    /// Rows and columns of the kernels of a level of the pyramid that is filtered, 0 the finest.
-    pub fn kernel(&self, level: usize) -> usize {
-        if level == 0 { self.full_kernel } else { KERNEL }
-    }
-
-    /// What is predicted for every pyramid level, full resolution first, from the encoders' inputs.
-    pub fn predict<T: Tape<f32, Cpu> + Merge<T>>(
-        &self,
-        inputs: [&Stacked; 2],
-    ) -> (Vec<Prediction<T>>, Finish<T>) {
-        let mut skips = [(inputs[0], 0), (inputs[1], 1)]
-            .map(|(input, e)| self.encoders[e].forward(Activation::<T>::input_halved(input.0, &input.1)));
-
-        // The decoder, coarsest level first; every level feeds its head.
-        let mut heads: Vec<Activation<T>> = Vec::with_capacity(LEVELS + 1);
-        let mut x: Option<Activation<T>> = None;
-        for (level, head) in self.decoder.iter().zip(self.heads.iter().rev()) {
-            let mut sources: Vec<_> = skips.iter_mut().map(|s| s.pop().expect("one skip a level")).collect();
-            if let (Some(up), Some(below)) = (&level.up, x) {
-                sources.push(up.forward(vec![below])); // (N, K', H, W) -> (N, K, 2H, 2W)
-            }
-            let fused = level.refine.forward(vec![level.fuse.forward(sources)]);
-            heads.push(head.forward(vec![fused.fork()])); // (N, K, H, W) -> (N, 31, H, W)
-            x = Some(fused);
-        }
-        let full = self.full.forward(vec![x.expect("there are levels")]);
-        let count = full.shape().c / 4;
-
-        let (finest, finish) = Prediction::split_full(self.kernel(0), count, planes_of(full, 2));
-        let mut levels = vec![finest];
-        levels.extend(heads.into_iter().rev().map(|head| Prediction::split(KERNEL, planes_of(head, 1))));
-        (levels, finish)
-    }
-
-    /// How far it sees in its inputs, and in the images that are filtered.
-    pub fn reach(&self) -> usize {
-        // At each trunk level two 3x3 convolutions and one more, and half a pixel each of a pool and an upsampling; then the
-        // kernels, and below full resolution a pixel for the corners of an upsampling and half a one for the squares of an image.
-        let trunk: usize = (1..=LEVELS).map(|level| (2 + 1 + 1) << level).sum();
-        let kernels: usize = (0..=LEVELS).map(|level| (self.kernel(level) / 2) << level).sum();
-        let pyramid: usize = (1..=LEVELS).map(|level| 3 << (level - 1)).sum();
-        trunk + kernels + pyramid
-    }
-
-    /// Multiply-accumulates for one pixel of the frame, of which `images` are filtered.
-    pub fn macs_per_pixel(&self, images: usize) -> f64 {
-        let convolutions: f64 = self
-            .convolution_levels()
-            .map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32))
-            .sum();
-        // Three channels of each image and the sum of weights, at every pyramid level.
-        let taps = |level: usize| (4 * images * self.kernel(level).pow(2)) as f64 / 4f64.powi(level as i32);
-        let filters: f64 = (0..=LEVELS).map(taps).sum();
-        convolutions + filters
-    }
-
-    /// Its convolutions, in a fixed order.
-    pub fn convolutions(&mut self) -> impl Iterator<Item = &mut Conv> {
-        let encoders = self.encoders.iter_mut().flat_map(|e| e.levels.iter_mut().flatten());
-        let decoder =
-            self.decoder.iter_mut().flat_map(|l| l.up.iter_mut().chain([&mut l.fuse, &mut l.refine]));
-        let heads = [&mut self.full].into_iter().chain(&mut self.heads);
-        encoders.chain(decoder).chain(heads)
-    }
-
-    /// Plans for inference: packs weights once.
-    pub fn freeze(&mut self) {
-        if self.full.arithmetic().precision != Precision::Int8 {
-            return self.convolutions().for_each(|conv| conv.freeze(&[]));
-        }
-        // Every layer takes in the steps of what it reads.
-        for (encoder, mut above) in self.encoders.iter_mut().zip(INPUT_STEPS) {
-            for [first, second] in &mut encoder.levels {
-                first.freeze(&[above]);
-                second.freeze(&[first.steps()]);
-                above = second.steps();
-            }
-        }
-        let mut below = None;
-        for (level, layers) in (0..LEVELS).rev().zip(&mut self.decoder) {
-            let mut sources =
-                self.encoders.each_ref().map(|encoder| encoder.levels[level][1].steps()).to_vec();
-            if let (Some(up), Some(below)) = (&mut layers.up, below) {
-                up.freeze(&[below]);
-                sources.push(up.steps());
-            }
-            layers.fuse.freeze(&sources);
-            layers.refine.freeze(&[layers.fuse.steps()]);
-            let steps = layers.refine.steps();
-            self.heads[level].freeze(&[steps]);
-            below = Some(steps);
-        }
-        self.full.freeze(&[below.expect("there are levels")]);
-    }
-
-    /// Every convolution and the level of the frame's pyramid at which it writes.
-    fn convolution_levels(&self) -> impl Iterator<Item = (&Conv, usize)> {
-        let encoders = self.encoders.iter().flat_map(|e| {
-            e.levels.iter().enumerate().flat_map(|(level, convs)| convs.iter().map(move |c| (c, level + 1)))
-        });
-        let decoder = self
-            .decoder
-            .iter()
-            .rev()
-            .enumerate()
-            .flat_map(|(level, l)| l.up.iter().chain([&l.fuse, &l.refine]).map(move |c| (c, level + 1)));
-        let heads = self.heads.iter().enumerate().map(|(level, c)| (c, level + 1));
-        encoders.chain(decoder).chain(heads).chain([(&self.full, 1)])
     }
 }
 
