@@ -1,6 +1,6 @@
 //! The work of one task of a narrow convolution: the sums of some rows, finished and stored.
 
-use super::{CHUNK, Engine, Format, Grid, LANES, Sums, Term, Wide};
+use super::{CHUNK, Engine, Format, Grid, LANES, Sums, Term, Wide, engine::Product};
 use crate::kernels::{
     Block, Shape, Shared,
     conv::Epilogue,
@@ -65,15 +65,15 @@ impl Kernel for Band<'_> {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint rows.
                     unsafe {
-                        let terms = (&terms[..], self.groups);
-                        self.engine.multiply(
-                            self.format,
+                        let product = Product {
                             terms,
+                            groups: self.groups,
                             position,
                             weights,
-                            (outputs, plane_rows),
-                            &mut sums,
-                        );
+                            outputs,
+                            plane: plane_rows,
+                        };
+                        self.engine.multiply(self.format, product, &mut sums);
                         self.store(
                             simd,
                             &sums,

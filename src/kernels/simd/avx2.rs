@@ -1,6 +1,6 @@
 //! Two registers of eight lanes: AVX2 with FMA.
 
-use std::{arch::x86_64::*, fmt, ops::Range};
+use std::{arch::x86_64::*, ops::Range};
 
 use super::{Block, Kernel, LANES, PAIRS, Simd};
 use crate::kernels::exponential::{EXP, LIMIT, LN_2};
@@ -9,12 +9,6 @@ use crate::kernels::exponential::{EXP, LIMIT, LN_2};
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Avx2(());
 
-impl fmt::Debug for Avx2 {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Avx2")
-    }
-}
-
 /// Compiles a kernel for these instructions.
 #[target_feature(enable = "avx2,fma")]
 fn compiled<K: Kernel>(lanes: Avx2, kernel: K) {
@@ -22,6 +16,7 @@ fn compiled<K: Kernel>(lanes: Avx2, kernel: K) {
 }
 
 impl Simd for Avx2 {
+    const NAME: &str = "Avx2";
     type V = (__m256, __m256);
     // 2 registers a block x 6 pixels = 12 accumulators of 16 registers.
     const TILE: (usize, usize) = (1, 6);

@@ -1,6 +1,6 @@
 //! One register of sixteen lanes: AVX-512.
 
-use std::{arch::x86_64::*, fmt, ops::Range};
+use std::{arch::x86_64::*, ops::Range};
 
 use super::{Block, Kernel, LANES, PAIRS, Simd};
 use crate::kernels::exponential::{EXP, LIMIT, LN_2};
@@ -9,12 +9,6 @@ use crate::kernels::exponential::{EXP, LIMIT, LN_2};
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Avx512(());
 
-impl fmt::Debug for Avx512 {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Avx512")
-    }
-}
-
 /// Compiles a kernel for these instructions.
 #[target_feature(enable = "avx512f,avx2,fma")]
 fn compiled<K: Kernel>(lanes: Avx512, kernel: K) {
@@ -22,6 +16,7 @@ fn compiled<K: Kernel>(lanes: Avx512, kernel: K) {
 }
 
 impl Simd for Avx512 {
+    const NAME: &str = "Avx512";
     type V = __m512;
     // 2 planes x 14 pixels = 28 accumulators of 32 registers.
     const TILE: (usize, usize) = (2, 14);

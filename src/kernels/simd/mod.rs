@@ -21,7 +21,9 @@ pub(super) use avx512::Avx512;
 use portable::Portable;
 
 /// Sixteen f32 lanes. A value proves that the processor has the instructions: only [`Simd::detect`] makes one.
-pub trait Simd: Copy + fmt::Debug {
+pub trait Simd: Copy {
+    /// What `DEMC_TIER` calls it, but for its capital.
+    const NAME: &str;
     /// The lanes.
     type V: Copy;
     /// How many output planes and pixels a convolution tile keeps in registers.
@@ -216,8 +218,12 @@ macro_rules! with_lanes {
 
 impl fmt::Debug for Tier {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        with_lanes!(self, lanes => lanes.fmt(f))
+        f.write_str(with_lanes!(self, lanes => name(lanes)))
     }
+}
+
+fn name<S: Simd>(_: S) -> &'static str {
+    S::NAME
 }
 
 impl Tier {

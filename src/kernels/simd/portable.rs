@@ -3,10 +3,11 @@
 use super::{Block, Kernel, LANES, Simd};
 
 /// The portable lanes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Portable;
 
 impl Simd for Portable {
+    const NAME: &str = "Portable";
     type V = [f32; LANES];
     const TILE: (usize, usize) = (1, 4);
 

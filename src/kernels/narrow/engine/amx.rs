@@ -1,26 +1,22 @@
 //! AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. 8 bits and conversions are those of AVX-512.
 
-use std::{arch::asm, fmt, sync::OnceLock};
+use std::{arch::asm, sync::OnceLock};
 
 use half::bf16;
 
-use super::{Backend, avx512::Avx512, cpuid};
+use super::{Backend, Correlation, Product, avx512::Avx512, cpuid};
 use crate::kernels::{
     Block,
     narrow::{Sums, Term, WIDE, Wide},
 };
 
-/// AMX-BF16.
+/// Eight tiles of 16 rows of 64 bytes.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Amx(Avx512);
 
-impl fmt::Debug for Amx {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Amx")
-    }
-}
-
 impl Backend for Amx {
+    const NAME: &str = "Amx";
+
     fn detect() -> Option<Self> {
         Avx512::detect().filter(|_| permitted()).map(Self)
     }
@@ -34,54 +30,172 @@ impl Backend for Amx {
         work()
     }
 
-    unsafe fn multiply_int8(
-        self,
-        terms: (&[Term], &[u8]),
-        position: usize,
-        weights: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise, and the token's.
-        unsafe { self.0.multiply_int8(terms, position, weights, outputs, sums) }
+    unsafe fn multiply_int8(self, product: Product, sums: &mut Sums) {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.multiply_int8(product, sums) }
     }
 
-    unsafe fn multiply_bf16(
-        self,
-        terms: (&[Term], &[u8]),
-        position: usize,
-        weights: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise, and the token's.
-        unsafe { multiply(terms.0, position, weights, outputs, sums) }
+    unsafe fn multiply_bf16(self, product: Product, sums: &mut Sums) {
+        let Product { terms, position, weights, outputs, plane, .. } = product;
+        debug_assert!(!terms.is_empty());
+        // SAFETY: the caller's promise; the loops run over `terms`, which are not empty; the sums of an
+        // output plane are two tiles.
+        unsafe {
+            if outputs == 2 {
+                asm!(
+                    "tilezero tmm0",
+                    "tilezero tmm1",
+                    "tilezero tmm2",
+                    "tilezero tmm3",
+                    "2:",
+                    "mov {x}, qword ptr [{term}]",
+                    "mov {w}, qword ptr [{term} + 8]",
+                    "add {x}, {input}",
+                    "add {w}, {weights}",
+                    "tileloadd tmm4, [{x} + {row}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "add {w}, {plane}",
+                    "tileloadd tmm5, [{x} + {row}*1 + 1024]",
+                    "tileloadd tmm7, [{w} + {row}*1]",
+                    "add {term}, 16",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "tdpbf16ps tmm2, tmm4, tmm7",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    "cmp {term}, {end}",
+                    "jne 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    "tilestored [{sums} + {row}*1 + 2048], tmm2",
+                    "tilestored [{sums} + {row}*1 + 3072], tmm3",
+                    x = out(reg) _,
+                    w = out(reg) _,
+                    term = inout(reg) terms.as_ptr() => _,
+                    end = in(reg) terms.as_ptr_range().end,
+                    input = in(reg) position * ROW,
+                    weights = in(reg) weights,
+                    plane = in(reg) plane * ROW,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            } else {
+                asm!(
+                    "tilezero tmm0",
+                    "tilezero tmm1",
+                    "2:",
+                    "mov {x}, qword ptr [{term}]",
+                    "mov {w}, qword ptr [{term} + 8]",
+                    "add {x}, {input}",
+                    "add {w}, {weights}",
+                    "tileloadd tmm4, [{x} + {row}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{x} + {row}*1 + 1024]",
+                    "add {term}, 16",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "cmp {term}, {end}",
+                    "jne 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    x = out(reg) _,
+                    w = out(reg) _,
+                    term = inout(reg) terms.as_ptr() => _,
+                    end = in(reg) terms.as_ptr_range().end,
+                    input = in(reg) position * ROW,
+                    weights = in(reg) weights,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            }
+        }
     }
 
-    unsafe fn correlate(
-        self,
-        steps: usize,
-        channels: *const bf16,
-        stride: usize,
-        pairs: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise, and the token's.
-        unsafe { correlate(steps, channels, stride, pairs, outputs, sums) }
+    unsafe fn correlate(self, correlation: Correlation, sums: &mut Sums) {
+        let Correlation { steps, channels, stride, pairs, outputs, plane } = correlation;
+        debug_assert!(steps > 0);
+        // SAFETY: the caller's promise; `steps` is not zero.
+        unsafe {
+            let upper = channels.byte_add(16 * stride);
+            if outputs == 2 {
+                asm!(
+                    "tileloadd tmm0, [{sums} + {row}*1]",
+                    "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
+                    "tileloadd tmm2, [{sums} + {row}*1 + 2048]",
+                    "tileloadd tmm3, [{sums} + {row}*1 + 3072]",
+                    "2:",
+                    "tileloadd tmm4, [{x} + {stride}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{y} + {stride}*1]",
+                    "tileloadd tmm7, [{v} + {row}*1]",
+                    "add {x}, 64",
+                    "add {y}, 64",
+                    "add {w}, 1024",
+                    "add {v}, 1024",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "tdpbf16ps tmm2, tmm4, tmm7",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    "dec {steps}",
+                    "jnz 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    "tilestored [{sums} + {row}*1 + 2048], tmm2",
+                    "tilestored [{sums} + {row}*1 + 3072], tmm3",
+                    x = inout(reg) channels => _,
+                    y = inout(reg) upper => _,
+                    w = inout(reg) pairs => _,
+                    v = inout(reg) pairs.add(plane) => _,
+                    steps = inout(reg) steps => _,
+                    stride = in(reg) stride,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            } else {
+                asm!(
+                    "tileloadd tmm0, [{sums} + {row}*1]",
+                    "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
+                    "2:",
+                    "tileloadd tmm4, [{x} + {stride}*1]",
+                    "tileloadd tmm6, [{w} + {row}*1]",
+                    "tileloadd tmm5, [{y} + {stride}*1]",
+                    "add {x}, 64",
+                    "add {y}, 64",
+                    "add {w}, 1024",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm5, tmm6",
+                    "dec {steps}",
+                    "jnz 2b",
+                    "tilestored [{sums} + {row}*1], tmm0",
+                    "tilestored [{sums} + {row}*1 + 1024], tmm1",
+                    x = inout(reg) channels => _,
+                    y = inout(reg) upper => _,
+                    w = inout(reg) pairs => _,
+                    steps = inout(reg) steps => _,
+                    stride = in(reg) stride,
+                    row = in(reg) ROW,
+                    sums = in(reg) sums,
+                    options(nostack)
+                );
+            }
+        }
+        const { assert!(TILE == 1024 && size_of::<Sums>() == 4 * TILE && size_of::<Term>() == 16) };
+        const { assert!(size_of::<Wide>() == ROW && WIDE == 32) };
     }
 
     unsafe fn narrow_spread(self, low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
-        // SAFETY: as above.
+        // SAFETY: the caller's promise.
         unsafe { self.0.narrow_spread(low, high, out, step) }
     }
 
     fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
-        self.0.interleave(pairs, out)
+        self.0.interleave(pairs, out);
     }
 
     unsafe fn transpose(self, blocks: &[Block], rows: *mut bf16, stride: usize) {
-        // SAFETY: as above.
+        // SAFETY: the caller's promise.
         unsafe { self.0.transpose(blocks, rows, stride) }
     }
 }
@@ -136,165 +250,4 @@ impl Drop for Tiles {
         // SAFETY: gives the tile state back, so that later context switches need not save it.
         unsafe { asm!("tilerelease", options(nostack, nomem)) };
     }
-}
-
-unsafe fn multiply(
-    terms: &[Term],
-    position: usize,
-    weights: *const Wide,
-    (outputs, plane): (usize, usize),
-    sums: &mut Sums,
-) {
-    debug_assert!(!terms.is_empty());
-    // SAFETY: the caller's promise; the loops run over `terms`, which are not empty; the sums of an
-    // output plane are two tiles.
-    unsafe {
-        if outputs == 2 {
-            asm!(
-                "tilezero tmm0",
-                "tilezero tmm1",
-                "tilezero tmm2",
-                "tilezero tmm3",
-                "2:",
-                "mov {x}, qword ptr [{term}]",
-                "mov {w}, qword ptr [{term} + 8]",
-                "add {x}, {input}",
-                "add {w}, {weights}",
-                "tileloadd tmm4, [{x} + {row}*1]",
-                "tileloadd tmm6, [{w} + {row}*1]",
-                "add {w}, {plane}",
-                "tileloadd tmm5, [{x} + {row}*1 + 1024]",
-                "tileloadd tmm7, [{w} + {row}*1]",
-                "add {term}, 16",
-                "tdpbf16ps tmm0, tmm4, tmm6",
-                "tdpbf16ps tmm1, tmm5, tmm6",
-                "tdpbf16ps tmm2, tmm4, tmm7",
-                "tdpbf16ps tmm3, tmm5, tmm7",
-                "cmp {term}, {end}",
-                "jne 2b",
-                "tilestored [{sums} + {row}*1], tmm0",
-                "tilestored [{sums} + {row}*1 + 1024], tmm1",
-                "tilestored [{sums} + {row}*1 + 2048], tmm2",
-                "tilestored [{sums} + {row}*1 + 3072], tmm3",
-                x = out(reg) _,
-                w = out(reg) _,
-                term = inout(reg) terms.as_ptr() => _,
-                end = in(reg) terms.as_ptr_range().end,
-                input = in(reg) position * ROW,
-                weights = in(reg) weights,
-                plane = in(reg) plane * ROW,
-                row = in(reg) ROW,
-                sums = in(reg) sums,
-                options(nostack)
-            );
-        } else {
-            asm!(
-                "tilezero tmm0",
-                "tilezero tmm1",
-                "2:",
-                "mov {x}, qword ptr [{term}]",
-                "mov {w}, qword ptr [{term} + 8]",
-                "add {x}, {input}",
-                "add {w}, {weights}",
-                "tileloadd tmm4, [{x} + {row}*1]",
-                "tileloadd tmm6, [{w} + {row}*1]",
-                "tileloadd tmm5, [{x} + {row}*1 + 1024]",
-                "add {term}, 16",
-                "tdpbf16ps tmm0, tmm4, tmm6",
-                "tdpbf16ps tmm1, tmm5, tmm6",
-                "cmp {term}, {end}",
-                "jne 2b",
-                "tilestored [{sums} + {row}*1], tmm0",
-                "tilestored [{sums} + {row}*1 + 1024], tmm1",
-                x = out(reg) _,
-                w = out(reg) _,
-                term = inout(reg) terms.as_ptr() => _,
-                end = in(reg) terms.as_ptr_range().end,
-                input = in(reg) position * ROW,
-                weights = in(reg) weights,
-                row = in(reg) ROW,
-                sums = in(reg) sums,
-                options(nostack)
-            );
-        }
-    }
-}
-
-unsafe fn correlate(
-    steps: usize,
-    channels: *const bf16,
-    stride: usize,
-    pairs: *const Wide,
-    (outputs, plane): (usize, usize),
-    sums: &mut Sums,
-) {
-    debug_assert!(steps > 0);
-    // SAFETY: the caller's promise; `steps` is not zero.
-    unsafe {
-        let upper = channels.byte_add(16 * stride);
-        if outputs == 2 {
-            asm!(
-                "tileloadd tmm0, [{sums} + {row}*1]",
-                "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
-                "tileloadd tmm2, [{sums} + {row}*1 + 2048]",
-                "tileloadd tmm3, [{sums} + {row}*1 + 3072]",
-                "2:",
-                "tileloadd tmm4, [{x} + {stride}*1]",
-                "tileloadd tmm6, [{w} + {row}*1]",
-                "tileloadd tmm5, [{y} + {stride}*1]",
-                "tileloadd tmm7, [{v} + {row}*1]",
-                "add {x}, 64",
-                "add {y}, 64",
-                "add {w}, 1024",
-                "add {v}, 1024",
-                "tdpbf16ps tmm0, tmm4, tmm6",
-                "tdpbf16ps tmm1, tmm5, tmm6",
-                "tdpbf16ps tmm2, tmm4, tmm7",
-                "tdpbf16ps tmm3, tmm5, tmm7",
-                "dec {steps}",
-                "jnz 2b",
-                "tilestored [{sums} + {row}*1], tmm0",
-                "tilestored [{sums} + {row}*1 + 1024], tmm1",
-                "tilestored [{sums} + {row}*1 + 2048], tmm2",
-                "tilestored [{sums} + {row}*1 + 3072], tmm3",
-                x = inout(reg) channels => _,
-                y = inout(reg) upper => _,
-                w = inout(reg) pairs => _,
-                v = inout(reg) pairs.add(plane) => _,
-                steps = inout(reg) steps => _,
-                stride = in(reg) stride,
-                row = in(reg) ROW,
-                sums = in(reg) sums,
-                options(nostack)
-            );
-        } else {
-            asm!(
-                "tileloadd tmm0, [{sums} + {row}*1]",
-                "tileloadd tmm1, [{sums} + {row}*1 + 1024]",
-                "2:",
-                "tileloadd tmm4, [{x} + {stride}*1]",
-                "tileloadd tmm6, [{w} + {row}*1]",
-                "tileloadd tmm5, [{y} + {stride}*1]",
-                "add {x}, 64",
-                "add {y}, 64",
-                "add {w}, 1024",
-                "tdpbf16ps tmm0, tmm4, tmm6",
-                "tdpbf16ps tmm1, tmm5, tmm6",
-                "dec {steps}",
-                "jnz 2b",
-                "tilestored [{sums} + {row}*1], tmm0",
-                "tilestored [{sums} + {row}*1 + 1024], tmm1",
-                x = inout(reg) channels => _,
-                y = inout(reg) upper => _,
-                w = inout(reg) pairs => _,
-                steps = inout(reg) steps => _,
-                stride = in(reg) stride,
-                row = in(reg) ROW,
-                sums = in(reg) sums,
-                options(nostack)
-            );
-        }
-    }
-    const { assert!(TILE == 1024 && size_of::<Sums>() == 4 * TILE && size_of::<Term>() == 16) };
-    const { assert!(size_of::<Wide>() == ROW && WIDE == 32) };
 }

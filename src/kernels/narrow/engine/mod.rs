@@ -19,7 +19,7 @@ use crate::kernels::{
     simd::choose,
     winograd::{PATCH, SIDE},
 };
-use portable::Portable;
+use portable::{Backend, Portable};
 
 /// Squares side by side that are transformed, multiplied and transformed back together ([`super::winograd`]): what they need
 /// meanwhile stays in the second-level cache.
@@ -28,148 +28,31 @@ pub const SQUARES: usize = 16;
 /// The inverse of 9 modulo 2^32.
 const NINTH: u32 = 0x38e3_8e39;
 
-/// A way to multiply narrow matrices. A value proves that the processor has its instructions: only [`Backend::detect`] makes
-/// one. What it has none for is done by plain loops.
-trait Backend: Copy + fmt::Debug {
-    /// The backend, if this processor has it.
-    fn detect() -> Option<Self>;
+/// A product of matrices: 32 positions of an input and the weights of one or two output planes.
+#[derive(Clone, Copy)]
+pub struct Product<'a> {
+    pub terms: &'a [Term],
+    /// How many groups of rows of each term's weights are not zero: an engine may leave out the others.
+    pub groups: &'a [u8],
+    pub position: usize,
+    pub weights: *const Wide,
+    /// Output planes, 1 or 2, and how many rows their weights lie apart.
+    pub outputs: usize,
+    pub plane: usize,
+}
 
-    /// Whether its products of bfloat16 are faster than those of f32.
-    fn prefers_bf16(self) -> bool {
-        false
-    }
-
-    /// Whether its products of 8 bits are faster than all others.
-    fn prefers_int8(self) -> bool {
-        false
-    }
-
-    /// See [`Engine::prefers_squares`].
-    fn prefers_squares(self, _: Geometry) -> bool {
-        false
-    }
-
-    /// See [`Engine::adds_in_16_bits`].
-    fn adds_in_16_bits(self, _: Geometry) -> bool {
-        false
-    }
-
-    /// See [`Engine::ready`].
-    fn ready<R>(self, work: impl FnOnce() -> R) -> R {
-        work()
-    }
-
-    /// See [`Engine::multiply`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn multiply_int8(
-        self,
-        (terms, _): (&[Term], &[u8]),
-        position: usize,
-        weights: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::multiply::<true>(terms, position, weights, outputs, sums) }
-    }
-
-    /// See [`Engine::multiply`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn multiply_bf16(
-        self,
-        (terms, _): (&[Term], &[u8]),
-        position: usize,
-        weights: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::multiply::<false>(terms, position, weights, outputs, sums) }
-    }
-
-    /// See [`Engine::evaluate`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn evaluate(self, patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::evaluate(patch, squares, points, stride) }
-    }
-
-    /// [`Engine::multiply_points`] for one output plane.
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn multiply_points(
-        self,
-        groups: &[u8],
-        points: *const Wide,
-        weights: *const Wide,
-        squares: usize,
-        products: *mut Wide,
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::multiply_points(groups, points, weights, squares, products) }
-    }
-
-    /// See [`Engine::interpolate`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn interpolate(
-        self,
-        products: *const Wide,
-        stride: usize,
-        sums: &mut [Sums; SIDE],
-        place: (usize, usize),
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::interpolate(products, stride, sums, place) }
-    }
-
-    /// See [`Engine::correlate`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn correlate(
-        self,
-        steps: usize,
-        channels: *const bf16,
-        stride: usize,
-        pairs: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::correlate(steps, channels, stride, pairs, outputs, sums) }
-    }
-
-    /// See [`Engine::narrow_spread`].
-    ///
-    /// # Safety
-    /// As that, and both halves are of one length.
-    unsafe fn narrow_spread(self, low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::narrow_spread(low, high, out, step) }
-    }
-
-    /// See [`Engine::interleave`].
-    fn interleave(self, pairs: &[[Block; 2]], out: &mut [Wide]) {
-        portable::interleave(pairs, out);
-    }
-
-    /// See [`Engine::transpose`].
-    ///
-    /// # Safety
-    /// As that.
-    unsafe fn transpose(self, blocks: &[Block], rows: *mut bf16, stride: usize) {
-        // SAFETY: the caller's promise.
-        unsafe { portable::transpose(blocks, rows, stride) }
-    }
+/// A product of 32 input channels, each a row of `stride` bytes, and one or two output planes, over pixels.
+#[derive(Clone, Copy)]
+pub struct Correlation {
+    /// Times 32 positions.
+    pub steps: usize,
+    pub channels: *const bf16,
+    pub stride: usize,
+    /// Positions interleaved two by two.
+    pub pairs: *const Wide,
+    /// Output planes, 1 or 2, and how many rows they lie apart.
+    pub outputs: usize,
+    pub plane: usize,
 }
 
 /// A way to multiply narrow matrices that this processor has.
@@ -212,8 +95,12 @@ macro_rules! with_backend {
 
 impl fmt::Debug for Engine {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        with_backend!(self, backend => backend.fmt(f))
+        f.write_str(with_backend!(self, backend => name(backend)))
     }
+}
+
+fn name<B: Backend>(_: B) -> &'static str {
+    B::NAME
 }
 
 impl Engine {
@@ -276,26 +163,16 @@ impl Engine {
         with_backend!(self, backend => backend.ready(work))
     }
 
-    /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]` for 32 positions
-    /// and `outputs.0` (1 or 2) output planes whose weights lie `outputs.1` rows apart, both factors in `format`. The
-    /// weights of a term beyond its groups of rows, which come with the terms, are zero: an engine may leave them out.
+    /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]`, both factors in `format`.
     ///
     /// # Safety
     /// Called inside [`Engine::ready`]; every term's 32 rows of input and 16 rows of weights can be read.
-    pub(super) unsafe fn multiply(
-        self,
-        format: Format,
-        terms: (&[Term], &[u8]),
-        position: usize,
-        weights: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
+    pub(super) unsafe fn multiply(self, format: Format, product: Product, sums: &mut Sums) {
         // SAFETY: the caller's promise.
         unsafe {
             with_backend!(self, backend => match format {
-                Format::Int8(_) => backend.multiply_int8(terms, position, weights, outputs, sums),
-                Format::Bf16 => backend.multiply_bf16(terms, position, weights, outputs, sums),
+                Format::Int8(_) => backend.multiply_int8(product, sums),
+                Format::Bf16 => backend.multiply_bf16(product, sums),
             });
         }
     }
@@ -359,25 +236,13 @@ impl Engine {
         unsafe { with_backend!(self, backend => backend.interpolate(products, stride, sums, place)) }
     }
 
-    /// `sums[o][half][i] += sum over positions of channels[16 half + i][position] * pairs[o][position]`:
-    /// 32 input channels, each a row of `stride` bytes, against `outputs.0` (1 or 2) output planes, `outputs.1`
-    /// rows apart, of `steps` times 32 positions interleaved two by two.
+    /// `sums[o][half][i] += sum over positions of channels[16 half + i][position] * pairs[o][position]`.
     ///
     /// # Safety
     /// Called inside [`Engine::ready`]; all rows can be read.
-    pub(super) unsafe fn correlate(
-        self,
-        steps: usize,
-        channels: *const bf16,
-        stride: usize,
-        pairs: *const Wide,
-        outputs: (usize, usize),
-        sums: &mut Sums,
-    ) {
+    pub(super) unsafe fn correlate(self, correlation: Correlation, sums: &mut Sums) {
         // SAFETY: the caller's promise.
-        unsafe {
-            with_backend!(self, backend => backend.correlate(steps, channels, stride, pairs, outputs, sums));
-        }
+        unsafe { with_backend!(self, backend => backend.correlate(correlation, sums)) }
     }
 
     /// Rounds 32 channels, the upper 16 of which may be absent, to bfloat16, block by block.
