@@ -77,12 +77,12 @@ pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: 
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
     rows.enumerate().for_each(|(y, ((red, green), blue))| {
-        Tier::detect().run(Row { size, place, y, fine, coarse, masks, output: [red, green, blue] });
+        Tier::detect().run(BlendRow { size, place, y, fine, coarse, masks, output: [red, green, blue] });
     });
 }
 
 /// One row of a blend.
-struct Row<'a> {
+struct BlendRow<'a> {
     size: Size,
     place: Place,
     y: usize,
@@ -92,7 +92,7 @@ struct Row<'a> {
     output: [&'a mut [f32]; 3],
 }
 
-impl Kernel for Row<'_> {
+impl Kernel for BlendRow<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { size: Size { w, .. }, place, y, fine, coarse, masks, mut output } = self;

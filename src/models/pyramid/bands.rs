@@ -47,7 +47,7 @@ pub fn of_planes(planes: Planes) -> Field {
 
 /// A frame that comes in band by band and leaves denoised.
 pub struct Feed<'a, S> {
-    frame: Frame<'a, S>,
+    frame: Progress<'a, S>,
     /// Columns and rows of the frame.
     size: (usize, usize),
 }
@@ -56,7 +56,7 @@ impl<'a, S: Subject> Feed<'a, S> {
     /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made for as many rows
     /// as [`padded`] has.
     pub fn new(trunk: &'a Trunk, subject: S, size: (usize, usize), band: usize) -> Self {
-        Self { frame: Frame::new(trunk, subject, padded(size.1), band), size }
+        Self { frame: Progress::new(trunk, subject, padded(size.1), band), size }
     }
 
     /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, times `scale`,
@@ -99,7 +99,7 @@ pub fn padded(rows: usize) -> usize {
 }
 
 /// All that is under way in a frame.
-struct Frame<'a, S> {
+struct Progress<'a, S> {
     trunk: &'a Trunk,
     subject: S,
     /// Rows that one step may take: without it, the last step would take all that is behind.
@@ -133,7 +133,7 @@ pub struct Filtered {
     smooth: Line<Field>,
 }
 
-impl<'a, S: Subject> Frame<'a, S> {
+impl<'a, S: Subject> Progress<'a, S> {
     fn new(trunk: &'a Trunk, subject: S, height: usize, band: usize) -> Self {
         let filtered = |s: usize| Filtered {
             image: Line::new(height >> s),

@@ -13,7 +13,7 @@ use crate::{companion::Kind, features::LightInputs, nn::Line, planes::Planes};
 
 /// Rows of radiance and its companions. They are handed out in this order, each (3, R, W): radiance, exposed, the normal,
 /// what radiance was divided by, and the companions.
-pub struct Light {
+pub struct LightImages {
     /// What is divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is to divide.
     quotient: Line<Field>,
     ratio: Line<Field>,
@@ -26,7 +26,7 @@ pub struct Light {
     normal: Line<Field>,
 }
 
-impl Light {
+impl LightImages {
     /// Of a frame of so many rows.
     pub fn new(height: usize, companions: &[Kind]) -> Self {
         let line = || Line::new(height);
@@ -41,7 +41,7 @@ impl Light {
     }
 }
 
-impl Subject for Light {
+impl Subject for LightImages {
     /// Companions are divided as radiance is.
     type Inputs = (LightInputs, Vec<Planes>);
 

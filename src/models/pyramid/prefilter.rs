@@ -130,9 +130,9 @@ impl Network for Prefilter {
 }
 
 /// Albedo and normal on their way through a prefilter, which hands them out in this order, in its scale.
-pub(super) struct Guides;
+pub(super) struct GuideImages;
 
-impl Subject for Guides {
+impl Subject for GuideImages {
     type Inputs = GuideInputs;
 
     fn images(&self) -> usize {

@@ -12,8 +12,8 @@ use rayon::prelude::*;
 use super::{
     NEEDED_BY, Pyramid,
     bands::{Feed, padded},
-    light::Light,
-    prefilter::{Guides, Prefilter},
+    light::LightImages,
+    prefilter::{GuideImages, Prefilter},
     trunk::MULTIPLE,
 };
 use crate::{
@@ -23,7 +23,7 @@ use crate::{
         LightInputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
         guide_inputs, guide_rows, keep_black, light_inputs, normal_of_target, tame_alike,
     },
-    filters::refit::{self, Refit, Samples},
+    filters::refit::{Guides, Refit, Samples},
     models::network::Network,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -136,7 +136,7 @@ fn prefilter_bands(
     cut: &Cut,
     done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
 ) -> Result<()> {
-    let mut feed = Feed::new(&prefilter.trunk, Guides, cut.size(), cut.rows);
+    let mut feed = Feed::new(&prefilter.trunk, GuideImages, cut.size(), cut.rows);
     for band in cut.bands() {
         let padded = cut.padded(&band);
         let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded).columns(cut.padded_columns());
@@ -252,7 +252,7 @@ impl Whole<'_> {
         let Self { network, passes, .. } = *self;
         let cut = Cut::new(passes, strip.seen.clone(), self.rows);
         let kinds: Vec<Kind> = self.companions.iter().map(|companion| companion.kind).collect();
-        let light = Light::new(padded(passes.height), &kinds);
+        let light = LightImages::new(padded(passes.height), &kinds);
         let mut beauty = Feed::new(&network.trunk, light, cut.size(), cut.rows);
         let mut last = Last::new(self, strip, written);
         let mut feed = |rows: Range<usize>, guides: [Planes; 2]| {
@@ -372,7 +372,7 @@ impl<'a> Last<'a> {
         let is_lit = companions.iter().any(|companion| companion.kind == Kind::Light);
         let before = if is_lit { image.clone() } else { Planes::default() };
         let first = self.refit.done();
-        let guides = refit::Guides { size: self.size, normal: &normal.data, albedo: &albedo.data, first };
+        let guides = Guides { size: self.size, normal: &normal.data, albedo: &albedo.data, first };
         let samples = Samples::Rendered(radiance, self.strip.seen.start, exposure);
         let change = |v: &mut f32, factor: f32| *v = *v * factor * exposure.recip();
         self.refit.advance(guides, &mut image.data, samples, end, change);
