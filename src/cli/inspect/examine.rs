@@ -86,13 +86,13 @@ pub struct Missing {
 }
 
 /// A method and the passes it needs.
-pub struct Method {
+pub struct Needs {
     name: String,
     passes: Vec<Pass>,
 }
 
 /// The methods there are, with the passes they need: networks with weights, classical methods, peers.
-pub fn methods() -> Vec<Method> {
+pub fn methods() -> Vec<Needs> {
     let listed = METHODS.iter().filter(|method| method.family != Family::Noisy);
     let passes = |method: &catalogue::Method| match method.kind {
         Kind::Fixed(make) => Some(make().passes().to_vec()),
@@ -100,7 +100,7 @@ pub fn methods() -> Vec<Method> {
         _ => Some(method.learned().ok()?.passes().to_vec()),
     };
     let method =
-        |method: &catalogue::Method| Some(Method { name: method.name.into(), passes: passes(method)? });
+        |method: &catalogue::Method| Some(Needs { name: method.name.into(), passes: passes(method)? });
     listed.filter_map(method).collect()
 }
 
@@ -108,7 +108,7 @@ pub fn methods() -> Vec<Method> {
 const DEFAULT_MODEL: &str = "demc-m";
 
 /// Reads and decodes a whole file. It leaves a trace if it `is_compared` with another.
-pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
+pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
     let frame = Frame::read(path)?;
     let parts = frame.parts().iter().map(|p| PartReport {
         name: p.name.clone(),
@@ -179,7 +179,7 @@ fn undecodable(frame: &Frame) -> Vec<Finding> {
 fn examine_layer(
     frame: &Frame,
     layer: &Layer,
-    methods: &[Method],
+    methods: &[Needs],
     is_compared: bool,
 ) -> Result<(LayerReport, Option<Trace>)> {
     let mut trace = None;
@@ -236,7 +236,7 @@ fn examine_layer(
 }
 
 /// What the file says of a view layer's passes.
-fn about(frame: &Frame, layer: &Layer, methods: &[Method]) -> About {
+fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
     let is_half = |pass: &Pass| {
         let at = &layer.passes[pass];
         frame.parts()[at.part].channels[at.channels[0]].kind == SampleKind::Half
