@@ -158,7 +158,7 @@ pub struct Refined {
     pub albedo: Planes,
     /// The denoised normal, (3, H, W): the refit reads it, the network does not.
     pub normal: Planes,
-    /// How the normal changes the light, a logarithm, (1, H, W). See [`Shading`].
+    /// See [`LightInputs::shading`].
     pub shading: Planes,
 }
 
@@ -171,23 +171,51 @@ impl Refined {
     }
 }
 
-/// The built-in models' inputs, in this order:
-///
-/// 0. light: exposed radiance divided by plane 1, (3, H, W);
-/// 1. divisor: the denoised albedo, clamped to 0..1, plus a floor of 0.05, (3, H, W);
-/// 2. input of the radiance encoder: the log-encoded light, (3, H, W);
-/// 3. input of the guide encoder, (7, H, W): the denoised albedo (3), the camera-space normal as rendered
-///    (3), whose noise is correlated with that of the radiance, and the mean of plane 4 over the colours (1);
-/// 4. logarithm of the divisor over the divisor that the noisy albedo would give, (3, H, W);
-/// 5. shading, see [`Shading`], (1, H, W);
-/// 6. the denoised normal, for the refit, (3, H, W).
-///
-/// `exposure` is that of the whole frame; `passes` may be some rows of it. The scale of the inputs is the
-/// inverse of the exposure.
+/// What a built-in network reads of a frame, as [`light_inputs`] makes it, each of the frame's size. `T` is an image, or
+/// those of several frames.
+#[derive(Clone, Debug)]
+pub struct LightInputs<T = Planes> {
+    /// Exposed radiance over the divisor, (3, H, W): what the network filters.
+    pub light: T,
+    /// The denoised albedo, clamped to 0..1, plus a floor of 0.05, (3, H, W).
+    pub divisor: T,
+    /// Input of the radiance encoder: the log-encoded light, (3, H, W).
+    pub encoded: T,
+    /// Input of the guide encoder, (7, H, W): the denoised albedo (3), the camera-space normal as rendered (3), whose
+    /// noise is correlated with that of the radiance, and the mean of `ratio` over the colours (1).
+    pub guide: T,
+    /// Logarithm of the divisor over the divisor that the noisy albedo would give, (3, H, W).
+    pub ratio: T,
+    /// How the normal changes the light, a logarithm, (1, H, W). See [`Shading`].
+    pub shading: T,
+    /// The denoised normal, for the refit, (3, H, W).
+    pub normal: T,
+}
+
+impl<T> LightInputs<T> {
+    /// In the order in which [`Inputs`] and batches hold them.
+    pub fn into_list(self) -> [T; 7] {
+        let Self { light, divisor, encoded, guide, ratio, shading, normal } = self;
+        [light, divisor, encoded, guide, ratio, shading, normal]
+    }
+
+    /// The inverse of [`LightInputs::into_list`].
+    pub fn from_list([light, divisor, encoded, guide, ratio, shading, normal]: [T; 7]) -> Self {
+        Self { light, divisor, encoded, guide, ratio, shading, normal }
+    }
+}
+
+/// The built-in networks' inputs. `exposure` is that of the whole frame; `passes` may be some rows of it. What the network
+/// makes of them is to be multiplied by the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guides(passes: &PassSet, refined: Refined, exposure: f32, needed_by: &str) -> Result<Inputs> {
+pub fn light_inputs(
+    passes: &PassSet,
+    refined: Refined,
+    exposure: f32,
+    needed_by: &str,
+) -> Result<LightInputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
     let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
     let noisy_normal = passes.require(Pass::DenoisingNormal, needed_by)?;
@@ -196,23 +224,22 @@ pub fn guides(passes: &PassSet, refined: Refined, exposure: f32, needed_by: &str
     let mut guide = unwritten(7);
     let (colours, rest) = guide.data.split_at_mut(noisy.data.len());
     let (directions, mean) = rest.split_at_mut(noisy.data.len());
-    let [mut albedo, mut irradiance, mut encoded] = [(); 3].map(|()| unwritten(3));
+    let [mut divisor, mut light, mut encoded] = [(); 3].map(|()| unwritten(3));
     let read = clean.data.par_chunks(CHUNK).zip(radiance.data.par_chunks(CHUNK));
-    let written = colours.par_chunks_mut(CHUNK).zip(albedo.data.par_chunks_mut(CHUNK));
-    let lit = irradiance.data.par_chunks_mut(CHUNK).zip(encoded.data.par_chunks_mut(CHUNK));
+    let written = colours.par_chunks_mut(CHUNK).zip(divisor.data.par_chunks_mut(CHUNK));
+    let lit = light.data.par_chunks_mut(CHUNK).zip(encoded.data.par_chunks_mut(CHUNK));
     read.zip(written).zip(lit).for_each(|(((clean, radiance), (colours, albedo)), (irradiance, encoded))| {
         vectorised::run(Divide { clean, radiance, exposure, colours, albedo, irradiance, encoded });
     });
     map(&noisy_normal.data, directions, unit);
     let mut ratio = clean;
-    let divisors = albedo.data.par_chunks(CHUNK).zip(noisy.data.par_chunks(CHUNK));
+    let divisors = divisor.data.par_chunks(CHUNK).zip(noisy.data.par_chunks(CHUNK));
     ratio.data.par_chunks_mut(CHUNK).zip(divisors).for_each(|(ratio, (clean, noisy))| {
         vectorised::run(Compare { clean, noisy, ratio });
     });
     let colours = ratio.channel(0).par_iter().zip(ratio.channel(1)).zip(ratio.channel(2));
     mean.par_iter_mut().zip(colours).for_each(|(mean, ((r, g), b))| *mean = (r + g + b) / 3.0);
-    let planes = vec![irradiance, albedo, encoded, guide, ratio, shading, normal];
-    Ok(Inputs { planes, scale: exposure.recip() })
+    Ok(LightInputs { light, divisor, encoded, guide, ratio, shading, normal })
 }
 
 /// Divides radiance by albedo, for a run of values.
@@ -300,28 +327,48 @@ fn divisor(albedo: f32) -> f32 {
 /// counts about as much as the same error of an albedo of a few tenths, and less where the component is long.
 const NORMAL_SCALE: f32 = 0.1;
 
-/// A prefilter's inputs, each (3, H, W), in this order:
-///
-/// 0. the exposed divisor that the noisy albedo gives;
-/// 1. the normal, scaled as in [`guide_targets`], and exposed;
-/// 2. input of the radiance encoder: the log encoding of plane 0;
-/// 3. input of the guide encoder: the normal.
-///
-/// The scale of the inputs is `1 / exposure`.
+/// What a prefilter reads of a frame, as [`guide_inputs`] makes it, each (3, H, W). `T` is an image, or those of several
+/// frames.
+#[derive(Clone, Debug)]
+pub struct GuideInputs<T = Planes> {
+    /// The exposed divisor that the noisy albedo gives.
+    pub albedo: T,
+    /// The normal, scaled as in [`guide_targets`], and exposed.
+    pub normal: T,
+    /// Input of the radiance encoder: the log encoding of `albedo`.
+    pub encoded: T,
+    /// Input of the guide encoder: the normal.
+    pub guide: T,
+}
+
+impl<T> GuideInputs<T> {
+    /// In the order in which [`Inputs`] and batches hold them.
+    pub fn into_list(self) -> [T; 4] {
+        let Self { albedo, normal, encoded, guide } = self;
+        [albedo, normal, encoded, guide]
+    }
+
+    /// The inverse of [`GuideInputs::into_list`].
+    pub fn from_list([albedo, normal, encoded, guide]: [T; 4]) -> Self {
+        Self { albedo, normal, encoded, guide }
+    }
+}
+
+/// A prefilter's inputs. What it makes of them is to be multiplied by the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
-pub fn noisy_guides(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Inputs> {
-    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+pub fn guide_inputs(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<GuideInputs> {
+    let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    let rendered = passes.require(Pass::DenoisingNormal, needed_by)?;
     let unwritten = || Planes::unwritten(3, passes.width, passes.height);
-    let [mut light, mut small, mut encoded, mut direction] = [(); 4].map(|()| unwritten());
-    map(&albedo.data, &mut light.data, |a| divisor(a) * exposure);
-    map(&normal.data, &mut small.data, |axis| unit(axis) * (NORMAL_SCALE * exposure));
-    map(&normal.data, &mut direction.data, unit);
-    let rows = encoded.data.par_chunks_mut(CHUNK).zip(light.data.par_chunks(CHUNK));
+    let [mut albedo, mut normal, mut encoded, mut guide] = [(); 4].map(|()| unwritten());
+    map(&noisy.data, &mut albedo.data, |a| divisor(a) * exposure);
+    map(&rendered.data, &mut normal.data, |axis| unit(axis) * (NORMAL_SCALE * exposure));
+    map(&rendered.data, &mut guide.data, unit);
+    let rows = encoded.data.par_chunks_mut(CHUNK).zip(albedo.data.par_chunks(CHUNK));
     rows.for_each(|(encoded, light)| vectorised::run(Encode { light, encoded }));
-    Ok(Inputs { planes: vec![light, small, encoded, direction], scale: exposure.recip() })
+    Ok(GuideInputs { albedo, normal, encoded, guide })
 }
 
 /// Log-encodes light, for a run of values.

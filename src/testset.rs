@@ -250,7 +250,7 @@ fn sort(pairs: &mut [Pair]) {
 
 /// A row of a manifest.
 #[derive(Deserialize)]
-struct Row {
+struct ManifestRow {
     scene: String,
     noisy: PathBuf,
     reference: PathBuf,
@@ -270,7 +270,7 @@ fn manifest(path: &Path) -> Result<TestSet> {
     let directory = path.parent().unwrap_or(Path::new(""));
     let mut set = TestSet::default();
     let mut seen = HashMap::new();
-    for row in reader.deserialize::<Row>() {
+    for row in reader.deserialize::<ManifestRow>() {
         let row = row.map_err(|e| Error::invalid(path, format!("{e}; {remedy}")))?;
         let frame = row
             .noisy

@@ -11,7 +11,7 @@ use demc::{
         self,
         network::{Batch, Config, Network, Taped},
     },
-    nn::{Activation, BatchNorm, Conv, Guides, Images, Init, MaxPool, Param, Stats, cross_bilateral},
+    nn::{Activation, BatchNorm, Conv, GuidedImages, Images, Init, MaxPool, Param, Stats, cross_bilateral},
     rng::Rng,
 };
 use dfdx::{
@@ -284,7 +284,7 @@ fn cross_bilateral_filter() {
     let mut rng = Rng::new(4, 0);
     let mut plane = |c: usize| -> Vec<f32> { (0..n * c * h * w).map(|_| 0.1 + rng.uniform()).collect() };
     let guides =
-        Guides { radius: 3, image: plane(3), noise: plane(1), features: plane(5), groups: vec![2, 3] };
+        GuidedImages { radius: 3, image: plane(3), noise: plane(1), features: plane(5), groups: vec![2, 3] };
     let values = plane(4);
     let precision = images(values.clone(), (n, 4, h, w));
     let filtered = cross_bilateral(guides.clone(), precision.leaky_trace());

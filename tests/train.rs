@@ -16,7 +16,7 @@ use demc::{
     models::{self, weights_file},
     nn::weights::{self, Tensor},
     shot,
-    train::{self, Event, Options},
+    train::{self, TrainEvent, TrainOptions},
 };
 use predicates::prelude::*;
 
@@ -173,7 +173,7 @@ fn skipped_steps_are_told_and_a_run_that_takes_none_stops_with_the_checkpoint_be
 
     // Step 1 goes well, step 2 leaves such weights, step 3 is skipped.
     let options = options(&out);
-    let well = Options { lr: (1e-4, 1e-4), ..options.clone() };
+    let well = TrainOptions { lr: (1e-4, 1e-4), ..options.clone() };
     let cut = dir.path().join("cut");
     assert!(matches!(run_until(&well, &cut, false, 1), Err(Error::Interrupted)));
     let good = tensors(&cut);
@@ -182,16 +182,16 @@ fn skipped_steps_are_told_and_a_run_that_takes_none_stops_with_the_checkpoint_be
 }
 
 /// What a run's config.json holds.
-fn options(out: &Path) -> Options {
+fn options(out: &Path) -> TrainOptions {
     let text = fs::read_to_string(out.join("config.json")).expect("a configuration");
     serde_json::from_str(&text).expect("options")
 }
 
 /// Trains in this process until the step `stop_at`, as if interrupted there.
-fn run_until(options: &Options, out: &Path, resume: bool, stop_at: usize) -> demc::Result<()> {
+fn run_until(options: &TrainOptions, out: &Path, resume: bool, stop_at: usize) -> demc::Result<()> {
     let stop = AtomicBool::new(false);
     train::run(options, out, resume, &stop, &mut |event| {
-        if matches!(event, Event::Step { step, .. } if step == stop_at) {
+        if matches!(event, TrainEvent::Step { step, .. } if step == stop_at) {
             stop.store(true, Ordering::Relaxed);
         }
     })
@@ -205,7 +205,7 @@ fn a_resumed_run_needs_none_of_the_weights_it_began_with() {
     let begin = first.join("best.safetensors");
     let (whole, cut) = (dir.path().join("whole"), dir.path().join("cut"));
     run(train(&other, 2).arg("--init").arg(&begin).arg("--prefilter").arg(&begin)).success();
-    let options = Options { steps: 6, every: 2, ..options(&other) };
+    let options = TrainOptions { steps: 6, every: 2, ..options(&other) };
     run_until(&options, &whole, false, 0).expect("it ends");
     assert!(matches!(run_until(&options, &cut, false, 3), Err(Error::Interrupted)));
     fs::remove_file(&begin).expect("it was there");
@@ -255,7 +255,7 @@ fn a_run_goes_on_from_any_folder_to_as_many_steps_as_its_configuration_says() {
     command.args(["train", "--data", "tests/data/s0010_outdoor_*.exr", "--batch", "1", "--patch", "32"]);
     command.args(["--model", "demc-s", "--every", "2", "--steps", "2"]).arg("--out").arg(&out);
     run(command.current_dir(env!("CARGO_MANIFEST_DIR"))).success();
-    let longer = Options { steps: 4, ..options(&out) };
+    let longer = TrainOptions { steps: 4, ..options(&out) };
     fs::write(out.join("config.json"), serde_json::to_string(&longer).expect("text")).expect("a file");
     let mut command = resume(Path::new("run"));
     run(command.current_dir(dir.path())).success();

@@ -9,7 +9,7 @@ use super::lines::{ExitCode, print_line, warn_line};
 use super::methods;
 use crate::{
     Error, Result,
-    report::{self, Event, Method, Options, Row},
+    report::{self, Contender, EvalEvent, EvalOptions, Row},
 };
 
 /// Arguments of `demc eval`.
@@ -57,7 +57,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         methods.extend(args.asked.temporal(&methods, reach.into())?);
     }
     let baseline = baseline(&args, &methods)?;
-    let options = Options {
+    let options = EvalOptions {
         out: args.out,
         repeats: args.repeats.into(),
         threads,
@@ -78,7 +78,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     Ok(methods::finish(failed, &options.out.join("scores.csv")))
 }
 
-fn baseline(args: &Args, methods: &[Method]) -> Result<String> {
+fn baseline(args: &Args, methods: &[Contender]) -> Result<String> {
     let Some(wanted) = &args.baseline else {
         return Ok(methods.get(1).unwrap_or(&methods[0]).name.clone());
     };
@@ -108,9 +108,9 @@ impl Progress {
         Self { bar: None, rows: 0, done: 0, told: HashSet::new() }
     }
 
-    fn tell(&mut self, event: &Event) {
+    fn tell(&mut self, event: &EvalEvent) {
         match event {
-            Event::Start { rows, kept } => {
+            EvalEvent::Start { rows, kept } => {
                 (self.rows, self.done) = (*rows, *kept);
                 if *kept > 0 {
                     warn_line(&format!(
@@ -126,12 +126,12 @@ impl Progress {
                     self.bar = Some(bar);
                 }
             }
-            Event::Pair(pair) => {
+            EvalEvent::Pair(pair) => {
                 if let Some(bar) = &self.bar {
                     bar.set_message(pair.id());
                 }
             }
-            Event::Note(note) => {
+            EvalEvent::Note(note) => {
                 if self.told.insert((*note).to_owned()) {
                     match &self.bar {
                         Some(bar) => bar.println(format!("note: {note}")),
@@ -139,7 +139,7 @@ impl Progress {
                     }
                 }
             }
-            Event::Row(row) => {
+            EvalEvent::Row(row) => {
                 self.done += 1;
                 let line = self.line(row);
                 match &self.bar {

@@ -13,7 +13,7 @@ use crate::{
     Error, Result,
     denoise::{TEMPORAL, Temporal},
     models::{self, Denoiser, oidn::Oidn},
-    report::{self, Method, NOISY},
+    report::{self, Contender, NOISY},
     testset::{self, Pair, Unmatched},
 };
 
@@ -49,7 +49,7 @@ impl Args {
     ///
     /// # Errors
     /// A name is no method's.
-    pub fn methods(&self) -> Result<Vec<Method>> {
+    pub fn methods(&self) -> Result<Vec<Contender>> {
         let threads = self.threads();
         // Built-in methods change with the program.
         let program = super::program().map_or("unknown".into(), |path| report::file_stamp(&path));
@@ -73,7 +73,7 @@ impl Args {
             let (spec, view_layer) = (name.to_string(), self.view_layer.clone());
             let peak_mib =
                 move |noisy: &Path| peak_memory::in_own_process(&spec, noisy, view_layer.as_deref(), threads);
-            methods.push(Method {
+            methods.push(Contender {
                 name: short_name(name, &asked),
                 denoiser,
                 peak_mib: Box::new(peak_mib),
@@ -87,7 +87,7 @@ impl Args {
     ///
     /// # Errors
     /// As [`Args::methods`].
-    pub fn temporal(&self, methods: &[Method], reach: usize) -> Result<Vec<Method>> {
+    pub fn temporal(&self, methods: &[Contender], reach: usize) -> Result<Vec<Contender>> {
         let asked: Vec<&str> = self.models.iter().map(|model| model.trim()).collect();
         let mut added = Vec::new();
         for name in &asked {
@@ -96,7 +96,7 @@ impl Args {
             else {
                 continue;
             };
-            added.push(Method {
+            added.push(Contender {
                 name: short + TEMPORAL,
                 denoiser: Box::new(Temporal::new(models::open(name)?, reach)),
                 // Of a frame with its neighbours in memory, which is not what a stream takes.

@@ -20,7 +20,7 @@ pub struct Args {
 
 /// One line of the list.
 #[derive(serde::Serialize)]
-struct Row {
+struct Listed {
     model: String,
     /// "built in", "untrained", or "file" where a file next to the program holds them.
     weights: &'static str,
@@ -31,8 +31,8 @@ struct Row {
     trained: Option<String>,
 }
 
-fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<String>) -> Row {
-    Row {
+fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<String>) -> Listed {
+    Listed {
         model: method.name.into(),
         weights: match trained {
             None => "untrained",
@@ -48,7 +48,7 @@ fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<St
     }
 }
 
-fn trained(method: &Method) -> Result<Row> {
+fn trained(method: &Method) -> Result<Listed> {
     let mut model = method.learned()?;
     let t = &model.metadata.training;
     let last = if t.init.is_some() { ", the last of several runs (docs/training.md)" } else { "" };
@@ -69,7 +69,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         Some(Ok(row(method, &mut *network, macs, None)))
     });
     let rows = METHODS.iter().filter(with_weights).map(trained).chain(untrained);
-    let rows: Vec<Row> = rows.collect::<Result<_>>()?;
+    let rows: Vec<Listed> = rows.collect::<Result<_>>()?;
     if args.json {
         super::lines::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
         return Ok(ExitCode::SUCCESS);

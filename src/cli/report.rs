@@ -55,7 +55,7 @@ enum Status {
 }
 
 /// What became of a frame in the end.
-struct Frame {
+struct Fate {
     status: Status,
     error: String,
 }
@@ -65,7 +65,7 @@ struct Frame {
 /// # Errors
 /// A log cannot be read, or the inputs of `--of` name no file.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let mut frames: BTreeMap<PathBuf, Frame> = BTreeMap::new();
+    let mut frames: BTreeMap<PathBuf, Fate> = BTreeMap::new();
     let mut seconds = 0.0;
     for log in &args.logs {
         let mut unreadable = 0;
@@ -114,7 +114,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 }
 
 /// A frame that any try denoised is denoised: tasks are run again, and meet.
-fn add(frames: &mut BTreeMap<PathBuf, Frame>, line: Line) {
+fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     let rank = |status| match status {
         Status::Failed => 0,
         Status::Skipped => 1,
@@ -123,11 +123,11 @@ fn add(frames: &mut BTreeMap<PathBuf, Frame>, line: Line) {
     let known = frames.get(&line.input).map(|frame| rank(frame.status));
     if known.is_none_or(|known| known <= rank(line.status)) {
         let error = line.error.unwrap_or_default();
-        frames.insert(line.input, Frame { status: line.status, error });
+        frames.insert(line.input, Fate { status: line.status, error });
     }
 }
 
-fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Frame>) -> Result<Vec<PathBuf>> {
+fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) -> Result<Vec<PathBuf>> {
     if of.is_empty() {
         return Ok(Vec::new());
     }

@@ -24,7 +24,7 @@ pub struct Names {
 
 /// Files of their own that hold guides.
 #[derive(Clone, Debug, Default, ClapArgs)]
-pub struct Guides {
+pub struct GuideFiles {
     /// The file that holds the albedo; #### in its name is the frame's number
     #[arg(long, value_name = "FILE")]
     albedo: Option<PathBuf>,
@@ -51,7 +51,7 @@ impl Names {
     }
 }
 
-impl Guides {
+impl GuideFiles {
     /// With the names, where the passes of one frame or of several are.
     ///
     /// # Errors

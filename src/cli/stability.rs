@@ -9,7 +9,7 @@ use super::methods;
 use crate::{
     Error, Result,
     report::{NOISY, number},
-    stability::{self, Options, Row, Trial, content::Case},
+    stability::{self, StabilityOptions, Trial, TrialRow, content::Case},
 };
 
 /// Arguments of `demc stability`.
@@ -66,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             names.join(", ")
         )));
     }
-    let options = Options {
+    let options = StabilityOptions {
         out: args.out.clone(),
         view_layer: args.asked.view_layer.clone(),
         trials: if args.trials.is_empty() { Trial::ALL.to_vec() } else { in_order(&args.trials) },
@@ -75,7 +75,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         threads: args.asked.threads(),
     };
     let (mut done, all) = (0, pairs.len() * methods.len() * options.trials.len());
-    let mut tell = |row: &Row| {
+    let mut tell = |row: &TrialRow| {
         done += 1;
         let value =
             |name: &str, v: Option<f64>| v.map(|v| format!("  {name} {}", number(v))).unwrap_or_default();

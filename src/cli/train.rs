@@ -22,7 +22,7 @@ use crate::{
     passes::{self, Pass},
     report,
     testset::{self, Pair},
-    train::{self, Event, Loss, Options, Rule},
+    train::{self, Loss, Rule, TrainEvent, TrainOptions},
 };
 
 /// Train a network on pairs of noisy and reference frames
@@ -206,7 +206,7 @@ fn has_light_passes(pair: &Pair) -> Result<bool> {
 }
 
 impl Args {
-    fn options(&self) -> Result<Options> {
+    fn options(&self) -> Result<TrainOptions> {
         let known: Vec<_> = models::trainable().collect();
         let mut network =
             known.iter().find(|(name, _)| *name == self.model).map(|(_, c)| c.clone()).ok_or_else(|| {
@@ -250,7 +250,7 @@ impl Args {
             ));
             network.architecture = Architecture::KpcnCombined;
         }
-        let options = Options {
+        let options = TrainOptions {
             network,
             train: from_anywhere(training)?,
             validation: from_anywhere(validation)?,
@@ -283,9 +283,9 @@ impl Args {
 }
 
 /// The settings of a run that goes on, which its folder holds and people edit.
-fn stored_options(config: &Path) -> Result<Options> {
+fn stored_options(config: &Path) -> Result<TrainOptions> {
     let text = fs::read_to_string(config).map_err(Error::io("read", config))?;
-    let options: Options = serde_json::from_str(&text).map_err(|e| {
+    let options: TrainOptions = serde_json::from_str(&text).map_err(|e| {
         let line = text.lines().nth(e.line().saturating_sub(1)).unwrap_or_default().trim();
         Error::invalid(config, format!("not a run's configuration: {e}: {line}"))
     })?;
@@ -336,12 +336,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {per_sec} eta {eta} loss {msg}");
     bar.set_style(style.expect("the template is well formed"));
     let mut on = |event| match event {
-        Event::Warning(warning) => bar.suspend(|| warn_line(&format!("warning: {warning}"))),
-        Event::Step { step, loss } => {
+        TrainEvent::Warning(warning) => bar.suspend(|| warn_line(&format!("warning: {warning}"))),
+        TrainEvent::Step { step, loss } => {
             bar.set_position(step as u64);
             bar.set_message(format!("{loss:.4}"));
         }
-        Event::Logged(rows) => {
+        TrainEvent::Logged(rows) => {
             let Some(row) = rows.last() else { return };
             // A chart that cannot be drawn is no reason to lose a run.
             if let Err(e) = report::loss_chart(&args.out.join("loss.png"), &rows) {

@@ -49,7 +49,7 @@ pub const DIFFUSE_FLOOR: f32 = 0.00316;
 /// A pass is missing.
 pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     let radiance = passes.require(Pass::Combined, needed_by)?;
-    let guides = Guides::new(passes, needed_by)?;
+    let guides = SharedInputs::new(passes, needed_by)?;
     let exposure = exposure(radiance);
     let mut albedo = guides.albedo.clone();
     albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
@@ -70,7 +70,7 @@ pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
 pub fn kpcn_streams(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     let get = |pass| passes.require(pass, needed_by);
     let radiance = get(Pass::Combined)?;
-    let guides = Guides::new(passes, needed_by)?;
+    let guides = SharedInputs::new(passes, needed_by)?;
     let exposure = exposure(radiance);
     let mut colour = get(Pass::DiffuseColor)?.clone();
     colour.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
@@ -110,13 +110,13 @@ fn logarithm(planes: &Planes) -> Planes {
 }
 
 /// The inputs that both streams share, besides their colour.
-struct Guides {
+struct SharedInputs {
     albedo: Planes,
     /// Normal, albedo and depth with variances and differences, (24, H, W).
     channels: Vec<f32>,
 }
 
-impl Guides {
+impl SharedInputs {
     fn new(passes: &PassSet, needed_by: &str) -> Result<Self> {
         let [normal, albedo, depth] = GUIDES;
         let clamped = |pass, least| -> Result<Planes> {

@@ -635,14 +635,14 @@ mod tests {
 
     /// A frame whose denoised radiance over albedo is `light(pixel)`, and whose noisy one is
     /// `samples(pixel)`.
-    struct Frame {
+    struct Scene {
         normal: Vec<f32>,
         albedo: Vec<f32>,
         image: Vec<f32>,
         samples: Vec<f32>,
     }
 
-    impl Frame {
+    impl Scene {
         fn new(albedo: &[f32], light: impl Fn(usize) -> f32, samples: impl Fn(usize) -> f32) -> Self {
             let lit =
                 |of: &dyn Fn(usize) -> f32| (0..3 * PIXELS).map(|i| albedo[i] * of(i % PIXELS)).collect();
@@ -695,7 +695,7 @@ mod tests {
         // The light that comes back falls with the albedo, which the network has not seen.
         let lost = |i: usize| (albedo[i] / 0.65).powf(-0.4);
         let frame =
-            Frame::new(&albedo, |_| 0.8, |i| 0.8 * lost(i) * (1.0 + 0.5 * random[i].clamp(-1.0, 1.0)));
+            Scene::new(&albedo, |_| 0.8, |i| 0.8 * lost(i) * (1.0 + 0.5 * random[i].clamp(-1.0, 1.0)));
         let found = frame.refitted();
         let products = |a: &dyn Fn(usize) -> f32| (0..PIXELS).map(|i| a(i) * lost(i).ln()).sum::<f32>();
         let share = products(&|i| (found[i] / 0.8).ln()) / products(&|i| lost(i).ln());
@@ -708,7 +708,7 @@ mod tests {
         let is_lit = |i: usize| i % SIZE.0 >= 35;
         let light = |i: usize| if is_lit(i) { 0.4 } else { 0.2 } * (1.0 + random[i]);
         let noisy = noise(12, PIXELS, 1.0);
-        let frame = Frame::new(&grey(0.5), light, |i| light(i) * (1.0 + noisy[i]).max(0.0));
+        let frame = Scene::new(&grey(0.5), light, |i| light(i) * (1.0 + noisy[i]).max(0.0));
         let found = frame.refitted();
         let of = |columns: std::ops::Range<usize>| -> Vec<f32> {
             (0..PIXELS).filter(|i| columns.contains(&(i % SIZE.0))).map(|i| found[i]).collect()
@@ -723,7 +723,7 @@ mod tests {
     #[test]
     fn noise_of_samples_alone_changes_little() {
         let (albedo, random) = (textured(), noise(8, PIXELS, 1.0));
-        let frame = Frame::new(&albedo, |_| 0.2, |i| 0.2 * (1.0 + 2.0 * random[i]).max(0.0));
+        let frame = Scene::new(&albedo, |_| 0.2, |i| 0.2 * (1.0 + 2.0 * random[i]).max(0.0));
         let (_, change) = spread_of(&frame.refitted());
         assert!(change / 0.2 < 0.06, "{change}");
     }
@@ -734,8 +734,8 @@ mod tests {
         let light = |i: usize| 0.2 * (1.0 + random[i]);
         let lamp = |i: usize| (20..26).contains(&(i % SIZE.0)) && (20..26).contains(&(i / SIZE.0));
         let firefly = |i: usize| i == 40 * SIZE.0 + 50;
-        let without = Frame::new(&albedo, light, light).refitted();
-        let with = Frame::new(
+        let without = Scene::new(&albedo, light, light).refitted();
+        let with = Scene::new(
             &albedo,
             |i| if lamp(i) { 500.0 } else { light(i) },
             |i| {
@@ -759,7 +759,7 @@ mod tests {
     fn neither_how_samples_are_given_nor_how_rows_arrive_matters() {
         let (albedo, random) = (textured(), noise(10, PIXELS, 0.3));
         let frame =
-            Frame::new(&albedo, |i| 0.2 + 0.1 * random[i].abs(), |i| 0.2 * (1.0 + random[i]).max(0.0));
+            Scene::new(&albedo, |i| 0.2 + 0.1 * random[i].abs(), |i| 0.2 * (1.0 + random[i]).max(0.0));
         let divided: Vec<f32> =
             frame.samples.iter().zip(&frame.albedo).map(|(v, a)| v.max(0.0) * 1.5 / a).collect();
         let mut whole = frame.image.clone();
@@ -789,7 +789,7 @@ mod tests {
 
     #[test]
     fn black_and_tiny_frames_stay_finite() {
-        let black = Frame::new(&grey(0.05), |_| 0.0, |_| 0.0);
+        let black = Scene::new(&grey(0.05), |_| 0.0, |_| 0.0);
         assert!(black.refitted().iter().all(|v| *v == 0.0));
         for size in [(1, 1), (3, 2), (5, 1), (2, 9)] {
             let n = 3 * size.0 * size.1;

@@ -220,8 +220,8 @@ fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
         let first = strip * STRIP * SQUARE;
         let end = (first + STRIP * SQUARE).min(height);
         // One row more on either side; beyond the frame lies its mirror image.
-        let rows: Vec<Row> = (first as isize - 1..end as isize + 1)
-            .map(|y| Row::read(image, render, seen.film, mirrored(y.unsigned_abs(), height)))
+        let rows: Vec<PixelRow> = (first as isize - 1..end as isize + 1)
+            .map(|y| PixelRow::read(image, render, seen.film, mirrored(y.unsigned_abs(), height)))
             .collect();
         let mut columns = vec![0.0; SUMS * width];
         for (sums, first_row) in sums.chunks_exact_mut(SUMS * squares).zip((0..end - first).step_by(SQUARE)) {
@@ -240,7 +240,7 @@ fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
 }
 
 /// What is read of a row of pixels. Each line has one value more on either side, where the row's mirror image lies.
-struct Row {
+struct PixelRow {
     /// The mean of the colours of the render.
     light: Vec<f32>,
     /// The same over the albedo.
@@ -252,7 +252,7 @@ struct Row {
     cut: Vec<f32>,
 }
 
-impl Row {
+impl PixelRow {
     fn read(image: &Planes, render: &Render, film: f32, y: usize) -> Self {
         let width = image.width;
         let line = || vec![0.0; width + 2];
@@ -277,7 +277,7 @@ struct Read<'a> {
     albedo: [&'a [f32]; 3],
     film: f32,
     floor: f32,
-    row: &'a mut Row,
+    row: &'a mut PixelRow,
 }
 
 impl Vectorised for Read<'_> {
@@ -285,7 +285,7 @@ impl Vectorised for Read<'_> {
     fn run(self) {
         let Self { image, radiance, albedo, film, floor, row } = self;
         let width = image[0].len();
-        let Row { light, ratio, scales: [of_light, of_ratio], residual, cut } = row;
+        let PixelRow { light, ratio, scales: [of_light, of_ratio], residual, cut } = row;
         let [light, ratio, of_light, of_ratio, residual, cut] =
             [light, ratio, of_light, of_ratio, residual, cut].map(|line| &mut line[1..][..width]);
         // Until it is needed, `cut` holds by how much more than a rounding error the light differs from the albedo: 0
@@ -320,9 +320,9 @@ impl Vectorised for Read<'_> {
 
 /// Adds what a row of pixels has to the sums over columns.
 struct Add<'a> {
-    above: &'a Row,
-    row: &'a Row,
-    below: &'a Row,
+    above: &'a PixelRow,
+    row: &'a PixelRow,
+    below: &'a PixelRow,
     /// [`SUMS`] lines of a value a column.
     columns: &'a mut [f32],
 }

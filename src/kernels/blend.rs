@@ -77,12 +77,12 @@ pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: 
     let (green, blue) = rest.split_at_mut(n);
     let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
     rows.enumerate().for_each(|(y, ((red, green), blue))| {
-        Tier::detect().run(Row { size, place, y, fine, coarse, masks, output: [red, green, blue] });
+        Tier::detect().run(BlendRow { size, place, y, fine, coarse, masks, output: [red, green, blue] });
     });
 }
 
 /// One row of a blend.
-struct Row<'a> {
+struct BlendRow<'a> {
     size: Size,
     place: Place,
     y: usize,
@@ -92,9 +92,9 @@ struct Row<'a> {
     output: [&'a mut [f32]; 3],
 }
 
-impl Kernel for Row<'_> {
+impl Kernel for BlendRow<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Self { size: Size { w, .. }, place, y, fine, coarse, masks, mut output } = self;
         let (n, narrow) = (self.size.pixels(), w / 2);
         let h = coarse.len() / (3 * narrow).max(1);
@@ -113,34 +113,34 @@ impl Kernel for Row<'_> {
         let corners: [_; CORNERS] = std::array::from_fn(|i| of(masks.corners, i));
         for x in (0..w).step_by(LANES) {
             let count = LANES.min(w - x);
-            // SAFETY: vectors are the tier's; of rows no more is read and written than they have, and a group of a
+            // SAFETY: of rows no more is read and written than they have, and a group of a
             // line's pixels begins inside it.
             unsafe {
-                let one = S::splat(1.0);
-                let read = |row: *const f32| S::read_some(row.add(x), 0..count, 0.0);
+                let one = simd.splat(1.0);
+                let read = |row: *const f32| simd.read_some(row.add(x), 0..count, 0.0);
                 let mut weights = [one; CORNERS];
-                let mut total = S::splat(0.0);
+                let mut total = simd.splat(0.0);
                 for i in 0..CORNERS {
-                    weights[i] = S::mul(S::splat(BILINEAR[i]), S::exp(read(corners[i])));
-                    total = S::add(total, weights[i]);
+                    weights[i] = simd.mul(simd.splat(BILINEAR[i]), simd.exp(read(corners[i])));
+                    total = simd.add(total, weights[i]);
                 }
                 // The share of the level below, a logistic, over the sum of its weights.
-                let negative = S::mul(read(alpha), S::splat(-1.0));
-                let part = S::div(one, S::mul(total, S::add(one, S::exp(negative))));
-                let share = S::mul(part, total);
+                let negative = simd.mul(read(alpha), simd.splat(-1.0));
+                let part = simd.div(one, simd.mul(total, simd.add(one, simd.exp(negative))));
+                let share = simd.mul(part, total);
                 for weight in &mut weights {
-                    *weight = S::mul(*weight, part);
+                    *weight = simd.mul(*weight, part);
                 }
-                let rest = S::fma(share, S::splat(-1.0), one);
+                let rest = simd.fma(share, simd.splat(-1.0), one);
                 for (c, output) in output.iter_mut().enumerate() {
-                    let mut sum = S::mul(read(of(fine, c)), rest);
+                    let mut sum = simd.mul(read(of(fine, c)), rest);
                     for pair in 0..2 {
                         let line = lines[(2 * c + pair) * stride..].as_ptr().add(x / 2);
-                        let [nearest, beside] = S::double(line);
-                        sum = S::fma(nearest, weights[2 * pair], sum);
-                        sum = S::fma(beside, weights[2 * pair + 1], sum);
+                        let [nearest, beside] = simd.double(line);
+                        sum = simd.fma(nearest, weights[2 * pair], sum);
+                        sum = simd.fma(beside, weights[2 * pair + 1], sum);
                     }
-                    S::write_first(output[x..].as_mut_ptr(), count, sum);
+                    simd.write_first(output[x..].as_mut_ptr(), count, sum);
                 }
             }
         }

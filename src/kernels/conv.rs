@@ -288,19 +288,19 @@ struct Plane {
 
 impl Kernel for Band<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         // SAFETY: views are as long as their shapes say, and `convolve` checked all else, and that the inputs'
         // borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
         unsafe {
             // Every geometry goes through one of two loops: each further call site would compile all
             // tile widths again.
             if self.geometry == Geometry::Strided {
-                self.rows::<S, 2>(&self.offsets(0), 1, (0, 0));
+                self.rows::<S, 2>(simd, &self.offsets(0), 1, (0, 0));
                 return;
             }
             let spread = self.geometry.spread();
             for phase in 0..spread * spread {
-                self.rows::<S, 1>(&self.offsets(phase), spread, (phase / spread, phase % spread));
+                self.rows::<S, 1>(simd, &self.offsets(phase), spread, (phase / spread, phase % spread));
             }
         }
     }
@@ -316,7 +316,13 @@ impl Band<'_> {
 
     /// Every row of the band for one output phase; `STEP` input pixels an output pixel.
     #[inline(always)]
-    unsafe fn rows<S: Simd, const STEP: usize>(&self, taps: &[Offset], spread: usize, phase: (usize, usize)) {
+    unsafe fn rows<S: Simd, const STEP: usize>(
+        &self,
+        simd: S,
+        taps: &[Offset],
+        spread: usize,
+        phase: (usize, usize),
+    ) {
         let mut inputs: Vec<Plane> = Vec::with_capacity(64);
         for y in self.rows.0..self.rows.1 {
             inputs.clear();
@@ -334,10 +340,18 @@ impl Band<'_> {
                 let at = |plane| self.pointer.at(self.out.row(self.n, plane, y * spread + phase.0) + phase.1);
                 let (first, end) = self.planes;
                 if end - first == 2 && S::TILE.0 == 2 {
-                    self.row::<S, STEP, 2>(taps, &inputs, first, [at(first), at(first + 1)], width, spread);
+                    self.row::<S, STEP, 2>(
+                        simd,
+                        taps,
+                        &inputs,
+                        first,
+                        [at(first), at(first + 1)],
+                        width,
+                        spread,
+                    );
                 } else {
                     for plane in first..end {
-                        self.row::<S, STEP, 1>(taps, &inputs, plane, [at(plane)], width, spread);
+                        self.row::<S, STEP, 1>(simd, taps, &inputs, plane, [at(plane)], width, spread);
                     }
                 }
             }
@@ -348,6 +362,7 @@ impl Band<'_> {
     #[inline(always)]
     unsafe fn row<S: Simd, const STEP: usize, const OUT: usize>(
         &self,
+        simd: S,
         taps: &[Offset],
         inputs: &[Plane],
         plane: usize,
@@ -366,7 +381,7 @@ impl Band<'_> {
                     ($($px:literal)*) => {
                         match pixels {
                             // Widths beyond the tier's tile are constant-folded away.
-                            $($px if $px <= S::TILE.1 => args.run::<S, STEP, $px>(),)*
+                            $($px if $px <= S::TILE.1 => args.run::<S, STEP, $px>(simd),)*
                             _ => unreachable!("tiles are at most TILE.1 pixels wide"),
                         }
                     };
@@ -391,19 +406,19 @@ struct Tile<'a, const OUT: usize> {
 
 impl<const OUT: usize> Tile<'_, OUT> {
     #[inline(always)]
-    unsafe fn run<S: Simd, const STEP: usize, const PX: usize>(self) {
+    unsafe fn run<S: Simd, const STEP: usize, const PX: usize>(self, simd: S) {
         let slab = self.band.geometry.taps() * LANES;
         let row = self.inputs.len() * slab;
         // SAFETY: `convolve` checked the lengths that these offsets stay within.
         unsafe {
-            let mut acc = [[S::splat(0.0); PX]; OUT];
+            let mut acc = [[simd.splat(0.0); PX]; OUT];
             let output: [*mut Block; OUT] = std::array::from_fn(|o| self.output[o].add(self.x * self.spread));
             for (o, acc) in acc.iter_mut().enumerate() {
                 for (p, acc) in acc.iter_mut().enumerate() {
                     *acc = if self.band.epilogue.accumulate {
-                        S::load(output[o].add(p * self.spread))
+                        simd.load(output[o].add(p * self.spread))
                     } else {
-                        S::load(&self.band.bias[self.plane + o])
+                        simd.get(&self.band.bias[self.plane + o])
                     };
                 }
             }
@@ -414,11 +429,11 @@ impl<const OUT: usize> Tile<'_, OUT> {
                     let pixel = pixel.offset(tap.input).cast::<f32>();
                     let weights = weights.add(i * slab + tap.slab);
                     for lane in 0..input.lanes {
-                        let w: [S::V; OUT] = std::array::from_fn(|o| S::load(weights.add(o * row + lane)));
+                        let w: [S::V; OUT] = std::array::from_fn(|o| simd.load(weights.add(o * row + lane)));
                         for p in 0..PX {
-                            let x = S::splat(*pixel.add(p * STEP * LANES + lane));
+                            let x = simd.splat(*pixel.add(p * STEP * LANES + lane));
                             for o in 0..OUT {
-                                acc[o][p] = S::fma(w[o], x, acc[o][p]);
+                                acc[o][p] = simd.fma(w[o], x, acc[o][p]);
                             }
                         }
                     }
@@ -426,8 +441,8 @@ impl<const OUT: usize> Tile<'_, OUT> {
             }
             for (o, acc) in acc.iter().enumerate() {
                 for (p, &acc) in acc.iter().enumerate() {
-                    let v = if self.band.epilogue.relu { S::max(acc, S::splat(0.0)) } else { acc };
-                    S::store(output[o].add(p * self.spread), v);
+                    let v = if self.band.epilogue.relu { simd.max(acc, simd.splat(0.0)) } else { acc };
+                    simd.store(output[o].add(p * self.spread), v);
                 }
             }
         }

@@ -167,7 +167,7 @@ struct Forward<'a, 'f> {
 
 impl Kernel for Forward<'_, '_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, _: S) {
         let Self { filter, y, output: [r, g, b], total } = self;
         let n = filter.size.pixels();
         for out in [&mut *r, &mut *g, &mut *b, &mut *total] {
@@ -200,7 +200,7 @@ struct Backward<'a, 'f> {
 
 impl Kernel for Backward<'_, '_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, _: S) {
         let Self { filter, y, output, total, output_gradient, mut into } = self;
         let (n, w) = (filter.size.pixels(), filter.size.w);
         let mut slope = vec![0.0; w];

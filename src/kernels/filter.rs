@@ -244,15 +244,15 @@ struct Forward<'a, const N: usize> {
 
 impl<const N: usize> Kernel for Forward<'_, N> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(mut self) {
+    fn run<S: Simd>(mut self, simd: S) {
         let w = self.total.len();
         for x in (0..w).step_by(LANES) {
-            // SAFETY: vectors are the tier's; all columns that are read lie inside the row in the first case.
+            // SAFETY: all columns that are read lie inside the row in the first case.
             unsafe {
                 if x >= self.reach && x + LANES + self.reach <= w {
-                    self.pixels::<S, true>(x);
+                    self.pixels::<S, true>(simd, x);
                 } else {
-                    self.pixels::<S, false>(x);
+                    self.pixels::<S, false>(simd, x);
                 }
             }
         }
@@ -265,29 +265,29 @@ impl<const N: usize> Forward<'_, N> {
     /// # Safety
     /// As for [`some_columns`].
     #[inline(always)]
-    unsafe fn pixels<S: Simd, const INNER: bool>(&mut self, x: usize) {
+    unsafe fn pixels<S: Simd, const INNER: bool>(&mut self, simd: S, x: usize) {
         let count = LANES.min(self.total.len() - x);
         // SAFETY: the caller's promise; no more is written than there is.
         unsafe {
-            let mut largest = S::splat(f32::NEG_INFINITY);
+            let mut largest = simd.splat(f32::NEG_INFINITY);
             for tap in &self.taps {
-                largest = S::max(tap.exponents::<S, INNER>(x), largest);
+                largest = simd.max(tap.exponents::<S, INNER>(simd, x), largest);
             }
-            let (mut sums, mut total) = ([[S::splat(0.0); 3]; N], S::splat(0.0));
+            let (mut sums, mut total) = ([[simd.splat(0.0); 3]; N], simd.splat(0.0));
             for tap in &self.taps {
-                let exponents = tap.exponents::<S, INNER>(x);
-                let weights = S::exp(S::fma(largest, S::splat(-1.0), exponents));
-                total = S::add(total, weights);
+                let exponents = tap.exponents::<S, INNER>(simd, x);
+                let weights = simd.exp(simd.fma(largest, simd.splat(-1.0), exponents));
+                total = simd.add(total, weights);
                 for (sum, row) in sums.as_flattened_mut().iter_mut().zip(tap.images.as_flattened()) {
-                    let values = some_columns::<S, INNER>(row, x as isize + tap.dx, 0.0);
-                    *sum = S::fma(values, weights, *sum);
+                    let values = some_columns::<S, INNER>(simd, row, x as isize + tap.dx, 0.0);
+                    *sum = simd.fma(values, weights, *sum);
                 }
             }
-            let inverse = S::div(S::splat(1.0), total);
+            let inverse = simd.div(simd.splat(1.0), total);
             for (out, sum) in self.output.as_flattened_mut().iter_mut().zip(sums.as_flattened()) {
-                S::write_first(out[x..].as_mut_ptr(), count, S::mul(*sum, inverse));
+                simd.write_first(out[x..].as_mut_ptr(), count, simd.mul(*sum, inverse));
             }
-            S::write_first(self.total[x..].as_mut_ptr(), count, total);
+            simd.write_first(self.total[x..].as_mut_ptr(), count, total);
         }
     }
 }
@@ -298,12 +298,13 @@ impl<const N: usize> Tap<'_, N> {
     /// # Safety
     /// As for [`some_columns`].
     #[inline(always)]
-    unsafe fn exponents<S: Simd, const INNER: bool>(&self, x: usize) -> S::V {
+    unsafe fn exponents<S: Simd, const INNER: bool>(&self, simd: S, x: usize) -> S::V {
         // SAFETY: the caller's promise.
         unsafe {
-            let logits = some_columns::<S, INNER>(self.logits, x as isize, 0.0);
-            let trust = some_columns::<S, INNER>(self.confidence, x as isize + self.dx, f32::NEG_INFINITY);
-            S::add(logits, trust)
+            let logits = some_columns::<S, INNER>(simd, self.logits, x as isize, 0.0);
+            let trust =
+                some_columns::<S, INNER>(simd, self.confidence, x as isize + self.dx, f32::NEG_INFINITY);
+            simd.add(logits, trust)
         }
     }
 }
@@ -311,17 +312,17 @@ impl<const N: usize> Tap<'_, N> {
 /// Columns `x..x + 16` of a row, and `other` where it has none.
 ///
 /// # Safety
-/// The processor has the instructions of `S`; if `INNER`, the row has all of them.
+/// If `INNER`, the row has all of them.
 #[inline(always)]
-unsafe fn some_columns<S: Simd, const INNER: bool>(row: &[f32], x: isize, other: f32) -> S::V {
+unsafe fn some_columns<S: Simd, const INNER: bool>(simd: S, row: &[f32], x: isize, other: f32) -> S::V {
     let p = row.as_ptr().wrapping_offset(x);
     // SAFETY: the caller's promise, or else only columns that the row has are read.
     unsafe {
         if INNER {
-            S::read(p)
+            simd.read(p)
         } else {
             let inside = |x: isize| x.clamp(0, LANES as isize) as usize;
-            S::read_some(p, inside(-x)..inside(row.len() as isize - x), other)
+            simd.read_some(p, inside(-x)..inside(row.len() as isize - x), other)
         }
     }
 }
@@ -336,7 +337,7 @@ struct Backward<'a, 'f> {
 
 impl Kernel for Backward<'_, '_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, _: S) {
         let Size { h, w } = self.filter.size;
         let n = h * w;
         let FilterGradient { mut image, logits, mut confidence } = self.into;

@@ -140,11 +140,12 @@ impl Unpacked {
     /// plane `plane` are what `finish` makes of `blocks`.
     ///
     /// # Safety
-    /// The processor has the instructions of `S`; the pixels lie inside the row and nobody else writes them; the planes
+    /// The pixels lie inside the row and nobody else writes them; the planes
     /// are still there.
     #[inline(always)]
     pub unsafe fn put<S: Simd>(
         self,
+        simd: S,
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
         blocks: &[Block],
@@ -153,8 +154,8 @@ impl Unpacked {
         // SAFETY: the caller's promise.
         unsafe {
             match self.map.factor {
-                1 => self.put_groups::<S, LANES>((n, plane), (y, x), blocks, finish),
-                _ => self.put_groups::<S, PAIRS>((n, plane), (y, x), blocks, finish),
+                1 => self.put_groups::<S, LANES>(simd, (n, plane), (y, x), blocks, finish),
+                _ => self.put_groups::<S, PAIRS>(simd, (n, plane), (y, x), blocks, finish),
             }
         }
     }
@@ -166,6 +167,7 @@ impl Unpacked {
     #[inline(always)]
     unsafe fn put_groups<S: Simd, const N: usize>(
         self,
+        simd: S,
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
         blocks: &[Block],
@@ -178,10 +180,10 @@ impl Unpacked {
         for (blocks, x) in blocks.chunks(N).zip((x..).step_by(N)) {
             // SAFETY: the caller's promise.
             unsafe {
-                let groups = Channels::transpose(load::<S, N>(blocks, finish));
+                let groups = Channels::transpose(simd, load::<S, N>(simd, blocks, finish));
                 for group in lanes.start / map.factor..lanes.end / map.factor {
                     let out = values.add(map.value(n, plane, group * map.factor, y, x));
-                    S::write_first(out, blocks.len() * map.factor, groups[group]);
+                    simd.write_first(out, blocks.len() * map.factor, groups[group]);
                 }
             }
         }
@@ -191,10 +193,7 @@ impl Unpacked {
 /// How vectors of pixels become vectors of `N` groups of neighbouring channels, and back.
 trait Groups<S: Simd, const N: usize> {
     /// Group `j` of vector `i` becomes group `i` of vector `j`.
-    ///
-    /// # Safety
-    /// The processor has the instructions of `S`.
-    unsafe fn transpose(vectors: [S::V; N]) -> [S::V; N];
+    fn transpose(simd: S, vectors: [S::V; N]) -> [S::V; N];
 }
 
 /// The channels of a blocked plane: each for itself where it is a plane, two by two where those are neighbours in a row.
@@ -202,27 +201,22 @@ struct Channels;
 
 impl<S: Simd> Groups<S, LANES> for Channels {
     #[inline(always)]
-    unsafe fn transpose(vectors: [S::V; LANES]) -> [S::V; LANES] {
-        // SAFETY: the caller's promise.
-        unsafe { S::transpose(vectors) }
+    fn transpose(simd: S, vectors: [S::V; LANES]) -> [S::V; LANES] {
+        simd.transpose(vectors)
     }
 }
 
 impl<S: Simd> Groups<S, PAIRS> for Channels {
     #[inline(always)]
-    unsafe fn transpose(vectors: [S::V; PAIRS]) -> [S::V; PAIRS] {
-        // SAFETY: the caller's promise.
-        unsafe { S::transpose_pairs(vectors) }
+    fn transpose(simd: S, vectors: [S::V; PAIRS]) -> [S::V; PAIRS] {
+        simd.transpose_pairs(vectors)
     }
 }
 
 /// What becomes of a block's lanes before they are planes.
 pub(super) trait Finish<S: Simd> {
     /// The lanes, changed.
-    ///
-    /// # Safety
-    /// The processor has the instructions of `S`.
-    unsafe fn of(&self, lanes: S::V) -> S::V;
+    fn of(&self, simd: S, lanes: S::V) -> S::V;
 }
 
 /// Lanes as they are.
@@ -230,7 +224,7 @@ struct Unchanged;
 
 impl<S: Simd> Finish<S> for Unchanged {
     #[inline(always)]
-    unsafe fn of(&self, lanes: S::V) -> S::V {
+    fn of(&self, _: S, lanes: S::V) -> S::V {
         lanes
     }
 }
@@ -245,14 +239,14 @@ struct Unpack<'a> {
 
 impl Kernel for Unpack<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Self { to, input, n, plane, rows } = self;
         let s = input.shape;
         for y in rows {
             let row = &input.data[s.row(n, plane, y)..][..s.w];
             for (x, blocks) in (0..s.w).step_by(LANES).zip(row.chunks(LANES)) {
-                // SAFETY: vectors are the tier's; every value belongs to this task.
-                unsafe { to.put::<S>((n, plane), (y, x), blocks, &Unchanged) }
+                // SAFETY: every value belongs to this task.
+                unsafe { to.put(simd, (n, plane), (y, x), blocks, &Unchanged) }
             }
         }
     }
@@ -271,16 +265,16 @@ struct Pack<'a> {
 
 impl Kernel for Pack<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Self { map, input, blocks, n, plane, rows, add } = self;
         let s = map.shape;
         for y in rows {
-            // SAFETY: vectors are the tier's; the row's blocks belong to this task.
+            // SAFETY: the row's blocks belong to this task.
             unsafe {
                 let row = std::slice::from_raw_parts_mut(blocks.at(s.row(n, plane, y)), s.w);
                 match map.factor {
-                    1 => map.gather::<S, LANES>(input, (n, plane), (y, 0), add, row),
-                    _ => map.gather::<S, PAIRS>(input, (n, plane), (y, 0), add, row),
+                    1 => map.gather::<S, LANES>(simd, input, (n, plane), (y, 0), add, row),
+                    _ => map.gather::<S, PAIRS>(simd, input, (n, plane), (y, 0), add, row),
                 }
             }
         }
@@ -291,12 +285,10 @@ impl Map {
     /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the planes hold of its
     /// channels, other lanes with zeros; or does `add` it to what the blocks hold. Each of the `N` groups of channels of a
     /// blocked plane is a run of values in its row.
-    ///
-    /// # Safety
-    /// The processor has the instructions of `S`.
     #[inline(always)]
-    unsafe fn gather<S: Simd, const N: usize>(
+    fn gather<S: Simd, const N: usize>(
         self,
+        simd: S,
         input: &[f32],
         (n, plane): (usize, usize),
         (y, x): (usize, usize),
@@ -308,20 +300,18 @@ impl Map {
         let lanes = self.lanes(plane);
         for (blocks, x) in blocks.chunks_mut(N).zip((x..).step_by(N)) {
             let count = blocks.len() * self.factor;
-            // SAFETY: the caller's promise; as many values are read as there are.
-            unsafe {
-                let mut groups = [S::splat(0.0); N];
-                if add {
-                    groups = Channels::transpose(load::<S, N>(blocks, &Unchanged));
-                }
-                for group in lanes.start / self.factor..lanes.end / self.factor {
-                    let from = &input[self.value(n, plane, group * self.factor, y, x)..][..count];
-                    let values = S::read_some(from.as_ptr(), 0..count, 0.0);
-                    groups[group] = if add { S::add(groups[group], values) } else { values };
-                }
-                for (block, vector) in blocks.iter_mut().zip(Channels::transpose(groups)) {
-                    S::store(block, vector);
-                }
+            let mut groups = [simd.splat(0.0); N];
+            if add {
+                groups = Channels::transpose(simd, load::<S, N>(simd, blocks, &Unchanged));
+            }
+            for group in lanes.start / self.factor..lanes.end / self.factor {
+                let from = &input[self.value(n, plane, group * self.factor, y, x)..][..count];
+                // SAFETY: as many values are read as there are.
+                let values = unsafe { simd.read_some(from.as_ptr(), 0..count, 0.0) };
+                groups[group] = if add { simd.add(groups[group], values) } else { values };
+            }
+            for (block, vector) in blocks.iter_mut().zip(Channels::transpose(simd, groups)) {
+                simd.set(block, vector);
             }
         }
     }
@@ -339,7 +329,7 @@ pub(super) struct HalvedRow<'a, F> {
 
 impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(mut self) {
+    fn run<S: Simd>(mut self, simd: S) {
         let (n, plane, y) = self.at;
         let map = Map::new(self.shape, 0, 2, self.values.len());
         let planes = map.blocks().len();
@@ -347,10 +337,7 @@ impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
         for x in (0..self.shape.w).step_by(LANES) {
             let count = LANES.min(self.shape.w - x);
             for (plane, blocks) in (plane..planes).zip(&mut blocks) {
-                // SAFETY: vectors are the tier's.
-                unsafe {
-                    map.gather::<S, PAIRS>(self.values, (n, plane), (y, x), false, &mut blocks[..count]);
-                }
+                map.gather::<S, PAIRS>(simd, self.values, (n, plane), (y, x), false, &mut blocks[..count]);
             }
             let [low, high] = blocks.each_ref().map(|blocks| &blocks[..count]);
             (self.put)(x, low, (plane + 1 < planes).then_some(high));
@@ -359,18 +346,13 @@ impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
 }
 
 /// Up to `N` blocks, the last of them once more where there are fewer.
-///
-/// # Safety
-/// The processor has the instructions of `S`.
 #[inline(always)]
-unsafe fn load<S: Simd, const N: usize>(blocks: &[Block], finish: &impl Finish<S>) -> [S::V; N] {
+fn load<S: Simd, const N: usize>(simd: S, blocks: &[Block], finish: &impl Finish<S>) -> [S::V; N] {
     let last = blocks.len() - 1;
-    // SAFETY: the caller's promise; no block beyond the last is read.
-    unsafe {
-        let mut vectors = [S::splat(0.0); N];
-        for i in 0..N {
-            vectors[i] = finish.of(S::load(blocks.as_ptr().add(i.min(last))));
-        }
-        vectors
+    let mut vectors = [simd.splat(0.0); N];
+    for i in 0..N {
+        // SAFETY: no block beyond the last is read.
+        vectors[i] = finish.of(simd, unsafe { simd.load(blocks.as_ptr().add(i.min(last))) });
     }
+    vectors
 }

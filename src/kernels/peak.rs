@@ -29,38 +29,32 @@ struct Chains<'a> {
 
 impl Kernel for Chains<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         // As many at once as a convolution's tile keeps in registers.
         let fit = S::TILE.0 * S::TILE.1 >= CHAINS;
-        // SAFETY: only registers and `out` are touched.
-        unsafe {
-            let sum = if fit {
-                chains::<S, CHAINS>(self.steps)
-            } else {
-                S::add(chains::<S, { CHAINS / 2 }>(self.steps), chains::<S, { CHAINS / 2 }>(self.steps))
-            };
-            S::store(self.out, sum);
-        }
+        let sum = if fit {
+            chains::<S, CHAINS>(simd, self.steps)
+        } else {
+            simd.add(
+                chains::<S, { CHAINS / 2 }>(simd, self.steps),
+                chains::<S, { CHAINS / 2 }>(simd, self.steps),
+            )
+        };
+        simd.set(self.out, sum);
     }
 }
 
 /// Runs `steps` rounds of `N` chains and adds them up.
-///
-/// # Safety
-/// As [`Simd::splat`].
 #[inline(always)]
-unsafe fn chains<S: Simd, const N: usize>(steps: usize) -> S::V {
-    // SAFETY: the caller's promise.
-    unsafe {
-        // Values that the compiler cannot know, or it would find the chains alike, or their limit.
-        let value = |v: f32| S::splat(std::hint::black_box(v));
-        let (a, b) = (value(0.999_999), value(1e-6));
-        let mut acc: [S::V; N] = std::array::from_fn(|i| value(i as f32));
-        for _ in 0..steps {
-            for v in &mut acc {
-                *v = S::fma(*v, a, b);
-            }
+fn chains<S: Simd, const N: usize>(simd: S, steps: usize) -> S::V {
+    // Values that the compiler cannot know, or it would find the chains alike, or their limit.
+    let value = |v: f32| simd.splat(std::hint::black_box(v));
+    let (a, b) = (value(0.999_999), value(1e-6));
+    let mut acc: [S::V; N] = std::array::from_fn(|i| value(i as f32));
+    for _ in 0..steps {
+        for v in &mut acc {
+            *v = simd.fma(*v, a, b);
         }
-        acc.into_iter().reduce(|a, b| S::add(a, b)).expect("there are chains")
     }
+    acc.into_iter().reduce(|a, b| simd.add(a, b)).expect("there are chains")
 }

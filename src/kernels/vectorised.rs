@@ -19,7 +19,7 @@ struct Plain<V>(V);
 
 impl<V: Vectorised> Kernel for Plain<V> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, _: S) {
         self.0.run();
     }
 }

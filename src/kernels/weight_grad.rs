@@ -139,7 +139,7 @@ struct Pair<'a> {
 
 impl Kernel for Pair<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         // SAFETY: `weight_gradient` checked sizes and borders; every task owns its slabs.
         unsafe {
             let (first, end) = self.outputs;
@@ -147,12 +147,12 @@ impl Kernel for Pair<'_> {
             // 1 x 4 where a block takes two registers.
             if S::TILE.0 == 1 {
                 for output in first..end {
-                    self.taps::<S, 1, 4>(output);
+                    self.taps::<S, 1, 4>(simd, output);
                 }
             } else if end - first == 2 {
-                self.taps::<S, 2, 8>(first);
+                self.taps::<S, 2, 8>(simd, first);
             } else {
-                self.taps::<S, 1, 8>(first);
+                self.taps::<S, 1, 8>(simd, first);
             }
         }
     }
@@ -160,7 +160,7 @@ impl Kernel for Pair<'_> {
 
 impl Pair<'_> {
     #[inline(always)]
-    unsafe fn taps<S: Simd, const OUT: usize, const CHUNK: usize>(&self, output: usize) {
+    unsafe fn taps<S: Simd, const OUT: usize, const CHUNK: usize>(&self, simd: S, output: usize) {
         let taps = self.geometry.taps();
         let s = self.source.shape;
         let band = match self.geometry {
@@ -186,9 +186,11 @@ impl Pair<'_> {
                         let slabs = slabs.map(|p| p.add(lane));
                         match self.geometry {
                             Geometry::Same(k) => {
-                                self.accumulate::<S, OUT, CHUNK, 1>(n, rows, output, lane, k, t, slabs)
+                                self.accumulate::<S, OUT, CHUNK, 1>(simd, n, rows, output, lane, k, t, slabs)
                             }
-                            _ => self.accumulate::<S, OUT, CHUNK, 2>(n, rows, output, lane, 4, t, slabs),
+                            _ => {
+                                self.accumulate::<S, OUT, CHUNK, 2>(simd, n, rows, output, lane, 4, t, slabs)
+                            }
                         }
                     }
                 }
@@ -202,6 +204,7 @@ impl Pair<'_> {
     #[allow(clippy::too_many_arguments)]
     unsafe fn accumulate<S: Simd, const OUT: usize, const CHUNK: usize, const STEP: usize>(
         &self,
+        simd: S,
         n: usize,
         rows: (usize, usize),
         output: usize,
@@ -222,7 +225,7 @@ impl Pair<'_> {
         // SAFETY: borders cover the taps' reach, as `weight_gradient` checked; views are as long as their shapes say.
         unsafe {
             let mut acc: [[S::V; CHUNK]; OUT] =
-                std::array::from_fn(|o| std::array::from_fn(|c| S::load(slabs[o].add(c))));
+                std::array::from_fn(|o| std::array::from_fn(|c| simd.load(slabs[o].add(c))));
             for y in rows.0..rows.1 {
                 let input = self.source.data.as_ptr().add(s.row(n, self.input, y)).offset(input_shift);
                 let input = input.cast::<f32>().add(lane);
@@ -230,18 +233,18 @@ impl Pair<'_> {
                     self.gradient.data.as_ptr().add(g.row(n, output + o, y * STEP)).offset(gradient_shift)
                 });
                 for x in 0..s.w {
-                    let g: [S::V; OUT] = std::array::from_fn(|o| S::load(gradient[o].add(x * STEP)));
+                    let g: [S::V; OUT] = std::array::from_fn(|o| simd.load(gradient[o].add(x * STEP)));
                     for c in 0..CHUNK {
-                        let v = S::splat(*input.add(x * LANES + c));
+                        let v = simd.splat(*input.add(x * LANES + c));
                         for o in 0..OUT {
-                            acc[o][c] = S::fma(g[o], v, acc[o][c]);
+                            acc[o][c] = simd.fma(g[o], v, acc[o][c]);
                         }
                     }
                 }
             }
             for o in 0..OUT {
                 for c in 0..CHUNK {
-                    S::store(slabs[o].add(c), acc[o][c]);
+                    simd.store(slabs[o].add(c), acc[o][c]);
                 }
             }
         }

@@ -34,32 +34,23 @@ pub const POWERS: [u32; SIDE] = [3, 2, 1, 1];
 /// What the transforms take.
 pub trait Ring: Copy {
     /// `self + other`.
-    ///
-    /// # Safety
-    /// Here and below: the processor has the instructions of the implementing type.
-    unsafe fn plus(self, other: Self) -> Self;
+    fn plus(self, other: Self) -> Self;
     /// `self - other`.
-    ///
-    /// # Safety
-    /// See [`Ring::plus`].
-    unsafe fn minus(self, other: Self) -> Self;
+    fn minus(self, other: Self) -> Self;
     /// `2 self`.
-    ///
-    /// # Safety
-    /// See [`Ring::plus`].
-    unsafe fn twice(self) -> Self;
+    fn twice(self) -> Self;
 }
 
 macro_rules! wrapping_ring {
     ($number:ty) => {
         impl Ring for Wrapping<$number> {
-            unsafe fn plus(self, other: Self) -> Self {
+            fn plus(self, other: Self) -> Self {
                 self + other
             }
-            unsafe fn minus(self, other: Self) -> Self {
+            fn minus(self, other: Self) -> Self {
                 self - other
             }
-            unsafe fn twice(self) -> Self {
+            fn twice(self) -> Self {
                 self << 1
             }
         }
@@ -70,99 +61,72 @@ wrapping_ring!(i32);
 
 /// Sixteen f32.
 #[derive(Clone, Copy)]
-struct Real<S: Simd>(S::V);
+struct Real<S: Simd>(S, S::V);
 
 impl<S: Simd> Ring for Real<S> {
     #[inline(always)]
-    unsafe fn plus(self, other: Self) -> Self {
-        // SAFETY: the caller's promise, here and below.
-        unsafe { Self(S::add(self.0, other.0)) }
+    fn plus(self, other: Self) -> Self {
+        Self(self.0, self.0.add(self.1, other.1))
     }
     #[inline(always)]
-    unsafe fn minus(self, other: Self) -> Self {
-        // SAFETY: as above.
-        unsafe { Self(S::fma(other.0, S::splat(-1.0), self.0)) }
+    fn minus(self, other: Self) -> Self {
+        Self(self.0, self.0.fma(other.1, self.0.splat(-1.0), self.1))
     }
     #[inline(always)]
-    unsafe fn twice(self) -> Self {
-        // SAFETY: as above.
-        unsafe { Self(S::add(self.0, self.0)) }
+    fn twice(self) -> Self {
+        self.plus(self)
     }
 }
 
 /// `B d`: a line of a patch at the six points.
-///
-/// # Safety
-/// See [`Ring::plus`].
 #[inline(always)]
-pub unsafe fn evaluate<R: Ring>(d: [R; PATCH]) -> [R; PATCH] {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let even = d[4].minus(d[2]);
-        let odd = d[3].minus(d[1]).twice();
-        [
-            d[0].minus(d[2]).twice().twice().plus(even),
-            d[3].plus(d[4]).minus(d[1].plus(d[2]).twice().twice()),
-            d[4].minus(d[3]).plus(d[1].minus(d[2]).twice().twice()),
-            even.plus(odd),
-            even.minus(odd),
-            d[5].minus(d[3]).minus(odd.twice()),
-        ]
-    }
+pub fn evaluate<R: Ring>(d: [R; PATCH]) -> [R; PATCH] {
+    let even = d[4].minus(d[2]);
+    let odd = d[3].minus(d[1]).twice();
+    [
+        d[0].minus(d[2]).twice().twice().plus(even),
+        d[3].plus(d[4]).minus(d[1].plus(d[2]).twice().twice()),
+        d[4].minus(d[3]).plus(d[1].minus(d[2]).twice().twice()),
+        even.plus(odd),
+        even.minus(odd),
+        d[5].minus(d[3]).minus(odd.twice()),
+    ]
 }
 
 /// `A m`: a line of a square, times 3 x 2^[`POWERS`].
-///
-/// # Safety
-/// See [`Ring::plus`].
 #[inline(always)]
-pub unsafe fn interpolate<R: Ring>(m: [R; PATCH]) -> [R; SIDE] {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let [near_even, near_odd] = [m[1].plus(m[2]), m[1].minus(m[2])];
-        let [far_even, far_odd] = [m[3].plus(m[4]), m[3].minus(m[4])];
-        [
-            m[0].plus(near_even.twice().twice()).plus(far_even),
-            near_odd.twice().plus(far_odd),
-            near_even.plus(far_even),
-            near_odd.plus(far_odd.twice()).plus(m[5]),
-        ]
-    }
+pub fn interpolate<R: Ring>(m: [R; PATCH]) -> [R; SIDE] {
+    let [near_even, near_odd] = [m[1].plus(m[2]), m[1].minus(m[2])];
+    let [far_even, far_odd] = [m[3].plus(m[4]), m[3].minus(m[4])];
+    [
+        m[0].plus(near_even.twice().twice()).plus(far_even),
+        near_odd.twice().plus(far_odd),
+        near_even.plus(far_even),
+        near_odd.plus(far_odd.twice()).plus(m[5]),
+    ]
 }
 
 /// `G g`: a line of a kernel at the six points, times 24, 6, 6, 24, 24 and 6.
-///
-/// # Safety
-/// See [`Ring::plus`].
 #[inline(always)]
-unsafe fn evaluate_line<R: Ring>(g: [R; 3]) -> [R; PATCH] {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let (even, odd) = (g[0].plus(g[2]), g[1].twice());
-        let far = g[0].plus(g[2].twice().twice());
-        let near = g[1].minus(even);
-        let [first, last] = [g[0].twice().plus(g[0]), g[2].twice().plus(g[2])];
-        [first.twice(), near.minus(odd), near, far.plus(odd), far.minus(odd), last.twice()]
-    }
+fn evaluate_line<R: Ring>(g: [R; 3]) -> [R; PATCH] {
+    let (even, odd) = (g[0].plus(g[2]), g[1].twice());
+    let far = g[0].plus(g[2].twice().twice());
+    let near = g[1].minus(even);
+    let [first, last] = [g[0].twice().plus(g[0]), g[2].twice().plus(g[2])];
+    [first.twice(), near.minus(odd), near, far.plus(odd), far.minus(odd), last.twice()]
 }
 
 /// `G g G'`: a kernel at all points, row by row, times those factors.
-///
-/// # Safety
-/// See [`Ring::plus`].
 #[inline(always)]
-pub unsafe fn evaluate_kernel<R: Ring>(kernel: [R; 9]) -> [R; POINTS] {
+pub fn evaluate_kernel<R: Ring>(kernel: [R; 9]) -> [R; POINTS] {
     let mut columns = [[kernel[0]; PATCH]; 3];
     let mut points = [kernel[0]; POINTS];
-    // SAFETY: the caller's promise.
-    unsafe {
-        for x in 0..3 {
-            columns[x] = evaluate_line([kernel[x], kernel[3 + x], kernel[6 + x]]);
-        }
-        for y in 0..PATCH {
-            let row = evaluate_line([columns[0][y], columns[1][y], columns[2][y]]);
-            points[PATCH * y..][..PATCH].copy_from_slice(&row);
-        }
+    for x in 0..3 {
+        columns[x] = evaluate_line([kernel[x], kernel[3 + x], kernel[6 + x]]);
+    }
+    for y in 0..PATCH {
+        let row = evaluate_line([columns[0][y], columns[1][y], columns[2][y]]);
+        points[PATCH * y..][..PATCH].copy_from_slice(&row);
     }
     points
 }
@@ -207,19 +171,16 @@ struct Transform<'a> {
 
 impl Kernel for Transform<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Self { packed, weights, planes } = self;
         for (i, taps) in packed.chunks_exact(9 * LANES).enumerate() {
             for lane in 0..LANES {
-                // SAFETY: vectors are the tier's.
-                unsafe {
-                    let mut kernel = [Real::<S>(S::splat(0.0)); 9];
-                    for t in 0..9 {
-                        kernel[t] = Real(S::load(&taps[t * LANES + lane]));
-                    }
-                    for (point, value) in evaluate_kernel(kernel).into_iter().enumerate() {
-                        S::store(&mut weights[(point * planes + i) * LANES + lane], value.0);
-                    }
+                let mut kernel = [Real(simd, simd.splat(0.0)); 9];
+                for t in 0..9 {
+                    kernel[t] = Real(simd, simd.get(&taps[t * LANES + lane]));
+                }
+                for (point, value) in evaluate_kernel(kernel).into_iter().enumerate() {
+                    simd.set(&mut weights[(point * planes + i) * LANES + lane], value.1);
                 }
             }
         }
@@ -276,7 +237,7 @@ struct Plane {
 
 impl Kernel for Rows<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let mut planes = Vec::with_capacity(64);
         for source in self.sources {
             let s = source.shape;
@@ -297,15 +258,22 @@ impl Kernel for Rows<'_> {
             let squares = (self.out.w - x).div_ceil(SIDE).min(SQUARES);
             for (i, plane) in planes.iter().enumerate() {
                 // SAFETY: `convolve` checked lengths and borders; patches end at the border.
-                unsafe { self.evaluate::<S>(plane, x, squares, &mut points[i * SQUARES..], point) }
+                unsafe { self.evaluate(simd, plane, x, squares, &mut points[i * SQUARES..], point) }
             }
             for plane in (0..self.out.planes()).step_by(S::TILE.0) {
                 // SAFETY: `convolve` checked lengths; tasks own disjoint rows.
                 unsafe {
                     if S::TILE.0 == OUTPUTS && plane + 1 < self.out.planes() {
-                        self.outputs::<S, OUTPUTS>(&planes, plane, (x, squares), &points, &mut products);
+                        self.outputs::<S, OUTPUTS>(
+                            simd,
+                            &planes,
+                            plane,
+                            (x, squares),
+                            &points,
+                            &mut products,
+                        );
                     } else {
-                        self.outputs::<S, 1>(&planes, plane, (x, squares), &points, &mut products);
+                        self.outputs::<S, 1>(simd, &planes, plane, (x, squares), &points, &mut products);
                     }
                 }
             }
@@ -318,15 +286,16 @@ impl Rows<'_> {
     #[inline(always)]
     unsafe fn evaluate<S: Simd>(
         &self,
+        simd: S,
         plane: &Plane,
         x: usize,
         squares: usize,
         points: &mut [Block],
         stride: usize,
     ) {
-        // SAFETY: the caller's promise; vectors are the tier's.
+        // SAFETY: the caller's promise.
         unsafe {
-            let nothing = Real::<S>(S::splat(0.0));
+            let nothing = Real(simd, simd.splat(0.0));
             // Columns of a patch at the points, the last two of which are the next patch's first.
             let mut columns = [[nothing; PATCH]; PATCH];
             for square in 0..squares {
@@ -335,7 +304,7 @@ impl Rows<'_> {
                     let mut column = [nothing; PATCH];
                     for y in 0..PATCH {
                         if let Some(row) = plane.rows[y].filter(|_| at <= self.out.w + 1) {
-                            column[y] = Real(S::load(row.add(at)));
+                            column[y] = Real(simd, simd.load(row.add(at)));
                         }
                     }
                     columns[i] = evaluate(column);
@@ -346,7 +315,7 @@ impl Rows<'_> {
                         row[i] = columns[i][y];
                     }
                     for (i, value) in evaluate(row).into_iter().enumerate() {
-                        S::store(&mut points[(PATCH * y + i) * stride + square], value.0);
+                        simd.set(&mut points[(PATCH * y + i) * stride + square], value.1);
                     }
                 }
                 columns.copy_within(SIDE.., 0);
@@ -358,6 +327,7 @@ impl Rows<'_> {
     #[inline(always)]
     unsafe fn outputs<S: Simd, const OUT: usize>(
         &self,
+        simd: S,
         planes: &[Plane],
         first: usize,
         (x, squares): (usize, usize),
@@ -378,34 +348,41 @@ impl Rows<'_> {
                     let count = (squares - at).div_ceil(strips - strip);
                     let place = (points.add(at), weights, products.add(at));
                     match count {
-                        1 => multiply::<S, OUT, 1>(planes, place),
-                        2 => multiply::<S, OUT, 2>(planes, place),
-                        3 => multiply::<S, OUT, 3>(planes, place),
-                        4 => multiply::<S, OUT, 4>(planes, place),
-                        5 => multiply::<S, OUT, 5>(planes, place),
-                        _ => multiply::<S, OUT, STRIP>(planes, place),
+                        1 => multiply::<S, OUT, 1>(simd, planes, place),
+                        2 => multiply::<S, OUT, 2>(simd, planes, place),
+                        3 => multiply::<S, OUT, 3>(simd, planes, place),
+                        4 => multiply::<S, OUT, 4>(simd, planes, place),
+                        5 => multiply::<S, OUT, 5>(simd, planes, place),
+                        _ => multiply::<S, OUT, STRIP>(simd, planes, place),
                     }
                     at += count;
                 }
             }
             for (o, square) in (0..OUT).flat_map(|o| (0..squares).map(move |square| (o, square))) {
                 let products = products[o * SQUARES + square..].as_ptr();
-                self.interpolate::<S>(products, product, first + o, x + SIDE * square);
+                self.interpolate(simd, products, product, first + o, x + SIDE * square);
             }
         }
     }
 
     /// Makes outputs of a square's products, which lie `stride` blocks apart, and stores those that are pixels.
     #[inline(always)]
-    unsafe fn interpolate<S: Simd>(&self, products: *const Block, stride: usize, plane: usize, x: usize) {
-        // SAFETY: the caller's promise; vectors are the tier's.
+    unsafe fn interpolate<S: Simd>(
+        &self,
+        simd: S,
+        products: *const Block,
+        stride: usize,
+        plane: usize,
+        x: usize,
+    ) {
+        // SAFETY: the caller's promise.
         unsafe {
-            let nothing = Real::<S>(S::splat(0.0));
+            let nothing = Real(simd, simd.splat(0.0));
             let mut lines = [[nothing; SIDE]; PATCH];
             for i in 0..PATCH {
                 let mut line = [nothing; PATCH];
                 for y in 0..PATCH {
-                    line[y] = Real(S::load(products.add((PATCH * y + i) * stride)));
+                    line[y] = Real(simd, simd.load(products.add((PATCH * y + i) * stride)));
                 }
                 lines[i] = interpolate(line);
             }
@@ -418,10 +395,11 @@ impl Rows<'_> {
                 let to = self.out.row(self.n, plane, self.y + y) + x;
                 for i in 0..SIDE.min(self.out.w - x) {
                     let to = self.pointer.at(to + i);
-                    let factor = S::splat(1.0 / (9.0 * (1u32 << (POWERS[y] + POWERS[i])) as f32));
-                    let add = if self.epilogue.accumulate { S::load(to) } else { S::load(&self.bias[plane]) };
-                    let sum = S::fma(row[i].0, factor, add);
-                    S::store(to, if self.epilogue.relu { S::max(sum, S::splat(0.0)) } else { sum });
+                    let factor = simd.splat(1.0 / (9.0 * (1u32 << (POWERS[y] + POWERS[i])) as f32));
+                    let add =
+                        if self.epilogue.accumulate { simd.load(to) } else { simd.get(&self.bias[plane]) };
+                    let sum = simd.fma(row[i].1, factor, add);
+                    simd.store(to, if self.epilogue.relu { simd.max(sum, simd.splat(0.0)) } else { sum });
                 }
             }
         }
@@ -431,34 +409,35 @@ impl Rows<'_> {
 /// The products of `COUNT` squares at a point for `OUT` output planes, where points, weights and products begin.
 ///
 /// # Safety
-/// All of them can be read and written; the processor has the instructions of `S`.
+/// All of them can be read and written.
 #[inline(always)]
 unsafe fn multiply<S: Simd, const OUT: usize, const COUNT: usize>(
+    simd: S,
     planes: &[Plane],
     (points, weights, products): (*const Block, *const Block, *mut Block),
 ) {
     let next = planes.len() * POINTS * LANES;
     // SAFETY: the caller's promise.
     unsafe {
-        let mut sums = [[S::splat(0.0); COUNT]; OUT];
+        let mut sums = [[simd.splat(0.0); COUNT]; OUT];
         for (i, plane) in planes.iter().enumerate() {
             let points = points.add(i * SQUARES).cast::<f32>();
             for lane in 0..plane.lanes {
-                let mut w = [S::splat(0.0); OUT];
+                let mut w = [simd.splat(0.0); OUT];
                 for o in 0..OUT {
-                    w[o] = S::load(weights.add(o * next + i * LANES + lane));
+                    w[o] = simd.load(weights.add(o * next + i * LANES + lane));
                 }
                 for s in 0..COUNT {
-                    let x = S::splat(*points.add(s * LANES + lane));
+                    let x = simd.splat(*points.add(s * LANES + lane));
                     for o in 0..OUT {
-                        sums[o][s] = S::fma(w[o], x, sums[o][s]);
+                        sums[o][s] = simd.fma(w[o], x, sums[o][s]);
                     }
                 }
             }
         }
         for o in 0..OUT {
             for s in 0..COUNT {
-                S::store(products.add(o * SQUARES + s), sums[o][s]);
+                simd.store(products.add(o * SQUARES + s), sums[o][s]);
             }
         }
     }

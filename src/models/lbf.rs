@@ -23,7 +23,7 @@ use super::network::{Architecture, Batch, Config, Design, Network, Taped, duplic
 use crate::{
     Result,
     features::{Inputs, LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf},
-    nn::{Activation, Conv, Guides, Images, Init, Param, Stats, cross_bilateral},
+    nn::{Activation, Conv, GuidedImages, Images, Init, Param, Stats, cross_bilateral},
     passes::{Pass, PassSet},
     rng::Rng,
 };
@@ -91,7 +91,7 @@ impl Lbf {
         let precision = ln(exp(clamp(output, -SOFTPLUS_LIMIT, SOFTPLUS_LIMIT)) + 1.0);
         let shape = (scales.0.n, PRECISIONS, scales.0.h, scales.0.w);
         let scales: Images = Cpu::default().tensor_from_vec(scales.1.to_vec(), shape);
-        let guides = Guides {
+        let guides = GuidedImages {
             radius: RADIUS,
             image: image.1.to_vec(),
             noise: noise.1.to_vec(),

@@ -10,7 +10,7 @@ use crate::kernels::{cross_bilateral::CrossBilateral, filter::Size, simd::Tier};
 
 /// The images of a batch, to be filtered.
 #[derive(Clone, Debug)]
-pub struct Guides {
+pub struct GuidedImages {
     /// Pixels from the centre of the filter's square to its edge.
     pub radius: usize,
     /// Radiance, (N, 3, H, W).
@@ -23,7 +23,7 @@ pub struct Guides {
     pub groups: Vec<usize>,
 }
 
-impl Guides {
+impl GuidedImages {
     /// The filter of image `n`.
     fn filter<'a>(&'a self, size: Size, n: usize, precision: &'a [f32]) -> CrossBilateral<'a> {
         let pixels = size.pixels();
@@ -45,7 +45,7 @@ impl Guides {
 ///
 /// # Panics
 /// If sizes do not fit together.
-pub fn cross_bilateral<T: Tape<f32, Cpu>>(guides: Guides, precision: Images<T>) -> Images<T> {
+pub fn cross_bilateral<T: Tape<f32, Cpu>>(guides: GuidedImages, precision: Images<T>) -> Images<T> {
     let (precision, mut tape) = precision.split_tape();
     let &(images, _, h, w) = precision.shape();
     let (size, tier) = (Size { h, w }, Tier::detect());

@@ -16,7 +16,7 @@ pub mod weights;
 
 pub use activation::Activation;
 pub use arithmetic::{Arithmetic, Precision};
-pub use cross_bilateral::{Guides, cross_bilateral};
+pub use cross_bilateral::{GuidedImages, cross_bilateral};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use line::{Line, Rows};

@@ -39,7 +39,7 @@ pub fn components(pass: Pass) -> Components {
 }
 
 /// One row: a pass, a renderer's names for it (the one to prefer first) and how it is turned on.
-pub struct Row {
+pub struct PassNames {
     /// The meaning.
     pub pass: Pass,
     /// The renderer's names. Letter case, spaces and underscores do not matter where no name is the very same.
@@ -53,7 +53,7 @@ pub struct Renderer {
     /// Its name in messages.
     pub name: &'static str,
     /// The passes that it writes and demc knows.
-    pub rows: &'static [Row],
+    pub rows: &'static [PassNames],
     /// What it calls its motion, which demc does not follow: units and directions differ from Cycles'.
     pub motion: &'static [&'static str],
 }
@@ -66,7 +66,7 @@ impl fmt::Debug for Renderer {
 
 macro_rules! row {
     ($pass:ident, $names:expr, $setting:expr) => {
-        Row { pass: Pass::$pass, names: &$names, setting: $setting }
+        PassNames { pass: Pass::$pass, names: &$names, setting: $setting }
     };
 }
 
@@ -348,7 +348,7 @@ const AMBIGUOUS: [&str; 1] = ["diffuse"];
 
 impl Renderer {
     /// The renderer's row of a pass.
-    pub fn row(&self, pass: Pass) -> Option<&'static Row> {
+    pub fn row(&self, pass: Pass) -> Option<&'static PassNames> {
         self.rows.iter().find(|row| row.pass == pass)
     }
 

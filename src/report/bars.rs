@@ -17,7 +17,7 @@ use super::{
     figure::Figure,
     palette::{FAINT, GRID, INK, colours},
     rows::Row,
-    summary::Method,
+    summary::MethodSummary,
 };
 use crate::Result;
 
@@ -59,25 +59,31 @@ pub struct Bars {
 
 impl Bars {
     /// RelMSE of all `rows`, with the means of `summaries`.
-    pub fn relmse(rows: &[Row], summaries: &[Method]) -> Self {
+    pub fn relmse(rows: &[Row], summaries: &[MethodSummary]) -> Self {
         let means = [("mean", mean as Mean), ("geometric mean", geomean as Mean)];
         Self::new("RelMSE by scene (logarithmic; lower is better)", "relmse", rows, summaries, &means)
     }
 
     /// SSIM of all `rows`, with the mean of `summaries`.
-    pub fn ssim(rows: &[Row], summaries: &[Method]) -> Self {
+    pub fn ssim(rows: &[Row], summaries: &[MethodSummary]) -> Self {
         Self::new("SSIM by scene (higher is better)", "ssim", rows, summaries, &[("mean", mean as Mean)])
     }
 
     /// Flicker of all `rows`, with the means of `summaries`.
-    pub fn flicker(rows: &[Row], summaries: &[Method]) -> Self {
+    pub fn flicker(rows: &[Row], summaries: &[MethodSummary]) -> Self {
         let followed: Vec<Row> = rows.iter().filter(|row| row.flicker.is_some()).cloned().collect();
         let means = [("mean", mean as Mean), ("geometric mean", geomean as Mean)];
         Self::new("Flicker by frame (logarithmic; lower is better)", "flicker", &followed, summaries, &means)
     }
 
-    fn new(title: &str, metric: &str, rows: &[Row], summaries: &[Method], means: &[(&str, Mean)]) -> Self {
-        let overall: Vec<&Method> = summaries.iter().filter(|s| s.spp.is_none()).collect();
+    fn new(
+        title: &str,
+        metric: &str,
+        rows: &[Row],
+        summaries: &[MethodSummary],
+        means: &[(&str, Mean)],
+    ) -> Self {
+        let overall: Vec<&MethodSummary> = summaries.iter().filter(|s| s.spp.is_none()).collect();
         let names: Vec<&str> = overall.iter().map(|s| s.model.as_str()).collect();
         let is_error = metric != "ssim";
         let value: fn(&Row) -> Option<f64> = match metric {
@@ -224,13 +230,13 @@ impl Bars {
 }
 
 /// How a summary gives a mean of a metric.
-type Mean = fn(&Method, &str) -> Option<f64>;
+type Mean = fn(&MethodSummary, &str) -> Option<f64>;
 
-fn mean(method: &Method, metric: &str) -> Option<f64> {
+fn mean(method: &MethodSummary, metric: &str) -> Option<f64> {
     method.of(metric).mean
 }
 
-fn geomean(method: &Method, metric: &str) -> Option<f64> {
+fn geomean(method: &MethodSummary, metric: &str) -> Option<f64> {
     method.of(metric).geomean
 }
 

@@ -12,7 +12,7 @@ use super::{
     figure::Figure,
     labels::{self, Rect},
     palette::{FAINT, GRID, INK, colours, legible},
-    summary::Method,
+    summary::MethodSummary,
 };
 use crate::Result;
 
@@ -51,8 +51,8 @@ pub struct Chart {
 
 impl Chart {
     /// From the summaries of a report; those of single sample counts are left out.
-    pub fn new(summaries: &[Method], threads: usize) -> Self {
-        let summaries: Vec<&Method> = summaries.iter().filter(|s| s.spp.is_none()).collect();
+    pub fn new(summaries: &[MethodSummary], threads: usize) -> Self {
+        let summaries: Vec<&MethodSummary> = summaries.iter().filter(|s| s.spp.is_none()).collect();
         let panels = [
             Panel::new(
                 &summaries,
@@ -101,14 +101,14 @@ pub fn number_label(value: f64) -> String {
 
 impl Panel {
     fn new(
-        summaries: &[&Method],
+        summaries: &[&MethodSummary],
         title: &'static str,
         axis: &'static str,
         is_error: bool,
-        score: impl Fn(&Method) -> Option<f64>,
+        score: impl Fn(&MethodSummary) -> Option<f64>,
     ) -> Self {
         // A logarithmic axis has no zero.
-        let score = |s: &Method| score(s).filter(|v| !is_error || *v > 0.0);
+        let score = |s: &MethodSummary| score(s).filter(|v| !is_error || *v > 0.0);
         let names: Vec<&str> = summaries.iter().map(|s| s.model.as_str()).collect();
         let points = summaries.iter().zip(colours(&names)).filter_map(|(s, colour)| {
             let time = s.of("ms_per_mpx").geomean.filter(|t| *t > 0.0)?;

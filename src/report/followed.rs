@@ -3,7 +3,7 @@
 use std::{collections::HashMap, path::Path};
 
 use super::{
-    Method, NOISY,
+    Contender, NOISY,
     run::{Loaded, load},
 };
 use crate::{
@@ -72,7 +72,12 @@ impl<'a> Before<'a> {
     ///
     /// # Errors
     /// Says why there is none.
-    pub fn flicker(&mut self, method: &Method, image: &Planes, next: &Loaded) -> Result<Option<f64>, String> {
+    pub fn flicker(
+        &mut self,
+        method: &Contender,
+        image: &Planes,
+        next: &Loaded,
+    ) -> Result<Option<f64>, String> {
         let said = |why: &str| format!("no flicker: {why}");
         let Some(vectors) = next.shot.passes.get(Pass::Vector) else {
             return Err(said("the frame has no Vector"));
@@ -91,7 +96,7 @@ impl<'a> Before<'a> {
     }
 
     /// Runs a method whose row of this frame was kept from an earlier run.
-    fn make(&mut self, method: &Method) -> Result<(), String> {
+    fn make(&mut self, method: &Contender) -> Result<(), String> {
         let lost = |why: &dyn std::fmt::Display| format!("of the frame before: {why}");
         if self.loaded.is_none() {
             let mut loaded = load(self.pair, self.view_layer).map_err(|e| lost(&e))?;

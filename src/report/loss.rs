@@ -9,7 +9,7 @@ use super::{
     axis::{Area, Scale, tick_label},
     canvas::{Anchor, Canvas, Style, draw_on, write_png},
 };
-use crate::{Result, train::Row};
+use crate::{Result, train::LogRow};
 
 const SIZE: (u32, u32) = (1200, 560);
 const AREA: Area = Area { left: 90, right: 1176, top: 64, bottom: 500 };
@@ -21,14 +21,14 @@ const VALIDATION: RGBColor = RGBColor(213, 94, 0);
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn loss_chart(path: &Path, rows: &[Row]) -> Result<()> {
+pub fn loss_chart(path: &Path, rows: &[LogRow]) -> Result<()> {
     let mut image = RgbImage::from_pixel(SIZE.0, SIZE.1, image::Rgb([255; 3]));
     draw_on(&mut image, |canvas| draw(canvas, rows))?;
     write_png(path, &image)
 }
 
-fn draw<B: DrawingBackend>(canvas: &Canvas<B>, rows: &[Row]) -> Result<()> {
-    let series = |value: fn(&Row) -> Option<f64>| -> Vec<(f64, f64)> {
+fn draw<B: DrawingBackend>(canvas: &Canvas<B>, rows: &[LogRow]) -> Result<()> {
+    let series = |value: fn(&LogRow) -> Option<f64>| -> Vec<(f64, f64)> {
         let points = rows.iter().filter_map(|r| Some((r.step as f64, value(r)?)));
         points.filter(|p| p.1 > 0.0 && p.1.is_finite()).collect()
     };

@@ -38,9 +38,9 @@ pub use loss::loss_chart;
 pub(crate) use page::{document, picture_of};
 pub use palette::is_own;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
-pub use run::{Event, Loaded, evaluate, load, load_listed, sheet_name};
+pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, sheet_name};
 pub use settings::file_stamp;
-pub use summary::{Method as MethodSummary, geometric_mean, mean, summarise};
+pub use summary::{MethodSummary, geometric_mean, mean, summarise};
 
 use crate::models::Denoiser;
 
@@ -51,7 +51,7 @@ pub const NOISY: &str = "noisy";
 pub type MemoryProbe = Box<dyn Fn(&Path) -> Option<f64> + Send + Sync>;
 
 /// A method under test.
-pub struct Method {
+pub struct Contender {
     /// Its name in tables and charts, unique in a run.
     pub name: String,
     /// What runs.
@@ -64,7 +64,7 @@ pub struct Method {
 
 /// How to run.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct EvalOptions {
     /// Folder for everything that is written.
     pub out: PathBuf,
     /// Timed runs of each method and pair, each after one that warms up; their median counts.

@@ -9,7 +9,7 @@ use std::{
 };
 
 use super::{
-    Method, NOISY, Options,
+    Contender, EvalOptions, NOISY,
     bars::Bars,
     chart::Chart,
     figure::Figure,
@@ -37,7 +37,7 @@ use crate::{
 
 /// What a run tells while it goes on.
 #[derive(Debug)]
-pub enum Event<'a> {
+pub enum EvalEvent<'a> {
     /// Rows asked for in all, and those of them kept from an earlier run.
     Start {
         /// Rows when all is done.
@@ -60,9 +60,9 @@ pub enum Event<'a> {
 /// The folder cannot be written. A pair or method that fails is no error: its row says why.
 pub fn evaluate(
     pairs: &[Pair],
-    methods: &[Method],
-    options: &Options,
-    on: &mut dyn FnMut(Event),
+    methods: &[Contender],
+    options: &EvalOptions,
+    on: &mut dyn FnMut(EvalEvent),
 ) -> Result<Vec<Row>> {
     let out = &options.out;
     let sheets = out.join("sheets");
@@ -88,7 +88,7 @@ pub fn evaluate(
     others.retain(|row| before.still_holds(row, &now));
     others.iter().for_each(|row| now.keep(row, &before));
     if others.len() < count {
-        on(Event::Note(&format!(
+        on(EvalEvent::Note(&format!(
             "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor or files \
              have changed",
             scores.display(),
@@ -96,7 +96,7 @@ pub fn evaluate(
         )));
     }
 
-    on(Event::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
+    on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
     let mut table = Table::create(scores, kept, others)?;
     let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
     let shows =
@@ -121,13 +121,13 @@ pub fn evaluate(
         if finished.iter().all(|f| *f) && sheet.is_none() {
             continue;
         }
-        on(Event::Pair(pair));
+        on(EvalEvent::Pair(pair));
         let done = run_pair(pair, methods, &finished, sheet.is_some(), options, (&mut peaks, &mut followed));
         for row in done.rows {
             if !row.note.is_empty() {
-                on(Event::Note(&row.note));
+                on(EvalEvent::Note(&row.note));
             }
-            on(Event::Row(&row));
+            on(EvalEvent::Row(&row));
             table.push(row)?;
         }
         if let (Some(path), Some(scene)) = (sheet, done.scene) {
@@ -258,14 +258,14 @@ type Peaks = HashMap<(String, usize, usize), Option<f64>>;
 
 fn run_pair(
     pair: &Pair,
-    methods: &[Method],
+    methods: &[Contender],
     finished: &[bool],
     shown: bool,
-    options: &Options,
+    options: &EvalOptions,
     (peaks, followed): (&mut Peaks, &mut Followed),
 ) -> Done {
     let open = || methods.iter().zip(finished).filter(|(_, finished)| !**finished).map(|(m, _)| m);
-    let new_row = |method: &Method| {
+    let new_row = |method: &Contender| {
         let mut row = Row::new(pair, &method.name);
         row.threads = options.threads;
         row
@@ -366,7 +366,7 @@ fn timed_run(denoiser: &dyn Denoiser, shot: &Shot) -> Result<Run> {
 }
 
 /// The run that is scored. None, with a reason in the row, where it fails.
-fn first_run(method: &Method, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
+fn first_run(method: &Contender, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
     let image = if method.name == NOISY {
         loaded.noisy().clone()
     } else {
@@ -405,7 +405,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
-    use crate::{Error, models::Noisy, report::Method};
+    use crate::{Error, models::Noisy, report::Contender};
 
     /// Fails as no method should.
     struct Panics;
@@ -449,13 +449,13 @@ mod tests {
         let out = tempfile::tempdir().unwrap();
         let data = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/*_0004spp.exr");
         let pairs = crate::testset::read(data).unwrap().pairs;
-        let method = |denoiser: Box<dyn Denoiser>| Method {
+        let method = |denoiser: Box<dyn Denoiser>| Contender {
             name: denoiser.name().into(),
             denoiser,
             peak_mib: Box::new(|_| None),
             stamp: "1".into(),
         };
-        let options = Options {
+        let options = EvalOptions {
             out: out.path().into(),
             repeats: 1,
             threads: 1,

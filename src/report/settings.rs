@@ -9,7 +9,7 @@ use std::{
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Method, NOISY, Options,
+    Contender, EvalOptions, NOISY,
     provenance::Provenance,
     rows::{Row, write_file},
 };
@@ -33,7 +33,7 @@ pub struct Settings {
 
 impl Settings {
     /// Those of a run about to start.
-    pub fn of(pairs: &[Pair], methods: &[Method], options: &Options, provenance: &Provenance) -> Self {
+    pub fn of(pairs: &[Pair], methods: &[Contender], options: &EvalOptions, provenance: &Provenance) -> Self {
         Self {
             provenance: provenance.clone(),
             threads: options.threads,

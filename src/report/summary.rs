@@ -46,7 +46,7 @@ pub struct Statistics {
 
 /// One method over the common scenes.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Method {
+pub struct MethodSummary {
     /// Its name.
     pub model: String,
     /// Samples per pixel of the rows summarised; none for all of them.
@@ -60,7 +60,7 @@ pub struct Method {
     statistics: [Statistics; METRICS.len()],
 }
 
-impl Method {
+impl MethodSummary {
     /// The statistics of a metric, named as its column.
     ///
     /// # Panics
@@ -73,7 +73,7 @@ impl Method {
 
 /// Every method in `models` over the pairs that all of them scored: first over all sample counts,
 /// then, where there are several, for each. A method that scored nowhere does not limit the others.
-pub fn summarise(rows: &[Row], models: &[String], baseline: &str) -> Vec<Method> {
+pub fn summarise(rows: &[Row], models: &[String], baseline: &str) -> Vec<MethodSummary> {
     let counts: BTreeSet<u32> = rows.iter().map(|r| r.spp).collect();
     let mut summaries = over(rows.iter().collect(), models, baseline, None);
     if counts.len() > 1 {
@@ -93,7 +93,7 @@ fn valid<'a>(of: &RowsOfMethod<'a>, pair: Files<'a>) -> bool {
     of.get(&pair).is_some_and(|r| r.is_valid())
 }
 
-fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) -> Vec<Method> {
+fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) -> Vec<MethodSummary> {
     let mut by_model: HashMap<&str, RowsOfMethod> = HashMap::new();
     for &row in &rows {
         by_model.entry(&row.model).or_default().insert((&row.noisy, &row.reference), row);
@@ -128,7 +128,7 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
                     ratio: geometric_mean(&ratios),
                 }
             });
-            Method {
+            MethodSummary {
                 model: model.clone(),
                 spp,
                 scenes: common.len(),
@@ -161,7 +161,7 @@ pub fn geometric_mean(values: &[f64]) -> Option<f64> {
 }
 
 /// The table as CSV.
-pub fn to_text(summaries: &[Method], baseline: &str) -> String {
+pub fn to_text(summaries: &[MethodSummary], baseline: &str) -> String {
     let mut columns: Vec<String> = ["model", "spp", "scenes", "failed", "baseline"].map(String::from).into();
     for (metric, _) in METRICS {
         columns.extend(["mean", "median", "geomean", "ratio"].map(|s| format!("{metric}_{s}")));

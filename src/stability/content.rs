@@ -11,7 +11,7 @@ use std::{
     path::PathBuf,
 };
 
-use super::{Row, Trial};
+use super::{Trial, TrialRow};
 use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean};
 
 /// How far the energy of a result may be from one, beside how far its input's is.
@@ -107,8 +107,8 @@ impl Case {
 }
 
 /// The cases of all frames as they were rendered, in the order of the rows.
-pub fn cases(rows: &[Row], baseline: &str) -> Vec<Case> {
-    let mut groups: BTreeMap<usize, Vec<&Row>> = BTreeMap::new();
+pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
+    let mut groups: BTreeMap<usize, Vec<&TrialRow>> = BTreeMap::new();
     let mut order: Vec<(&str, u32, &str)> = Vec::new();
     for row in rows.iter().filter(|row| row.trial == Trial::AsRendered.name()) {
         let key = (row.scene.as_str(), row.spp, row.model.as_str());
@@ -122,9 +122,9 @@ pub fn cases(rows: &[Row], baseline: &str) -> Vec<Case> {
         let at = order.iter().position(|known| *known == (scene, spp, model));
         at.map(|at| groups[&at].as_slice()).unwrap_or_default()
     };
-    let case = |(at, own): (&usize, &Vec<&Row>)| {
+    let case = |(at, own): (&usize, &Vec<&TrialRow>)| {
         let (scene, spp, model) = order[*at];
-        let values = |value: fn(&Row) -> Option<f64>| -> Vec<f64> {
+        let values = |value: fn(&TrialRow) -> Option<f64>| -> Vec<f64> {
             own.iter().filter_map(|row| value(row)).collect()
         };
         let relmse = values(|row| row.relmse);
@@ -196,8 +196,8 @@ fn spread(values: &[f64]) -> Option<f64> {
 mod tests {
     use super::*;
 
-    fn row(model: &str, seed: usize, relmse: f64, energy: f64) -> Row {
-        Row {
+    fn row(model: &str, seed: usize, relmse: f64, energy: f64) -> TrialRow {
+        TrialRow {
             scene: "fog".into(),
             model: model.into(),
             spp: 4,
@@ -206,7 +206,7 @@ mod tests {
             relmse: Some(relmse),
             ssim: Some(0.5),
             energy: Some(energy),
-            ..Row::default()
+            ..TrialRow::default()
         }
     }
 
@@ -221,7 +221,7 @@ mod tests {
             row("good", 1, 0.3, 1.0),
             row("dark", 1, 0.1, 0.92),
             row("bad", 1, 0.9, 1.0),
-            Row { trial: Trial::Mirrored.name(), ..row("good", 0, 9.0, 9.0) },
+            TrialRow { trial: Trial::Mirrored.name(), ..row("good", 0, 9.0, 9.0) },
         ];
         let cases = cases(&rows, "good");
         let names: Vec<&str> = cases.iter().map(|case| case.model.as_str()).collect();
@@ -243,7 +243,7 @@ mod tests {
     #[test]
     fn what_gave_no_result_fails() {
         let failed =
-            Row { relmse: None, ssim: None, energy: None, reason: "no".into(), ..row("m", 0, 0.0, 0.0) };
+            TrialRow { relmse: None, ssim: None, energy: None, reason: "no".into(), ..row("m", 0, 0.0, 0.0) };
         let cases = cases(&[row(NOISY, 0, 0.1, 1.0), failed], NOISY);
         assert_eq!((cases[1].passes(), cases[1].relmse, cases[1].to_input), (Some(false), None, None));
     }

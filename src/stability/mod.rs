@@ -20,8 +20,8 @@ use crate::{
     metrics::{self, display, error, ssim},
     planes::Planes,
     report::{
-        self, Event, Figure, HeatCell, HeatMap, Loaded, Method, NOISY, append_row, cell, geometric_mean,
-        to_csv, write_file,
+        self, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, append_row, cell,
+        geometric_mean, to_csv, write_file,
     },
     shot::Shot,
     testset::Pair,
@@ -33,7 +33,7 @@ pub use trial::Trial;
 
 /// What one method made of one changed frame.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Row {
+pub struct TrialRow {
     /// Scene, with the frame of a sequence.
     pub scene: String,
     /// Method.
@@ -80,7 +80,7 @@ const COLUMNS: [&str; 12] = [
 const SUMMARY_COLUMNS: [&str; 8] =
     ["model", "trial", "scenes", "failed", "ratio", "worst_ratio", "worst_scene", "worst_deviation"];
 
-impl Row {
+impl TrialRow {
     fn cells(&self) -> [String; COLUMNS.len()] {
         [
             self.scene.clone(),
@@ -101,7 +101,7 @@ impl Row {
 
 /// What is asked for.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct StabilityOptions {
     /// Folder for everything that is written.
     pub out: PathBuf,
     /// View layer to read; by default the one with the most passes.
@@ -124,10 +124,10 @@ pub struct Options {
 /// A file cannot be written.
 pub fn run(
     pairs: &[Pair],
-    methods: &[Method],
-    options: &Options,
-    on: &mut dyn FnMut(&Row),
-) -> Result<(Vec<Row>, Vec<Case>)> {
+    methods: &[Contender],
+    options: &StabilityOptions,
+    on: &mut dyn FnMut(&TrialRow),
+) -> Result<(Vec<TrialRow>, Vec<Case>)> {
     let out = &options.out;
     prepare_folder(out)?;
     let table = out.join("stability.csv");
@@ -138,13 +138,13 @@ pub fn run(
         for method in methods {
             let mut before = None;
             for &trial in &options.trials {
-                let mut row = Row {
+                let mut row = TrialRow {
                     scene: pair.label(),
                     model: method.name.clone(),
                     spp: pair.spp,
                     noisy: pair.noisy.clone(),
                     trial: trial.name(),
-                    ..Row::default()
+                    ..TrialRow::default()
                 };
                 match &loaded {
                     Ok(loaded) => {
@@ -175,8 +175,8 @@ pub fn run(
 /// Draws the maps, and the worst scenes with pictures.
 fn show(
     pairs: &[Pair],
-    methods: &[Method],
-    options: &Options,
+    methods: &[Contender],
+    options: &StabilityOptions,
     summary: &[Summary],
     cases: &[Case],
 ) -> Result<()> {
@@ -202,7 +202,7 @@ fn show(
     let worst = worst(pairs, cases, options);
     let folder = options.out.join("worst");
     if !worst.is_empty() {
-        let shown = report::Options {
+        let shown = report::EvalOptions {
             out: folder.clone(),
             repeats: 1,
             threads: options.threads,
@@ -211,7 +211,7 @@ fn show(
             overwrite: true,
             sheets: true,
         };
-        report::evaluate(&worst, methods, &shown, &mut |_: Event<'_>| {})?;
+        report::evaluate(&worst, methods, &shown, &mut |_: EvalEvent<'_>| {})?;
     }
     page::write(&options.out, &maps, cases, &worst)
 }
@@ -232,7 +232,7 @@ fn map_of_trials(methods: Vec<String>, trials: &[Trial], summaries: &[Summary]) 
 }
 
 /// The renders on which our own methods, or else any, do worst beside the baseline: one of each scene.
-fn worst(pairs: &[Pair], cases: &[Case], options: &Options) -> Vec<Pair> {
+fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair> {
     let others = [NOISY, options.baseline.as_str()];
     let is_judged = |case: &&Case| !others.contains(&case.model.as_str());
     let is_own = |case: &&Case| report::is_own(&case.model);
@@ -257,10 +257,10 @@ fn worst(pairs: &[Pair], cases: &[Case], options: &Options) -> Vec<Pair> {
 /// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial leaves there.
 fn measure(
     trial: Trial,
-    method: &Method,
+    method: &Contender,
     loaded: &Loaded,
     before: &mut Option<Planes>,
-    row: &mut Row,
+    row: &mut TrialRow,
 ) -> Result<()> {
     let (width, height) = (loaded.shot.passes.width, loaded.shot.passes.height);
     if trial == Trial::Cropped && (width <= CORNER.0 || height <= CORNER.1) {
@@ -310,9 +310,9 @@ struct Summary {
 }
 
 /// A line for each method and trial, method by method.
-fn summarise(rows: &[Row], methods: &[Method], trials: &[Trial]) -> Vec<Summary> {
+fn summarise(rows: &[TrialRow], methods: &[Contender], trials: &[Trial]) -> Vec<Summary> {
     let lines = methods.iter().flat_map(|method| trials.iter().map(move |trial| (method, *trial)));
-    let line = |(method, trial): (&Method, Trial)| {
+    let line = |(method, trial): (&Contender, Trial)| {
         let own = || rows.iter().filter(|row| row.model == method.name && row.trial == trial.name());
         let ratios: Vec<(f64, &str)> =
             own().filter_map(|row| Some((row.ratio?, row.scene.as_str()))).collect();
@@ -379,14 +379,14 @@ mod tests {
         let out = tempfile::tempdir().unwrap();
         let frame = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/s0000_room_0004spp.exr");
         let pairs = crate::testset::read(frame).unwrap().pairs;
-        let method = Method {
+        let method = Contender {
             name: "delicate".into(),
             denoiser: Box::new(Delicate),
             peak_mib: Box::new(|_| None),
             stamp: String::new(),
         };
         let mut told = 0;
-        let options = Options {
+        let options = StabilityOptions {
             out: out.path().into(),
             view_layer: None,
             trials: Trial::ALL.to_vec(),

@@ -8,7 +8,7 @@ use crate::{Error, Result, frame::atomically};
 
 /// A row of `log.csv`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Row {
+pub struct LogRow {
     /// Steps done.
     pub step: usize,
     /// Seconds of training, over all sittings.
@@ -24,12 +24,12 @@ pub struct Row {
 }
 
 /// Reads the rows up to `step`: a resumed run writes the later ones again.
-pub fn read(path: &Path, step: usize) -> Result<Vec<Row>> {
+pub fn read(path: &Path, step: usize) -> Result<Vec<LogRow>> {
     if !path.exists() {
         return Ok(Vec::new());
     }
     let foreign = |e: csv::Error| Error::invalid(path, format!("not a training log ({e}); remove it"));
-    let rows: Vec<Row> = csv::Reader::from_path(path)
+    let rows: Vec<LogRow> = csv::Reader::from_path(path)
         .map_err(foreign)?
         .deserialize()
         .collect::<Result<_, _>>()
@@ -38,7 +38,7 @@ pub fn read(path: &Path, step: usize) -> Result<Vec<Row>> {
 }
 
 /// Writes every row, whole or not at all.
-pub fn write(path: &Path, rows: &[Row]) -> Result<()> {
+pub fn write(path: &Path, rows: &[LogRow]) -> Result<()> {
     atomically(path, |file| {
         let mut writer = csv::Writer::from_writer(file);
         for row in rows {

@@ -14,8 +14,8 @@ mod run;
 
 pub use checkpoint::{CHECKPOINT, check_size};
 pub use dataset::{Dataset, Sample};
-pub use log::Row;
+pub use log::LogRow;
 pub use loss::Loss;
 pub use optimizer::{Optimizer, Rule};
-pub use options::{Options, Refusal, train_only};
-pub use run::{Event, run};
+pub use options::{Refusal, TrainOptions, train_only};
+pub use run::{TrainEvent, run};

@@ -18,7 +18,7 @@ use crate::{
 /// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were
 /// read: a folder without one is free.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Options {
+pub struct TrainOptions {
     /// The network.
     pub network: Config,
     /// Pairs trained on.
@@ -78,7 +78,7 @@ pub struct Refusal {
 /// memory.
 const MOST: usize = 4096;
 
-impl Options {
+impl TrainOptions {
     /// Whether a run can have these settings, before any file is read.
     ///
     /// # Errors

@@ -11,7 +11,7 @@ use dfdx::tensor_ops::Backward;
 use rayon::prelude::*;
 
 use super::{
-    Dataset, Optimizer, Options, Sample,
+    Dataset, Optimizer, Sample, TrainOptions,
     checkpoint::{self, CHECKPOINT, Progress},
     log,
     options::train_only,
@@ -34,7 +34,7 @@ use crate::{
 
 /// What the caller hears of.
 #[derive(Clone, Debug)]
-pub enum Event {
+pub enum TrainEvent {
     /// Something the user should know of the data, or of how training goes.
     Warning(String),
     /// A step was done.
@@ -45,7 +45,7 @@ pub enum Event {
         loss: f64,
     },
     /// A row was added to the log, which is given whole.
-    Logged(Vec<log::Row>),
+    Logged(Vec<log::LogRow>),
 }
 
 /// Steps in a row that may be skipped before a run is given up.
@@ -61,11 +61,11 @@ const CHECKPOINT_SECONDS: f64 = 60.0;
 /// # Errors
 /// A pair is unusable, the run folder cannot be read or written, or step after step had no finite gradient.
 pub fn run(
-    options: &Options,
+    options: &TrainOptions,
     out: &Path,
     resume: bool,
     stop: &AtomicBool,
-    on: &mut dyn FnMut(Event),
+    on: &mut dyn FnMut(TrainEvent),
 ) -> Result<()> {
     prepare_folder(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join(CHECKPOINT));
@@ -105,7 +105,10 @@ pub fn run(
         checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
         atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
     }
-    training.warnings().chain(validation.warnings()).for_each(|warning| on(Event::Warning(warning.clone())));
+    training
+        .warnings()
+        .chain(validation.warnings())
+        .for_each(|warning| on(TrainEvent::Warning(warning.clone())));
     let (mut since, mut saved) = (Instant::now(), Instant::now());
     while progress.step < options.steps {
         let samples = draw(&training, options, network.multiple(), progress.step);
@@ -119,7 +122,7 @@ pub fn run(
         } else {
             progress.skipped += 1;
         }
-        on(Event::Step { step: progress.step, loss });
+        on(TrainEvent::Step { step: progress.step, loss });
         let last = progress.step == options.steps;
         if progress.step % options.every == 0 || last {
             progress.seconds += since.elapsed().as_secs_f64();
@@ -129,7 +132,7 @@ pub fn run(
                 progress.skipped = 0;
             }
             let score = validate(&mut *average, &validation)?;
-            let row = log::Row {
+            let row = log::LogRow {
                 step: progress.step,
                 seconds: (progress.seconds * 10.0).round() / 10.0,
                 lr,
@@ -145,7 +148,7 @@ pub fn run(
                 progress.best = row.val_relmse;
                 weights_file::write(&out.join("best.safetensors"), &mut *average, &facts(options, &row))?;
             }
-            on(Event::Logged(rows.clone()));
+            on(TrainEvent::Logged(rows.clone()));
             since = Instant::now();
         }
         let stopping = stop.load(Ordering::Relaxed);
@@ -166,7 +169,7 @@ pub fn run(
 ///
 /// # Errors
 /// None was taken, in [`MOST_SKIPPED`] steps or more.
-fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(Event)) -> Result<()> {
+fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(TrainEvent)) -> Result<()> {
     if taken == 0 && skipped >= MOST_SKIPPED {
         return Err(Error::invalid(
             out,
@@ -178,7 +181,7 @@ fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(E
     }
     if skipped > 0 {
         let steps = skipped + taken;
-        on(Event::Warning(format!(
+        on(TrainEvent::Warning(format!(
             "{skipped} of the last {steps} steps had no finite gradient and were skipped; should most be, lower --lr"
         )));
     }
@@ -186,7 +189,7 @@ fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(E
 }
 
 /// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one of those widths.
-fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
+fn set_prefilter(network: &mut dyn Network, options: &TrainOptions) -> Result<()> {
     let wanted = &options.network.prefilter;
     if wanted.is_empty() {
         return Ok(());
@@ -209,7 +212,7 @@ fn set_prefilter(network: &mut dyn Network, options: &Options) -> Result<()> {
 }
 
 /// The crops of a step, all of one size and each from its own stream of a seed.
-fn draw(dataset: &Dataset, options: &Options, multiple: usize, step: usize) -> Vec<Sample> {
+fn draw(dataset: &Dataset, options: &TrainOptions, multiple: usize, step: usize) -> Vec<Sample> {
     // Stream 0 made the initial weights.
     let rng = &mut Rng::new(options.seed, 1 + step as u64);
     let side = dataset.draw_side(options.patch, multiple, rng);
@@ -232,7 +235,7 @@ fn learning_rate((largest, last): (f64, f64), steps: usize, step: usize) -> f64 
 fn step(
     network: &mut dyn Network,
     optimizer: &mut Optimizer,
-    options: &Options,
+    options: &TrainOptions,
     lr: f64,
     step: usize,
     samples: &[Sample],
@@ -311,7 +314,7 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
 }
 
 /// What a weights file says of its training.
-fn facts(options: &Options, row: &log::Row) -> Facts {
+fn facts(options: &TrainOptions, row: &log::LogRow) -> Facts {
     let path = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
     Facts {
         frames: options.train.len(),

@@ -19,7 +19,7 @@ use progress::{Progress, Style};
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::{
     inputs::{self, Inputs, Search},
-    sources::{Guides, Names},
+    sources::{GuideFiles, Names},
     stop,
 };
 use crate::{
@@ -121,7 +121,7 @@ pub struct Args {
     names: Names,
 
     #[command(flatten)]
-    guides: Guides,
+    guides: GuideFiles,
 
     /// Print one JSON object per file, one a line
     #[arg(long)]

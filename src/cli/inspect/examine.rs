@@ -88,14 +88,14 @@ pub struct Missing {
 }
 
 /// A method, the passes it reads, and those of them that it can do without.
-pub struct Method {
+pub struct Needs {
     name: String,
     passes: Vec<Pass>,
     dispensable: Vec<Pass>,
 }
 
 /// The methods there are, with the passes they need: networks with weights, classical methods, peers.
-pub fn methods() -> Vec<Method> {
+pub fn methods() -> Vec<Needs> {
     let listed = METHODS.iter().filter(|method| method.family != Family::Noisy);
     let method = |method: &catalogue::Method| {
         let denoiser: Box<dyn Denoiser> = match method.kind {
@@ -104,7 +104,7 @@ pub fn methods() -> Vec<Method> {
             _ => Box::new(method.learned().ok()?),
         };
         let (passes, dispensable) = (denoiser.passes().to_vec(), denoiser.dispensable().to_vec());
-        Some(Method { name: method.name.into(), passes, dispensable })
+        Some(Needs { name: method.name.into(), passes, dispensable })
     };
     listed.filter_map(method).collect()
 }
@@ -113,7 +113,7 @@ pub fn methods() -> Vec<Method> {
 const DEFAULT_MODEL: &str = "demc-m";
 
 /// Reads and decodes a whole file. It leaves a trace if it `is_compared` with another.
-pub fn examine(path: &Path, methods: &[Method], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
+pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: bool) -> Result<FileReport> {
     let frame = Frame::read(path)?;
     let parts = frame.parts().iter().map(|p| PartReport {
         name: p.name.clone(),
@@ -184,7 +184,7 @@ fn undecodable(frame: &Frame) -> Vec<Finding> {
 fn examine_layer(
     frame: &Frame,
     layer: &Layer,
-    methods: &[Method],
+    methods: &[Needs],
     is_compared: bool,
 ) -> Result<(LayerReport, Option<Trace>)> {
     let mut trace = None;
@@ -241,7 +241,7 @@ fn examine_layer(
 }
 
 /// What the file says of a view layer's passes.
-fn about(frame: &Frame, layer: &Layer, methods: &[Method]) -> About {
+fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
     let is_half = |pass: &Pass| {
         let at = &layer.passes[pass];
         frame.parts()[at.part].channels[at.channels[0]].kind == SampleKind::Half

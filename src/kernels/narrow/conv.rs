@@ -10,15 +10,15 @@ use half::bf16;
 use rayon::prelude::*;
 
 use super::{
-    CHUNK, Engine, FITTING_STEPS, Format, GROUP, Grid, LANES, Operand, Steps, Sums, Term, WEIGHT_STEPS, WORD,
-    Wide,
+    Engine, FITTING_STEPS, Format, GROUP, LANES, Operand, Steps, Term, WEIGHT_STEPS, WORD, Wide,
+    band::{Band, SharedWide, Target},
     winograd::{self, FITTING_SUM, Part, Squares},
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
     conv::{self, Direction, Epilogue, Geometry, weight_index},
-    layout::{Finish, Unpacked},
-    simd::{Kernel, Simd, Tier},
+    layout::Unpacked,
+    simd::Tier,
     winograd::SIDE,
 };
 
@@ -408,7 +408,10 @@ pub fn convolve(
         let band = Band {
             engine,
             grid,
-            weights,
+            weights: &weights.rows,
+            groups: &weights.groups,
+            format: weights.inputs[0].1,
+            spread,
             scale: &scale,
             bias: &bias,
             epilogue,
@@ -426,218 +429,4 @@ pub fn convolve(
             }
         });
     });
-}
-
-/// A pointer that tasks share to write disjoint rows of one operand.
-#[derive(Clone, Copy)]
-struct SharedWide(*mut Wide);
-
-// SAFETY: every task writes its own rows, so no two ever touch the same value.
-unsafe impl Send for SharedWide {}
-// SAFETY: as above.
-unsafe impl Sync for SharedWide {}
-
-#[derive(Clone, Copy)]
-enum Target {
-    F32(Shared),
-    Narrow(SharedWide, Grid, Format),
-    Planes(Unpacked),
-}
-
-/// The work of one task: some rows of all output planes of one image.
-pub(super) struct Band<'a> {
-    pub engine: Engine,
-    pub grid: Grid,
-    pub weights: &'a Weights,
-    /// Of sums, a block an output plane.
-    scale: &'a [Block],
-    bias: &'a [Block],
-    epilogue: Epilogue,
-    /// The terms of each phase; those of the planes as they are where squares are computed.
-    pub phases: &'a [Vec<Term>],
-    pub out: Shape,
-    target: Target,
-    n: usize,
-    pub rows: (usize, usize),
-}
-
-impl Kernel for Band<'_> {
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        let grid = self.grid;
-        let (first, end) = (grid.row(self.rows.0), grid.row(self.rows.1 - 1) + grid.w);
-        let phase_rows = self.phases[0].len() * LANES;
-        let plane_rows = self.phases.len() * phase_rows;
-        let mut sums = Sums::default();
-        for plane in (0..self.out.planes()).step_by(2) {
-            let outputs = (self.out.planes() - plane).min(2);
-            for (phase, terms) in self.phases.iter().enumerate() {
-                let weights = self.weights.rows[plane * plane_rows + phase * phase_rows..].as_ptr();
-                for position in (first..end).step_by(CHUNK) {
-                    // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
-                    // reach, and runs this inside `ready`; tasks own disjoint rows.
-                    unsafe {
-                        let terms = (&terms[..], &self.weights.groups[..]);
-                        let format = self.weights.inputs[0].1;
-                        self.engine.multiply(
-                            format,
-                            terms,
-                            position,
-                            weights,
-                            (outputs, plane_rows),
-                            &mut sums,
-                        );
-                        self.store::<S>(
-                            &sums,
-                            (plane, outputs),
-                            phase,
-                            (position, end.min(position + CHUNK)),
-                        );
-                    }
-                }
-            }
-        }
-    }
-}
-
-impl Band<'_> {
-    /// Finishes the sums of positions `from..end` and stores those that are pixels.
-    ///
-    /// # Safety
-    /// The processor has the instructions of `S`; no other task writes these rows.
-    #[inline(always)]
-    pub unsafe fn store<S: Simd>(
-        &self,
-        sums: &Sums,
-        (plane, outputs): (usize, usize),
-        phase: usize,
-        (from, end): (usize, usize),
-    ) {
-        let (grid, spread) = (self.grid, self.weights.geometry.spread());
-        let accumulate = self.epilogue.accumulate;
-        let mut position = from;
-        while position < end {
-            // Positions run from the left border, over the pixels, to the right border, and may begin or end in either.
-            let line = position / grid.stride();
-            let left = line * grid.stride() + grid.pad;
-            let pixels = position.max(left)..end.min(left + grid.w);
-            position = (line + 1) * grid.stride();
-            if pixels.is_empty() {
-                continue;
-            }
-            let (run, first, column) = (pixels.len(), pixels.start - from, pixels.start - left);
-            let row = (line - grid.pad) * spread + phase / spread;
-            // SAFETY: vectors are the tier's.
-            let finish = unsafe { [self.finish::<S>(plane), self.finish::<S>(plane + outputs - 1)] };
-            let sums: [&[Block]; 2] = std::array::from_fn(|o| &sums.0[o][first..first + run]);
-            match self.target {
-                Target::F32(blocks) => {
-                    for o in 0..outputs {
-                        let row = self.out.row(self.n, plane + o, row) + phase % spread;
-                        for (i, sum) in sums[o].iter().enumerate() {
-                            // SAFETY: vectors are the tier's; the pixels lie inside the row, which is this task's.
-                            unsafe {
-                                let block = blocks.at(row + (column + i) * spread);
-                                let add = if accumulate { S::load(block) } else { finish[o].bias };
-                                S::store(block, Scaled { bias: add, ..finish[o] }.of(S::load(sum)));
-                            }
-                        }
-                    }
-                }
-                Target::Planes(planes) => {
-                    for o in 0..outputs {
-                        for (i, pixels) in sums[o].chunks(LANES).enumerate() {
-                            let at = (row, column + i * LANES);
-                            // SAFETY: as above.
-                            unsafe { planes.put::<S>((self.n, plane + o), at, pixels, &finish[o]) }
-                        }
-                    }
-                }
-                Target::Narrow(wides, grid, format) => {
-                    // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
-                    let blocks = format.channels() / LANES;
-                    let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;
-                    let start = wide * grid.positions() + grid.row(row) + phase % spread;
-                    // SAFETY: as above.
-                    unsafe {
-                        let at = wides.0.add(start + column * spread);
-                        match format {
-                            Format::Bf16 => self.narrow(&finish[..outputs], sums, at),
-                            Format::Int8(_) => {
-                                let at = at.cast::<u8>().add(plane % blocks * LANES);
-                                for i in 0..run {
-                                    let at = at.add(i * spread * size_of::<Wide>()).cast::<[u8; LANES]>();
-                                    at.write(S::bytes(finish[0].of(S::load(&sums[0][i]))));
-                                    // The upper half of a pair of planes is zero where there is none.
-                                    let upper = if outputs == 2 {
-                                        S::bytes(finish[1].of(S::load(&sums[1][i])))
-                                    } else {
-                                        [0; LANES]
-                                    };
-                                    at.add(1).write(upper);
-                                }
-                            }
-                        }
-                    }
-                }
-            }
-        }
-    }
-
-    /// How the sums of an output plane become values.
-    ///
-    /// # Safety
-    /// The processor has the instructions of `S`.
-    #[inline(always)]
-    unsafe fn finish<S: Simd>(&self, plane: usize) -> Scaled<S> {
-        let Epilogue { relu, accumulate } = self.epilogue;
-        // SAFETY: the caller's promise.
-        unsafe {
-            let bias = if accumulate { S::splat(0.0) } else { S::load(&self.bias[plane]) };
-            Scaled { scale: S::load(&self.scale[plane]), bias, relu }
-        }
-    }
-
-    /// Finishes sums and rounds them to bfloat16.
-    ///
-    /// # Safety
-    /// As for [`Engine::narrow_spread`].
-    #[inline(always)]
-    unsafe fn narrow<S: Simd>(&self, finish: &[Scaled<S>], sums: [&[Block]; 2], at: *mut Wide) {
-        let mut values = [[Block::default(); CHUNK]; 2];
-        // SAFETY: the caller's promise.
-        unsafe {
-            for ((values, sums), finish) in values.iter_mut().zip(sums).zip(finish) {
-                for (value, sum) in values.iter_mut().zip(sums) {
-                    S::store(value, finish.of(S::load(sum)));
-                }
-            }
-            let [low, high] = values.each_ref().map(|values| &values[..sums[0].len()]);
-            self.engine.narrow_spread(
-                low,
-                (finish.len() == 2).then_some(high),
-                at,
-                self.weights.geometry.spread(),
-            );
-        }
-    }
-}
-
-/// What makes values of a plane's sums: `relu(sum * scale + bias)`, the ReLU only where asked for.
-#[derive(Clone, Copy)]
-struct Scaled<S: Simd> {
-    scale: S::V,
-    bias: S::V,
-    relu: bool,
-}
-
-impl<S: Simd> Finish<S> for Scaled<S> {
-    #[inline(always)]
-    unsafe fn of(&self, sum: S::V) -> S::V {
-        // SAFETY: the caller's promise.
-        unsafe {
-            let value = S::fma(sum, self.scale, self.bias);
-            if self.relu { S::max(value, S::splat(0.0)) } else { value }
-        }
-    }
 }

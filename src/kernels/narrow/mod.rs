@@ -10,6 +10,7 @@
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.
 
+mod band;
 pub mod conv;
 mod engine;
 pub mod weight_grad;
@@ -415,14 +416,11 @@ struct Quantize<'a> {
 
 impl Kernel for Quantize<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Steps { step, zero } = self.steps;
         for (out, block) in self.out.iter_mut().zip(self.blocks) {
-            // SAFETY: vectors are the tier's.
-            let bytes = unsafe {
-                let steps = S::fma(S::load(block), S::splat(step.recip()), S::splat(zero.into()));
-                S::bytes(S::max(steps, S::splat(0.0)))
-            };
+            let steps = simd.fma(simd.get(block), simd.splat(step.recip()), simd.splat(zero.into()));
+            let bytes = simd.bytes(simd.max(steps, simd.splat(0.0)));
             out.0[self.lane..][..LANES].copy_from_slice(&bytes);
         }
     }

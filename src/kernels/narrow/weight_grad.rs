@@ -8,7 +8,8 @@ use half::bf16;
 use rayon::prelude::*;
 
 use super::{
-    Block, CHUNK, Engine, Geometry, Grid, LANES, Pooled, Shape, Sums, View, WIDE, Wide, allocate, halves,
+    Block, CHUNK, Engine, Geometry, Grid, LANES, Pooled, Shape, Sums, View, WIDE, Wide, allocate,
+    engine::Correlation, halves,
 };
 use crate::kernels::weight_grad::add_sums;
 
@@ -173,7 +174,9 @@ pub fn weight_gradient(
                             let at = pairs + phase * output_gradient.rows + step * CHUNK / 2;
                             let pairs = output_gradient.data.as_ptr().add(at);
                             let stride = source.stride * size_of::<bf16>();
-                            engine.correlate(count, channels, stride, pairs, (outputs, phases), sums);
+                            let correlation =
+                                Correlation { steps: count, channels, stride, pairs, outputs, plane: phases };
+                            engine.correlate(correlation, sums);
                         }
                     }
                 }

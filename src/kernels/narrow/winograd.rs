@@ -9,17 +9,11 @@ use std::num::Wrapping;
 
 use rayon::prelude::*;
 
-use super::{CHUNK, LANES, Sums, WIDE, WORD, Wide, allocate, conv::Band};
+use super::{CHUNK, LANES, Sums, WIDE, WORD, Wide, allocate, band::Band, engine::SQUARES};
 use crate::kernels::{
     simd::{Kernel, Simd},
     winograd::{PATCH, POINTS, SIDE, evaluate_kernel},
 };
-
-/// Squares side by side that are transformed, multiplied and transformed back together: what they need meanwhile stays in the second-level cache.
-pub const SQUARES: usize = 16;
-
-/// The inverse of 9 modulo 2^32.
-pub const NINTH: u32 = 0x38e3_8e39;
 
 /// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before rounding them adds one step
 /// to each at most: 2^6 times that times the largest activation fits into 32 bits.
@@ -66,8 +60,7 @@ pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i1
             for l in 0..(outputs - plane * LANES).min(LANES) {
                 for i in 0..part.count {
                     let kernel = kernel(plane * LANES + l, part.first + i).map(Wrapping);
-                    // SAFETY: numbers of Rust's own want no instructions.
-                    let points = unsafe { evaluate_kernel(kernel) };
+                    let points = evaluate_kernel(kernel);
                     for (point, Wrapping(value)) in points.into_iter().enumerate() {
                         let row = &mut rows[(point * parts.len() + p) * LANES + i / 2];
                         row.0[WORD * l + 2 * (i % 2)..][..2].copy_from_slice(&value.to_ne_bytes());
@@ -87,9 +80,9 @@ pub struct Squares<'a> {
 
 impl Kernel for Squares<'_> {
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    fn run<S: Simd>(self, simd: S) {
         let Squares { band, parts } = self;
-        let (grid, engine, weights, planes) = (band.grid, band.engine, band.weights, &band.phases[0]);
+        let (grid, engine, planes) = (band.grid, band.engine, &band.phases[0]);
         // Points lie one value further apart than they need to, so that not all are in the same few sets of a cache.
         let (point, product) = (parts.len() * SQUARES + 1, 2 * SQUARES + 1);
         let rows_of_plane = POINTS * parts.len() * LANES;
@@ -120,9 +113,9 @@ impl Kernel for Squares<'_> {
                         // SAFETY: both hold as many values a point.
                         unsafe {
                             let rows =
-                                weights.rows[plane * rows_of_plane + i * parts.len() * LANES..].as_ptr();
+                                band.weights[plane * rows_of_plane + i * parts.len() * LANES..].as_ptr();
                             engine.multiply_points(
-                                &weights.groups,
+                                band.groups,
                                 points.as_ptr().add(i * point),
                                 rows,
                                 (outputs, rows_of_plane),
@@ -145,7 +138,7 @@ impl Kernel for Squares<'_> {
                             let from = grid.row(row) + column;
                             let end = from + (grid.w - column).min(CHUNK);
                             // SAFETY: `convolve` ran this as it does a band; tasks own disjoint rows.
-                            unsafe { band.store::<S>(sums, (plane, outputs), 0, (from, end)) }
+                            unsafe { band.store(simd, sums, (plane, outputs), 0, (from, end)) }
                         }
                     }
                 }

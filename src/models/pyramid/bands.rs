@@ -8,47 +8,66 @@ use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
 
-use super::{Encoder, Finish, KERNEL, LEVELS, Prediction, Pyramid};
+use super::trunk::{ENCODER, Finish, KERNEL, LEVELS, Layer, MULTIPLE, Prediction, Trunk};
 use crate::{
     Result,
-    companion::Kind,
-    features::Inputs,
-    kernels::{Shape, blend::Place},
-    models::network::Network,
-    nn::{Activation, Conv, Line, MaxPool},
+    kernels::{Shape, blend::Place, conv::Geometry},
+    nn::{Activation, Line, MaxPool},
     planes::Planes,
 };
 
 type Maps = Activation<NoneTape>;
-type Field = crate::nn::Field<NoneTape>;
+pub type Field = crate::nn::Field<NoneTape>;
+
+/// Images that a trunk's kernels filter: light, or guides.
+pub trait Subject {
+    /// What is read of some rows.
+    type Inputs;
+
+    /// How many images there are.
+    fn images(&self) -> usize;
+
+    /// Takes in the next rows, and returns the encoders' inputs; `images` are those of full resolution.
+    fn push(&mut self, inputs: Self::Inputs, images: &mut [Filtered]) -> [Planes; 2];
+
+    /// Takes in what the head of full resolution says of `rows`, and returns the logits of the gains.
+    fn predicted(&mut self, rows: Range<usize>, finish: Finish<NoneTape>, images: &mut [Filtered]) -> Field;
+
+    /// What becomes of `rows` once their images are filtered, each (3, R, W).
+    fn finish(&self, rows: Range<usize>, filtered: Vec<Field>, gain: Field) -> Vec<Field>;
+
+    /// Lets go of the rows of which everything is `predicted`, and of those that are `finished`.
+    fn forget(&mut self, predicted: usize, finished: usize);
+}
+
+/// Planes as a field.
+pub fn of_planes(planes: Planes) -> Field {
+    Field::from_buffer((1, planes.channels, planes.height, planes.width), planes.data)
+}
 
 /// A frame that comes in band by band and leaves denoised.
-pub struct Feed<'a> {
-    frame: Frame<'a>,
+pub struct Feed<'a, S> {
+    frame: Progress<'a, S>,
     /// Columns and rows of the frame.
     size: (usize, usize),
 }
 
-impl<'a> Feed<'a> {
-    /// A frame of `size` columns and rows, of which no step takes more than `band` rows.
-    pub fn new(network: &'a Pyramid, size: (usize, usize), band: usize, companions: &[Kind]) -> Self {
-        let frame = Frame::new(network, size.1.next_multiple_of(network.multiple()), band, companions);
-        Self { frame, size }
+impl<'a, S: Subject> Feed<'a, S> {
+    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made for as many rows
+    /// as [`padded`] has.
+    pub fn new(trunk: &'a Trunk, subject: S, size: (usize, usize), band: usize) -> Self {
+        Self { frame: Progress::new(trunk, subject, padded(size.1), band), size }
     }
 
-    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, each (3, R, W), and
-    /// its first row: radiance, in its scale, the normal, what radiance was divided by, and the companions, which come in divided
-    /// alike; of a prefilter albedo and normal, in their scale.
+    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, times `scale`,
+    /// and its first row.
     pub fn push(
         &mut self,
-        Inputs { planes, scale }: Inputs,
-        companions: Vec<Planes>,
+        inputs: S::Inputs,
+        scale: f32,
         done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
     ) -> Result<()> {
         let (width, height) = self.size;
-        // What goes with radiance has none.
-        let others = if self.frame.network.denoises_guides() { scale } else { 1.0 };
-        let scales = || std::iter::once(scale).chain(std::iter::repeat(others));
         let mut result = Ok(());
         let mut hand_out = |first: usize, fields: &[Field]| {
             let (_, _, h, w) = fields[0].extent();
@@ -56,16 +75,16 @@ impl<'a> Feed<'a> {
             if rows == 0 || result.is_err() {
                 return;
             }
-            let part = |(field, scale): (&Field, f32)| {
+            let part = |field: &Field| {
                 let values = field.values();
                 Planes::from_rows(3, (width, rows), |c, y, into| {
                     let from = &values[(c * h + y) * w..];
                     into.iter_mut().zip(from).for_each(|(into, v)| *into = v * scale);
                 })
             };
-            result = done(first, fields.iter().zip(scales()).map(part).collect());
+            result = done(first, fields.iter().map(part).collect());
         };
-        self.frame.push(planes, companions);
+        self.frame.push(inputs);
         self.frame.advance(&mut hand_out);
         while self.frame.is_whole() && !self.frame.is_done() {
             self.frame.advance(&mut hand_out);
@@ -74,48 +93,28 @@ impl<'a> Feed<'a> {
     }
 }
 
+/// The rows that a frame of so many is grown to.
+pub fn padded(rows: usize) -> usize {
+    rows.next_multiple_of(MULTIPLE)
+}
+
 /// All that is under way in a frame.
-struct Frame<'a> {
-    network: &'a Pyramid,
+struct Progress<'a, S> {
+    trunk: &'a Trunk,
+    subject: S,
     /// Rows that one step may take: without it, the last step would take all that is behind.
     band: usize,
-    encoders: [Vec<Encoded>; 2],
-    /// Finest level first.
-    decoder: Vec<Decoded>,
+    /// What each layer makes.
+    lines: Vec<Line<Maps>>,
     /// Full resolution first.
     scales: Vec<Scale>,
-    albedo: Line<Field>,
-    /// For a refit.
-    normal: Line<Field>,
-    /// What was divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is
-    /// to divide.
-    quotient: Line<Field>,
-    ratio: Line<Field>,
-    /// Companions wait for the same. They are the images of each scale after the first.
-    companions: Vec<(Kind, Line<Field>)>,
-    /// What normals tell of the light, until the network says how far to follow it.
-    shading: Line<Field>,
     /// Logits of the gains, a field for each kernel of full resolution.
     gains: VecDeque<Field>,
 }
 
-/// A level of an encoder.
-struct Encoded {
-    input: Line<Maps>,
-    middle: Line<Maps>,
-    output: Line<Maps>,
-}
-
-/// A level of the decoder.
-struct Decoded {
-    up: Line<Maps>,
-    fused: Line<Maps>,
-    refined: Line<Maps>,
-}
-
 /// A level of the pyramid.
 struct Scale {
-    /// What is filtered: radiance and its companions, or albedo and normal.
+    /// What is filtered.
     images: Vec<Filtered>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet blended, and for those not yet filtered.
@@ -126,84 +125,51 @@ struct Scale {
 }
 
 /// A level of an image.
-struct Filtered {
-    image: Line<Field>,
+pub struct Filtered {
+    pub image: Line<Field>,
     /// That blended with the level below.
     blended: Line<Field>,
     /// What the level above takes in.
     smooth: Line<Field>,
 }
 
-impl<'a> Frame<'a> {
-    fn new(network: &'a Pyramid, height: usize, band: usize, companions: &[Kind]) -> Self {
-        let rows = |level: usize| height >> (level + 1);
-        let encoder = || {
-            let level = |l| Encoded {
-                input: Line::new(rows(l)),
-                middle: Line::new(rows(l)),
-                output: Line::new(rows(l)),
-            };
-            (0..LEVELS).map(level).collect()
-        };
-        let decoded =
-            |l| Decoded { up: Line::new(rows(l)), fused: Line::new(rows(l)), refined: Line::new(rows(l)) };
+impl<'a, S: Subject> Progress<'a, S> {
+    fn new(trunk: &'a Trunk, subject: S, height: usize, band: usize) -> Self {
         let filtered = |s: usize| Filtered {
             image: Line::new(height >> s),
             blended: Line::new(height >> s),
             smooth: Line::new(height >> s),
         };
-        let images = if network.denoises_guides() { 2 } else { 1 + companions.len() };
         let scale = |s: usize| Scale {
-            images: (0..images).map(|_| filtered(s)).collect(),
+            images: (0..subject.images()).map(|_| filtered(s)).collect(),
             confidence: Line::new(height >> s),
             masks: VecDeque::new(),
             kernels: VecDeque::new(),
             filtered: 0,
         };
         Self {
-            network,
+            trunk,
             band,
-            encoders: [encoder(), encoder()],
-            decoder: (0..LEVELS).map(decoded).collect(),
+            lines: trunk.layers.iter().map(|layer| Line::new(height >> layer.level)).collect(),
             scales: (0..=LEVELS).map(scale).collect(),
-            albedo: Line::new(height),
-            normal: Line::new(height),
-            quotient: Line::new(height),
-            ratio: Line::new(height),
-            companions: companions.iter().map(|kind| (*kind, Line::new(height))).collect(),
-            shading: Line::new(height),
+            subject,
             gains: VecDeque::new(),
         }
     }
 
     /// Adds the inputs of the next rows.
-    fn push(&mut self, inputs: Vec<Planes>, companions: Vec<Planes>) {
-        let mut inputs = inputs.into_iter();
-        let mut next = || inputs.next().expect("`guides` makes seven planes, `noisy_guides` four");
-        let field = |p: Planes| Field::from_buffer((1, p.channels, p.height, p.width), p.data);
-        let [image, second, radiance, guide] = std::array::from_fn(|_| next());
-        if self.network.denoises_guides() {
-            let images = self.scales[0].images.iter_mut().zip([image, second]);
-            images.for_each(|(filtered, planes)| filtered.image.push(field(planes)));
-        } else {
-            self.quotient.push(field(image));
-            self.albedo.push(field(second));
-            self.ratio.push(field(next()));
-            self.shading.push(field(next()));
-            self.normal.push(field(next()));
-            let lines = self.companions.iter_mut().zip(companions);
-            lines.for_each(|((_, line), planes)| line.push(field(planes)));
-        }
-        let layers = self.network.encoders.iter().map(|encoder| &encoder.levels[0][0]);
-        for ((encoder, layer), planes) in self.encoders.iter_mut().zip(layers).zip([radiance, guide]) {
+    fn push(&mut self, inputs: S::Inputs) {
+        let inputs = self.subject.push(inputs, &mut self.scales[0].images);
+        for (first, planes) in [0, ENCODER].into_iter().zip(inputs) {
+            let reader = self.trunk.layers[first + 1].conv().expect("a convolution reads an input");
             let shape = Shape::new(1, planes.channels, planes.height, planes.width);
-            encoder[0].input.push(layer.input_halved(shape, &planes.data));
+            self.lines[first].push(reader.input_halved(shape, &planes.data));
         }
     }
 
     /// Whether all inputs are there.
     fn is_whole(&self) -> bool {
-        self.encoders[0][0].input.end() == self.encoders[0][0].input.total()
+        self.lines[0].end() == self.lines[0].total()
     }
 
     /// Whether everything is computed.
@@ -226,67 +192,42 @@ impl<'a> Frame<'a> {
 
     /// Both encoders side by side: their layers need not wait for each other.
     fn encode(&mut self) {
-        let ([radiance, guide], band) = (&mut self.encoders, self.band);
-        let [of_radiance, of_guide] = &self.network.encoders;
-        rayon::join(|| encode(of_radiance, radiance, band), || encode(of_guide, guide, band));
+        let layers = &self.trunk.layers;
+        let (radiance, rest) = self.lines.split_at_mut(ENCODER);
+        let encode = |first: usize, lines: &mut [Line<Maps>]| {
+            for i in 0..ENCODER {
+                let (before, line) = lines.split_at_mut(i);
+                layers[first + i].advance(|source| &before[source - first], &mut line[0], self.band);
+            }
+        };
+        rayon::join(|| encode(0, radiance), || encode(ENCODER, &mut rest[..ENCODER]));
     }
 
     fn decode(&mut self) {
-        // The decoder's layers, coarsest level first; its lines, finest first.
-        for (level, layers) in (0..LEVELS).rev().zip(&self.network.decoder) {
-            let (finer, coarser) = self.decoder.split_at_mut(level + 1);
-            let Decoded { up, fused, refined } = &mut finer[level];
-            if let (Some(layer), Some(below)) = (&layers.up, coarser.first()) {
-                let from = up.end() / 2;
-                let to = below.refined.settled(1).min(from + (self.band >> (level + 2)));
-                if from < to {
-                    up.push(layer.forward(vec![below.refined.rows_and_border(from..to)]));
+        for (i, layer) in self.trunk.layers.iter().enumerate().skip(2 * ENCODER) {
+            let (before, line) = self.lines.split_at_mut(i);
+            let from = line[0].end();
+            layer.advance(|source| &before[source], &mut line[0], self.band);
+            let rows = from..line[0].end();
+            for (level, head) in self.trunk.heads.iter().enumerate().rev() {
+                if head.source == i && !rows.is_empty() {
+                    let planes = head.conv.forward_planes(&[self.lines[i].rows(rows.clone())], head.factor);
+                    self.predicted(level, head.factor * rows.start..head.factor * rows.end, &planes);
                 }
-            }
-            // A band of the skips at a time, which so need no copy.
-            let skips = self.encoders.each_ref().map(|encoder| &encoder[level].output);
-            while let Some(to) = skips[0].band_end(fused.end()) {
-                let rows = fused.end()..to;
-                if layers.up.is_some() && up.end() < to {
-                    break;
-                }
-                let mut sources: Vec<Maps> = skips.iter().map(|skip| skip.rows(rows.clone())).collect();
-                sources.extend(layers.up.iter().map(|_| up.rows(rows.clone())));
-                fused.push(layers.fuse.forward(sources));
-            }
-            let from = refined.end();
-            convolve(&layers.refine, fused, refined, self.band >> (level + 1));
-            let rows = from..refined.end();
-            if rows.is_empty() {
-                continue;
-            }
-            let fine = [refined.rows(rows.clone())];
-            let head = self.network.heads[level].forward_planes(&fine, 1);
-            let prediction = Prediction::split(KERNEL, |first, count| head.channels(first, count));
-            self.scales[level + 1].predicted(rows.clone(), prediction);
-            if level == 0 {
-                let head = self.network.full.forward_planes(&fine, 2);
-                let planes = |first, count| head.channels(first, count);
-                let (prediction, Finish { mut gain, refined }) =
-                    Prediction::split_full(self.network.kernel(0), head.extent().1, planes);
-                let rows = 2 * rows.start..2 * rows.end;
-                if let Some((divisor, shade)) = refined {
-                    let (quotient, ratio) = (self.quotient.rows(rows.clone()), self.ratio.rows(rows.clone()));
-                    let (beauty, others) = self.scales[0].images.split_at_mut(1);
-                    for (filtered, (kind, line)) in others.iter_mut().zip(&self.companions) {
-                        let planes = line.rows(rows.clone());
-                        filtered.image.push(match kind {
-                            Kind::Light | Kind::Colour => planes.redivide(ratio.fork(), divisor.fork()),
-                            Kind::Share => planes,
-                        });
-                    }
-                    beauty[0].image.push(quotient.redivide(ratio, divisor));
-                    gain = gain.plus_product(self.shading.rows(rows.clone()), shade);
-                }
-                self.gains.push_back(gain);
-                self.scales[0].predicted(rows, prediction);
             }
         }
+    }
+
+    /// Takes in what the head of a level predicted for `rows`.
+    fn predicted(&mut self, level: usize, rows: Range<usize>, head: &Field) {
+        let planes = |first, count| head.channels(first, count);
+        if level > 0 {
+            return self.scales[level].predicted(rows, Prediction::split(KERNEL, planes));
+        }
+        let (prediction, finish) = Prediction::split_full(self.trunk.kernel(0), head.extent().1, planes);
+        let images = &mut self.scales[0].images;
+        self.gains.push_back(self.subject.predicted(rows.clone(), finish, images));
+        self.scales[0].predicted(rows, prediction);
     }
 
     /// Builds the pyramid.
@@ -328,7 +269,7 @@ impl<'a> Frame<'a> {
 
     /// Filters the images; at full resolution, hands out what becomes of them.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
-        let reach = self.network.kernel(scale) / 2;
+        let reach = self.trunk.kernel(scale) / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
         while let Some((rows, _)) = kernels.front() {
             let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
@@ -346,48 +287,26 @@ impl<'a> Frame<'a> {
                 [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
                 images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
             };
-            let mut outputs = sources.chunks(3).flat_map(filtered_together);
+            let outputs = sources.chunks(3).flat_map(filtered_together);
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let image = outputs.next().expect("something is filtered");
-            if self.network.denoises_guides() {
-                let normal = outputs.next().expect("guides are two");
-                done(rows.start, &[image.amplify(gain), normal]);
-                continue;
-            }
-            let [normal, albedo] = [&self.normal, &self.albedo].map(|line| line.rows(rows.clone()));
-            let companions = outputs.zip(&self.companions).map(|(planes, (kind, _))| match kind {
-                Kind::Light => planes.product(albedo.fork()).amplify(gain.fork()),
-                Kind::Colour => planes.product(albedo.fork()),
-                Kind::Share => planes,
-            });
-            let companions: Vec<Field> = companions.collect();
-            let beauty = [image.product(albedo.fork()).amplify(gain), normal, albedo];
-            done(rows.start, &beauty.into_iter().chain(companions).collect::<Vec<_>>());
+            done(rows.start, &self.subject.finish(rows, outputs.collect(), gain));
         }
     }
 
     /// Lets go of every row that nothing needs any more.
     fn forget(&mut self) {
-        for level in 0..LEVELS {
-            let pooled = (level + 1 < LEVELS).then(|| level + 1);
-            for encoder in &mut self.encoders {
-                let below = pooled.map_or(usize::MAX, |below| 2 * encoder[below].input.end());
-                let Encoded { input, middle, output } = &mut encoder[level];
-                input.forget(middle.end().saturating_sub(1));
-                middle.forget(output.end().saturating_sub(1));
-                output.forget(below.min(self.decoder[level].fused.end()));
+        let mut needed = vec![usize::MAX; self.lines.len()];
+        for (layer, line) in self.trunk.layers.iter().zip(&self.lines) {
+            for source in &layer.sources {
+                needed[*source] = needed[*source].min(layer.first_read(line.end()));
             }
-            let above = level.checked_sub(1).map_or(usize::MAX, |above| self.decoder[above].up.end() / 2);
-            let Decoded { up, fused, refined } = &mut self.decoder[level];
-            up.forget(fused.end());
-            fused.forget(refined.end().saturating_sub(1));
-            refined.forget(above.min(refined.end()).saturating_sub(1));
         }
+        self.lines.iter_mut().zip(needed).for_each(|(line, row)| line.forget(row));
         for scale in 0..=LEVELS {
             // Of several images all are as far on.
             let reduced =
@@ -395,7 +314,7 @@ impl<'a> Frame<'a> {
             let above =
                 scale.checked_sub(1).map_or(0, |above| self.scales[above].images[0].blended.end() / 2);
             let Scale { images, confidence, filtered, .. } = &mut self.scales[scale];
-            let reach = filtered.saturating_sub(self.network.kernel(scale) / 2);
+            let reach = filtered.saturating_sub(self.trunk.kernel(scale) / 2);
             confidence.forget(reach.min(reduced));
             for Filtered { image, blended, smooth } in images {
                 image.forget(reach.min(reduced));
@@ -404,13 +323,7 @@ impl<'a> Frame<'a> {
             }
         }
         let Scale { images, filtered, .. } = &self.scales[0];
-        let divided = images[0].image.end();
-        self.quotient.forget(divided);
-        self.companions.iter_mut().for_each(|(_, line)| line.forget(divided));
-        self.ratio.forget(divided);
-        self.shading.forget(divided);
-        self.albedo.forget(*filtered);
-        self.normal.forget(*filtered);
+        self.subject.forget(images[0].image.end(), *filtered);
     }
 }
 
@@ -432,28 +345,48 @@ impl Scale {
     }
 }
 
-/// Takes the levels of an encoder as far as they can go, by at most `band` rows of the frame.
-fn encode(encoder: &Encoder, levels: &mut [Encoded], band: usize) {
-    for (level, [first, second]) in encoder.levels.iter().enumerate() {
-        let (above, rest) = levels.split_at_mut(level);
-        let Encoded { input, middle, output } = &mut rest[0];
-        if let Some(above) = above.last() {
-            let (from, to) = (input.end(), above.output.end() / 2);
-            if from < to {
-                input.push(MaxPool.forward(above.output.rows(2 * from..2 * to)));
+impl Layer {
+    /// Makes the next rows of `line`, by at most `band` rows of the frame, as far as the sources are there.
+    fn advance<'a>(&self, source: impl Fn(usize) -> &'a Line<Maps>, line: &mut Line<Maps>, band: usize) {
+        let Some(&first) = self.sources.first() else { return };
+        let (first, end, most) = (source(first), line.end(), band >> self.level);
+        let Some(conv) = self.conv() else {
+            let to = first.end() / 2;
+            if end < to {
+                line.push(MaxPool.forward(first.rows(2 * end..2 * to)));
+            }
+            return;
+        };
+        match conv.arithmetic().geometry {
+            // A band of the first source at a time, which so needs no copy.
+            Geometry::Same(1) => {
+                while let Some(to) = first.band_end(line.end()) {
+                    let sources = || self.sources.iter().map(|i| source(*i));
+                    if sources().any(|source| source.end() < to) {
+                        break;
+                    }
+                    let rows = line.end()..to;
+                    line.push(conv.forward(sources().map(|source| source.rows(rows.clone())).collect()));
+                }
+            }
+            geometry => {
+                let spread = if geometry == Geometry::Transposed { 2 } else { 1 };
+                let from = end / spread;
+                let to = first.settled(1).min(from + most / spread);
+                if from < to {
+                    line.push(conv.forward(vec![first.rows_and_border(from..to)]));
+                }
             }
         }
-        let most = band >> (level + 1);
-        convolve(first, input, middle, most);
-        convolve(second, middle, output, most);
     }
-}
 
-/// A 3x3 convolution of at most `most` rows whose neighbours are there.
-fn convolve(layer: &Conv, from: &Line<Maps>, to: &mut Line<Maps>, most: usize) {
-    let rows = to.end()..from.settled(1).min(to.end() + most);
-    if !rows.is_empty() {
-        to.push(layer.forward(vec![from.rows_and_border(rows)]));
+    /// The first row of its sources that it needs to go on from row `end` of its own.
+    fn first_read(&self, end: usize) -> usize {
+        match self.conv().map(|conv| conv.arithmetic().geometry) {
+            None => 2 * end,
+            Some(Geometry::Same(k)) => end.saturating_sub(k / 2),
+            Some(_) => (end / 2).saturating_sub(1),
+        }
     }
 }
 

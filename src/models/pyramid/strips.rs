@@ -9,13 +9,19 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{NEEDED_BY, Pyramid, bands::Feed};
+use super::{
+    NEEDED_BY, Pyramid,
+    bands::{Feed, padded},
+    light::LightImages,
+    prefilter::{GuideImages, Prefilter},
+    trunk::MULTIPLE,
+};
 use crate::{
     Result,
     companion::{Companion, Kind},
     features::{
-        self, Inputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
-        guide_rows, keep_black, noisy_guides, normal_of_target, tame_alike,
+        LightInputs, PREFILTERED_PASSES, Refined, Shading, albedo_exposure, albedo_of_target, exposure,
+        guide_inputs, guide_rows, keep_black, light_inputs, normal_of_target, tame_alike,
     },
     filters::refit::{Guides, Refit, Samples},
     models::network::Network,
@@ -68,7 +74,7 @@ fn infer_in(
         None => CleanGuides::Prefiltered(exposure_of_guides(passes)?),
     };
     let whole = Whole { network, passes, guides, companions, rows, radiance, exposure, shading };
-    for strip in Strip::all(network, passes.width, widest) {
+    for strip in network.strips(passes.width, widest) {
         whole.denoise(&strip, &mut written)?;
     }
     let mut written = written.into_iter();
@@ -90,20 +96,20 @@ fn infer_in(
 ///
 /// # Errors
 /// A pass is missing.
-pub fn infer_guides(prefilter: &Pyramid, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
+pub fn infer_guides(prefilter: &Prefilter, passes: &PassSet, rows: Option<usize>) -> Result<[Planes; 2]> {
     infer_guides_in((rows, WIDEST), prefilter, passes)
 }
 
 /// [`infer_guides`] in strips of at most `widest` columns.
 fn infer_guides_in(
     (rows, widest): (Option<usize>, usize),
-    prefilter: &Pyramid,
+    prefilter: &Prefilter,
     passes: &PassSet,
 ) -> Result<[Planes; 2]> {
     let exposure = exposure_of_guides(passes)?;
     let mut guides = [(); 2].map(|()| Planes::unwritten(3, passes.width, passes.height));
-    for Strip { own, seen, .. } in Strip::all(prefilter, passes.width, widest) {
-        let cut = Cut::new(prefilter, passes, seen, rows);
+    for Strip { own, seen, .. } in Strip::all(passes.width, widest, [prefilter.reach(), 0]) {
+        let cut = Cut::new(passes, seen, rows);
         prefilter_bands(prefilter, passes, exposure, &cut, &mut |first, parts| {
             for (guide, part) in guides.iter_mut().zip(parts) {
                 let from = (own.start - cut.columns.start, 0);
@@ -121,19 +127,20 @@ fn exposure_of_guides(passes: &PassSet) -> Result<f32> {
     Ok(albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?))
 }
 
-/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as [`Feed::push`] does.
+/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as [`Feed::push`]
+/// does: albedo and normal.
 fn prefilter_bands(
-    prefilter: &Pyramid,
+    prefilter: &Prefilter,
     passes: &PassSet,
     exposure: f32,
     cut: &Cut,
     done: &mut dyn FnMut(usize, Vec<Planes>) -> Result<()>,
 ) -> Result<()> {
-    let mut feed = Feed::new(prefilter, cut.size(), cut.rows, &[]);
+    let mut feed = Feed::new(&prefilter.trunk, GuideImages, cut.size(), cut.rows);
     for band in cut.bands() {
         let padded = cut.padded(&band);
         let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded).columns(cut.padded_columns());
-        feed.push(noisy_guides(&band, exposure, NEEDED_BY)?, Vec::new(), done)?;
+        feed.push(guide_inputs(&band, exposure, NEEDED_BY)?, exposure.recip(), done)?;
     }
     Ok(())
 }
@@ -149,27 +156,31 @@ struct Strip {
 }
 
 impl Strip {
-    /// As few of a width as make up a frame, none wider than `widest`.
-    fn all(network: &Pyramid, width: usize, widest: usize) -> impl Iterator<Item = Self> {
-        let multiple = network.multiple();
+    /// As few of a width as make up a frame, none wider than `widest`. They see as far beyond their own columns as `reach`
+    /// says, and what prefilters those as far again as its second number.
+    fn all(width: usize, widest: usize, reach: [usize; 2]) -> impl Iterator<Item = Self> {
         let beside = move |columns: &Range<usize>, reach: usize| {
-            let reach = reach.next_multiple_of(multiple);
+            let reach = reach.next_multiple_of(MULTIPLE);
             columns.start.saturating_sub(reach)..(columns.end + reach).min(width)
         };
-        let reach = network.reach_in_inputs() + Refit::REACH;
-        let reach_of_prefilter = network.prefilter.as_ref().map_or(0, |prefilter| prefilter.reach());
-        let columns = width.div_ceil(width.div_ceil(widest)).next_multiple_of(multiple);
+        let columns = width.div_ceil(width.div_ceil(widest)).next_multiple_of(MULTIPLE);
         (0..width).step_by(columns).map(move |first| {
             let own = first..(first + columns).min(width);
-            let seen = beside(&own, reach);
-            Self { prefiltered: beside(&seen, reach_of_prefilter), own, seen }
+            let seen = beside(&own, reach[0]);
+            Self { prefiltered: beside(&seen, reach[1]), own, seen }
         })
+    }
+}
+
+impl Pyramid {
+    /// The strips of a frame.
+    fn strips(&self, width: usize, widest: usize) -> impl Iterator<Item = Strip> {
+        Strip::all(width, widest, [self.trunk.reach() + Refit::REACH, self.prefilter.reach()])
     }
 }
 
 /// How some columns of a frame are cut into bands.
 struct Cut {
-    multiple: usize,
     columns: Range<usize>,
     /// Columns and rows of the frame once padded, and rows before.
     width: usize,
@@ -181,11 +192,10 @@ struct Cut {
 
 impl Cut {
     /// That of a strip; `rows` are those of a band, if the user has an opinion.
-    fn new(network: &Pyramid, passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
-        let multiple = network.multiple();
-        let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(multiple));
-        let rows = (rows.unwrap_or(BAND_PIXELS / width) / multiple * multiple).max(multiple);
-        Self { multiple, columns, width, height, unpadded: passes.height, rows }
+    fn new(passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
+        let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(MULTIPLE));
+        let rows = (rows.unwrap_or(BAND_PIXELS / width) / MULTIPLE * MULTIPLE).max(MULTIPLE);
+        Self { columns, width, height, unpadded: passes.height, rows }
     }
 
     /// Columns and rows that there are.
@@ -195,13 +205,13 @@ impl Cut {
 
     /// The columns and those to which they are padded: only where the frame ends is there anything to pad.
     fn padded_columns(&self) -> Range<usize> {
-        self.columns.start..self.columns.end.next_multiple_of(self.multiple)
+        self.columns.start..self.columns.end.next_multiple_of(MULTIPLE)
     }
 
     /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below themselves, so
     /// as many come at once as that may take.
     fn is_last(&self, end: usize) -> bool {
-        self.unpadded < end + self.multiple
+        self.unpadded < end + MULTIPLE
     }
 
     /// The columns and rows to which some rows of the whole frame are padded.
@@ -240,13 +250,14 @@ impl Whole<'_> {
     /// Denoises a strip and writes it: radiance and companions.
     fn denoise(&self, strip: &Strip, written: &mut [Planes]) -> Result<()> {
         let Self { network, passes, .. } = *self;
-        let cut = Cut::new(network, passes, strip.seen.clone(), self.rows);
+        let cut = Cut::new(passes, strip.seen.clone(), self.rows);
         let kinds: Vec<Kind> = self.companions.iter().map(|companion| companion.kind).collect();
-        let mut beauty = Feed::new(network, cut.size(), cut.rows, &kinds);
+        let light = LightImages::new(padded(passes.height), &kinds);
+        let mut beauty = Feed::new(&network.trunk, light, cut.size(), cut.rows);
         let mut last = Last::new(self, strip, written);
         let mut feed = |rows: Range<usize>, guides: [Planes; 2]| {
-            let (inputs, companions) = self.inputs(&cut, rows, guides)?;
-            beauty.push(inputs, companions, &mut |first, parts| {
+            // A refit takes exposed radiance, and scales it last.
+            beauty.push(self.inputs(&cut, rows, guides)?, 1.0, &mut |first, parts| {
                 last.push(first, parts);
                 Ok(())
             })
@@ -262,13 +273,12 @@ impl Whole<'_> {
                 return Ok(());
             }
         };
-        let prefilter = network.prefilter.as_ref().expect("it denoises radiance");
         let prefiltered = Cut { columns: strip.prefiltered.clone(), ..cut };
         let from = strip.seen.start - strip.prefiltered.start;
         let seen = from..from + strip.seen.len();
         let mut held: Option<[Planes; 2]> = None;
         // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
-        prefilter_bands(prefilter, passes, exposure, &prefiltered, &mut |first, parts| {
+        prefilter_bands(&network.prefilter, passes, exposure, &prefiltered, &mut |first, parts| {
             let clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
             let mut clean = clean.map(|planes| planes.columns(seen.clone()));
             let end = first + clean[0].height;
@@ -291,15 +301,13 @@ impl Whole<'_> {
         cut: &Cut,
         rows: Range<usize>,
         [albedo, normal]: [Planes; 2],
-    ) -> Result<(Inputs, Vec<Planes>)> {
+    ) -> Result<(LightInputs, Vec<Planes>)> {
         let Self { passes, radiance, exposure, .. } = *self;
         let (padded, columns) = (cut.padded(&rows), cut.padded_columns());
         let shading = self.shading.rows(passes, rows.clone(), NEEDED_BY)?.columns(cut.columns.clone());
         let refined = Refined { albedo, normal, shading }.padded_to((columns.len(), padded.1));
         let band = guide_rows(passes, rows.clone(), padded, exposure, NEEDED_BY)?.columns(columns.clone());
-        // A refit takes exposed radiance, and scales it last.
-        let inputs = Inputs { scale: 1.0, ..features::guides(&band, refined, exposure, NEEDED_BY)? };
-        let divisor = &inputs.planes[1];
+        let inputs = light_inputs(&band, refined, exposure, NEEDED_BY)?;
         let tamed = band.require(Pass::Combined, NEEDED_BY)?;
         let part = |planes: &Planes| planes.padded_rows(rows.clone(), padded).columns(columns.clone());
         let is_lit = self.companions.iter().any(|companion| companion.kind == Kind::Light);
@@ -314,7 +322,7 @@ impl Whole<'_> {
             }
             let scale = if companion.kind == Kind::Light { exposure } else { 1.0 };
             if companion.kind != Kind::Share {
-                let values = planes.data.par_iter_mut().zip(&divisor.data);
+                let values = planes.data.par_iter_mut().zip(&inputs.divisor.data);
                 values.for_each(|(value, divisor)| *value = *value * scale / divisor);
             }
             planes
@@ -472,22 +480,21 @@ mod tests {
     #[test]
     fn strips_of_guides_give_the_same_bits_as_the_whole_frame() {
         let (network, passes) = (network(Precision::Int8), passes());
-        let prefilter = network.prefilter.as_ref().unwrap();
         let [whole, strips] =
-            [SIZE.0, 300].map(|widest| infer_guides_in((None, widest), prefilter, &passes).unwrap());
+            [SIZE.0, 300].map(|widest| infer_guides_in((None, widest), &network.prefilter, &passes).unwrap());
         assert!(whole == strips);
     }
 
     #[test]
     fn strips_are_as_wide_as_one_another_and_frames_of_usual_widths_are_one() {
         let network = network(Precision::F32);
-        let strips = |width| Strip::all(&network, width, WIDEST).map(|strip| strip.own).collect::<Vec<_>>();
+        let strips = |width| network.strips(width, WIDEST).map(|strip| strip.own).collect::<Vec<_>>();
         for width in [1, 3840, 4096, 6144] {
             assert_eq!(strips(width), std::slice::from_ref(&(0..width)));
         }
         assert_eq!(strips(7680), [0..3840, 3840..7680]);
         assert_eq!(strips(16_384), [0..5472, 5472..10_944, 10_944..16_384]);
-        for strip in Strip::all(&network, 7680, WIDEST) {
+        for strip in network.strips(7680, WIDEST) {
             assert!(strip.prefiltered.len() < 4400, "{:?}", strip.prefiltered);
         }
     }

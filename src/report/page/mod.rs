@@ -16,12 +16,12 @@ use rayon::prelude::*;
 use table::{Better, Column, Line, ratio, score, share, table, whole};
 
 use super::{
-    NOISY, Options,
+    EvalOptions, NOISY,
     palette::colours,
     picture::{self, Picture},
     provenance::Provenance,
     rows::{Row, write_file},
-    summary::{Method, Statistics},
+    summary::{MethodSummary, Statistics},
 };
 use crate::{Result, testset::Pair};
 
@@ -30,7 +30,7 @@ pub struct Page<'a> {
     /// All rows.
     pub rows: &'a [Row],
     /// Their summaries.
-    pub summaries: &'a [Method],
+    pub summaries: &'a [MethodSummary],
     /// Title and SVG of each chart.
     pub charts: &'a [(&'a str, String)],
     /// The pairs, each with its sheet where there is one.
@@ -38,7 +38,7 @@ pub struct Page<'a> {
     /// What sequences look like over time, where there are any.
     pub sequences: Option<&'a Markup>,
     /// How it was run.
-    pub options: &'a Options,
+    pub options: &'a EvalOptions,
     /// What it was run with and on.
     pub provenance: &'a Provenance,
 }
@@ -147,13 +147,13 @@ impl Page<'_> {
     }
 
     /// Summaries over all sample counts.
-    fn overall(&self) -> impl Iterator<Item = &Method> {
+    fn overall(&self) -> impl Iterator<Item = &MethodSummary> {
         self.summaries.iter().filter(|s| s.spp.is_none())
     }
 
     /// Who wins, before any table.
     fn best(&self) -> Markup {
-        let winner = |value: fn(&Method) -> Option<f64>, sign: f64| {
+        let winner = |value: fn(&MethodSummary) -> Option<f64>, sign: f64| {
             let scored = self.overall().filter(|s| s.model != NOISY);
             let scored = scored.filter_map(|s| Some((s.model.as_str(), value(s)?)));
             scored.min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))
@@ -204,9 +204,9 @@ impl Page<'_> {
         counts.dedup();
         html! {
             @for spp in counts {
-                @let methods: Vec<&Method> = self.summaries.iter().filter(|s| s.spp == spp).collect();
+                @let methods: Vec<&MethodSummary> = self.summaries.iter().filter(|s| s.spp == spp).collect();
                 @let names: Vec<&str> = methods.iter().map(|s| s.model.as_str()).collect();
-                @let lines: Vec<Line<Method>> = methods
+                @let lines: Vec<Line<MethodSummary>> = methods
                     .iter()
                     .zip(colours(&names))
                     .map(|(&item, colour)| Line { method: &item.model, colour, item })
@@ -304,7 +304,7 @@ macro_rules! statistic {
             hint: $hint,
             better: Better::$better,
             show: $show,
-            value: |m: &Method| -> Option<f64> {
+            value: |m: &MethodSummary| -> Option<f64> {
                 let Statistics { $field: value, .. } = m.of($metric);
                 value
             },
@@ -312,7 +312,7 @@ macro_rules! statistic {
     };
 }
 
-const SUMMARY: [Column<Method>; 14] = [
+const SUMMARY: [Column<MethodSummary>; 14] = [
     statistic!("RelMSE", "geometric mean over scenes", Low, score, "relmse", geomean),
     statistic!("× baseline", "RelMSE against the baseline, scene by scene", Low, ratio, "relmse", ratio),
     statistic!("mean RelMSE", "arithmetic mean: the worst scene rules it", Low, score, "relmse", mean),
