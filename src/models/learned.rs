@@ -226,6 +226,14 @@ impl Learned {
         Ok(image)
     }
 
+    /// What the network makes of a frame, all of it: see [`shrink`].
+    ///
+    /// # Errors
+    /// A pass is missing.
+    pub fn unrestrained(&self, passes: &PassSet) -> Result<Planes> {
+        self.looks(&with_stand_ins(passes), &mut [], None)
+    }
+
     /// What the network makes of a frame.
     fn looks(&self, passes: &PassSet, companions: &mut [Companion], tile: Option<usize>) -> Result<Planes> {
         if !self.turned {

@@ -1,0 +1,178 @@
+"""Trains what decides how much of the render a denoised frame keeps: src/filters/shrinkage/perceptron.rs.
+
+    cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
+    python restraint.py FEATURES/m FEATURES/s --hold-out              what it reaches on views that it did not see
+    python restraint.py FEATURES/m FEATURES/s --out ../../src/filters/shrinkage/restraint.safetensors
+
+What is made least is the squared error of the mixture, relative to the brightness of the place, against references that
+need not be clean: their noise adds the same to every mixture. Each frame counts by how well it can be done. Frames with a
+part of their noise (restraint_features.rs) teach that what has none is kept. The number of samples is left out or blurred
+at random, so that what is measured decides. Needs torch and safetensors.
+"""
+
+import argparse
+import glob
+import os
+import re
+import zlib
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file, save_file
+from torch import nn
+from torch.nn import functional as F
+
+# As in perceptron.rs and mod.rs beside it.
+SQUARE, HIDDEN, LEAK = 4, 24, 0.1
+FLOOR, OWN_FLOOR, OWN_RANGE, SNAP, LARGEST_CHANGE = 0.02, 1e-6, 3.0, 1 / 64, 1.5
+SAMPLES, KNOWN = -2, -1
+
+CROP, BATCH, HELD_OUT = 64, 24, 5
+
+
+class Frames:
+    """All frames of some folders, (N, channels, 128, 128); what is relative is so to the brightness of the place."""
+
+    def __init__(self, folders):
+        paths = sorted(path for folder in folders for path in glob.glob(os.path.join(folder, "*.safetensors")))
+        self.scenes = [re.match(r"\d+_(.+)_\d+spp", os.path.basename(path))[1] for path in paths]
+        loaded = [load_file(path) for path in paths]
+        of = lambda name: torch.from_numpy(np.stack([tensors[name] for tensors in loaded]))
+        self.features, facts = of("features"), of("facts").flatten(1)
+        render, denoised, truth = of("render").clamp_min(0), of("denoised").clamp_min(0), of("truth")
+        exposure, self.samples, self.noise = facts.unbind(1)
+        floor = FLOOR / exposure.view(-1, 1, 1, 1)
+        light = denoised.mean(1, keepdim=True)
+        self.change = (render.mean(1, keepdim=True) - light) / (light + floor)
+        around = F.avg_pool2d(truth.mean(1, keepdim=True), 5, 1, 2, count_include_pad=False)
+        place = 0.5 * (light + around.clamp_min(0)) + floor
+        self.render = ((render - denoised) / place).clamp(-4, 4)
+        self.truth = ((truth - denoised) / place).clamp(-2, 2)
+        # The least that a mixture can be expected to reach; the noise of the truth is in both.
+        error = lambda image: ((image - self.truth) ** 2).mean((1, 2, 3))
+        self.errors = torch.stack([error(0 * self.render), error(self.render)])
+        noise_of_truth = self.errors.min(0).values * 0.5
+        self.scale = torch.maximum(self.errors.min(0).values - noise_of_truth, 0.1 * self.errors[0]).clamp_min(2e-4)
+
+
+class Perceptron(nn.Module):
+    """What perceptron.rs computes, of standardised features."""
+
+    def __init__(self, features):
+        super().__init__()
+        self.first, self.second, self.last = nn.Conv2d(features, HIDDEN, 1), nn.Conv2d(HIDDEN, HIDDEN, 1), nn.Conv2d(HIDDEN, 2, 1)
+        nn.init.zeros_(self.last.weight)
+        self.last.bias.data = torch.tensor([-2.0, 0.0])
+
+    def forward(self, standard, usual, change):
+        """The share of the render in every pixel: `share_of_render` of mod.rs."""
+        hidden = F.leaky_relu(self.second(F.leaky_relu(self.first(standard), LEAK)), LEAK)
+        judged = torch.cat([self.last(hidden), usual], 1)
+        logit, slope, usual = F.interpolate(judged, scale_factor=SQUARE, mode="bilinear").split(1, 1)
+        own = change.clamp(-1, 1)
+        unusual = ((own**2 + OWN_FLOOR).log() - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE
+        share = (torch.sigmoid(logit + slope * unusual) - SNAP) / (1 - 2 * SNAP)
+        share = share.clamp(0, 1)
+        return share * (LARGEST_CHANGE / ((1 - share) * change.abs()).clamp_min(1e-9)).clamp_max(1)
+
+
+def weights_of(frames):
+    """How often each frame is drawn: half are whole renders of 8 and more samples, a sixth renders of fewer."""
+    kind = torch.where(frames.noise < 1, 0, torch.where(frames.samples >= 8, 1, 2))
+    share = torch.tensor([0.35, 0.5, 0.15]) / torch.bincount(kind, minlength=3).clamp_min(1)
+    return share[kind]
+
+
+def known_samples(samples, noise, generator):
+    """What the perceptron is told of the number of samples: (logarithm, whether it is known)."""
+    draw = torch.rand(len(samples), generator=generator)
+    fewer_noise = samples / noise.clamp_min(1 / 64) ** 2
+    other = 2 ** (12 * torch.rand(len(samples), generator=generator))
+    told = torch.where((noise < 1) & (draw < 0.25), other, fewer_noise)
+    known = torch.where(noise < 1, draw < 0.5, draw < 0.75).float()
+    blurred = torch.log2(told) + 0.4 * torch.randn(len(samples), generator=generator)
+    return blurred.clamp_min(0) * known, known
+
+
+def train(frames, chosen, steps, seed):
+    """The perceptron, and the mean and deviation of the features."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    of_chosen = frames.features[chosen]
+    mean, deviation = of_chosen.mean((0, 2, 3)), of_chosen.std((0, 2, 3)) + 1e-3
+    for column, (m, d) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
+        mean[column], deviation[column] = m, d
+    model = Perceptron(frames.features.shape[1])
+    optimizer = torch.optim.AdamW(model.parameters(), 3e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, steps)
+    weights = weights_of(frames)[chosen]
+    squares = CROP // SQUARE
+    for step in range(steps):
+        at = chosen[torch.multinomial(weights, BATCH, True, generator=generator)]
+        y, x = (int(torch.randint(0, frames.features.shape[2] - squares + 1, (), generator=generator)) for _ in "yx")
+        cut = lambda planes, of: planes[at, :, y * of:(y + squares * 4 // SQUARE) * of, x * of:(x + squares) * of]
+        features = cut(frames.features, 1).clone()
+        log, known = known_samples(frames.samples[at], frames.noise[at], generator)
+        features[:, SAMPLES], features[:, KNOWN] = log.view(-1, 1, 1), known.view(-1, 1, 1)
+        standard = (features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)
+        change, render, truth = (cut(planes, SQUARE) for planes in (frames.change, frames.render, frames.truth))
+        share = model(standard, features[:, :1], change)
+        gain = ((share * render - truth) ** 2 - truth**2).mean((1, 2, 3)) / frames.scale[at]
+        loss = gain.clamp(-20, 20).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+        if (step + 1) % 500 == 0:
+            print(f"step {step + 1}: {loss.item():.3f}", flush=True)
+    return model, mean, deviation
+
+
+def report(frames, chosen, model, mean, deviation):
+    """Mean squared errors on frames that were not trained on, less the noise of the reference as far as it is known."""
+    kinds = sorted({(float(frames.noise[at]), float(frames.samples[at])) for at in chosen})
+    print("noise, samples: frames; error less that of the render, in 1e-4: denoised, mixed, mixed without samples; worse than the render")
+    for noise, samples in kinds:
+        at = torch.tensor([i for i in chosen if (frames.noise[i], frames.samples[i]) == (noise, samples)])
+        changes = []
+        for known in (1.0, 0.0):
+            features = frames.features[at].clone()
+            features[:, SAMPLES] = known * float(np.log2(samples / max(noise, 1 / 64) ** 2))
+            features[:, KNOWN] = known
+            with torch.no_grad():
+                standard = (features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)
+                share = model(standard, features[:, :1], frames.change[at])
+            changes.append(((share * frames.render[at] - frames.truth[at]) ** 2).mean((1, 2, 3)) - frames.errors[1, at])
+        denoised = frames.errors[0, at] - frames.errors[1, at]
+        figures = [1e4 * float(v.mean()) for v in (denoised, *changes)]
+        worse = [int((v > 1e-6).sum()) for v in (denoised, *changes)]
+        print(f"{noise:.1f}, {samples:.0f}: {len(at)}; " + ", ".join(f"{v:.2f}" for v in figures) + f"; {worse}")
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="restraint.py", description="Trains how much of the render a result keeps.")
+    parser.add_argument("folders", nargs="+", help="what restraint_features.rs wrote, pairs of 128x128")
+    parser.add_argument("--out", help="safetensors file to write")
+    parser.add_argument("--hold-out", action="store_true", help=f"leave one scene in {HELD_OUT} out, and report on those")
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    frames = Frames(options.folders)
+    held_out = torch.tensor([zlib.crc32(scene.encode()) % HELD_OUT == 0 for scene in frames.scenes])
+    every = torch.arange(len(frames.scenes))
+    chosen = every[~held_out] if options.hold_out else every
+    model, mean, deviation = train(frames, chosen, options.steps, options.seed)
+    if options.hold_out:
+        report(frames, every[held_out].tolist(), model, mean, deviation)
+    if options.out:
+        # The standardisation goes into the first layer.
+        flat = {name: value.detach().flatten(1) if value.dim() > 1 else value.detach() for name, value in model.state_dict().items()}
+        flat["first.weight"] = flat["first.weight"] / deviation
+        flat["first.bias"] = flat["first.bias"] - flat["first.weight"] @ mean
+        save_file({name: value.numpy().copy() for name, value in flat.items()}, options.out)
+
+
+if __name__ == "__main__":
+    main()

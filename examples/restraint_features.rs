@@ -1,0 +1,95 @@
+//! Writes what `eval/training/restraint.py` learns from: how much of the render a denoised frame should keep.
+//!
+//! ```text
+//! cargo run --release --example restraint_features -- demc-m PAIRS.csv OUT
+//! ```
+//!
+//! For each pair, and for the pair with a part of its noise (where the reference has guides, cleaned by
+//! `eval/training/clean_references.py`), a safetensors file of 32-bit floats: `features` (36, H/4, W/4), `render`,
+//! `denoised` and `truth` (3, H, W), and `facts`: exposure, samples, and the share of the noise.
+
+use std::path::Path;
+
+use demc::{
+    Error, Result, features,
+    filters::shrinkage::{self, Render},
+    models::catalogue,
+    passes::{self, Pass, PassSet},
+    planes::Planes,
+    shot, testset,
+};
+use safetensors::{Dtype, tensor::TensorView};
+
+/// Shares of the noise that a frame is seen with: without any, a result must go back to its input.
+const NOISE: [f32; 5] = [1.0, 0.6, 0.3, 0.1, 0.0];
+
+fn main() -> Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [model, pairs, out] = &arguments[..] else {
+        return Err(Error::Usage("restraint_features MODEL PAIRS OUT".into()));
+    };
+    let Some(method) = catalogue::find(model) else {
+        return Err(Error::Usage(format!("no model '{model}'")));
+    };
+    let model = method.learned()?.with_precision(model, None)?;
+    let folder = Path::new(out);
+    std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    for (at, pair) in testset::read(pairs)?.pairs.iter().enumerate() {
+        let noisy = shot::prepare(&pair.noisy, None)?.passes;
+        let reference = passes::load(&pair.reference, None)?;
+        let denoised = model.unrestrained(&noisy)?;
+        for (step, share) in NOISE.into_iter().enumerate() {
+            let Some((frame, truth)) = with_noise(&noisy, &reference, share) else { continue };
+            let path = folder.join(format!("{at:05}_{}_{step}.safetensors", pair.id()));
+            write(&path, &frame, &denoised, &truth, (pair.spp, share))?;
+        }
+    }
+    Ok(())
+}
+
+/// The frame with a share of its noise, and what is true of it: of all of its noise the reference as rendered, which need
+/// not be clean but must be unbiased, and of less the cleaned one, which the rest of the noise was taken from.
+fn with_noise(noisy: &PassSet, reference: &PassSet, share: f32) -> Option<(PassSet, Planes)> {
+    let clean = reference.get(Pass::Combined)?;
+    if share == 1.0 {
+        return Some((noisy.clone(), reference.get(Pass::NoisyImage).unwrap_or(clean).clone()));
+    }
+    let mut frame = noisy.clone();
+    for pass in [Pass::Combined, Pass::DenoisingAlbedo] {
+        let (noisy, clean) = (noisy.get(pass)?, reference.get(pass)?);
+        let values = noisy.data.iter().zip(&clean.data).map(|(n, c)| c + share * (n - c)).collect();
+        frame.insert(pass, Planes::from_vec(3, noisy.width, noisy.height, values));
+    }
+    Some((frame, clean.clone()))
+}
+
+fn write(
+    path: &Path,
+    frame: &PassSet,
+    denoised: &Planes,
+    truth: &Planes,
+    (spp, share): (u32, f32),
+) -> Result<()> {
+    let radiance = frame.require(Pass::Combined, "training")?;
+    let albedo = frame.require(Pass::DenoisingAlbedo, "training")?;
+    let exposure = features::exposure(radiance);
+    let render = Render { radiance, albedo, exposure, samples: Some(spp), firefly: features::FIREFLY };
+    let features = shrinkage::features(denoised, &render);
+    let facts = Planes::from_vec(3, 1, 1, vec![exposure, spp as f32, share]);
+    let planes = [
+        ("features", &features),
+        ("render", radiance),
+        ("denoised", denoised),
+        ("truth", truth),
+        ("facts", &facts),
+    ];
+    let bytes = planes.map(|(name, planes)| {
+        let bytes: Vec<u8> = planes.data.iter().flat_map(|v| v.to_le_bytes()).collect();
+        (name, vec![planes.channels, planes.height, planes.width], bytes)
+    });
+    let tensors = bytes.iter().map(|(name, shape, bytes)| {
+        (*name, TensorView::new(Dtype::F32, shape.clone(), bytes).expect("as many bytes as values"))
+    });
+    let file = safetensors::serialize(tensors, &None).map_err(|why| Error::invalid(path, why))?;
+    std::fs::write(path, file).map_err(Error::io("write", path))
+}

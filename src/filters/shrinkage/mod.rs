@@ -1,0 +1,415 @@
+//! Takes back what a denoiser changed beyond the noise.
+//!
+//! A denoiser that was trained on noisy frames blurs clean ones. How far it should be followed is an old question of
+//! statistics: an unbiased but noisy value `c` (the render) and a biased one `d` (what was denoised) are best mixed as
+//! `d + w (c - d)`, with a share `w` that grows with the bias and falls with the noise (James and Stein 1961). Neither is
+//! known of one frame alone, but what was changed tells of both:
+//! - Cycles draws every pixel by itself, so noise has no direction, while edges and texture have. Of the second
+//!   differences along four directions, the smallest holds next to nothing but noise. They are taken of the light, and
+//!   of the light over the albedo as rendered, which divides texture away.
+//! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred detail: with
+//!   its neighbours, with the detail that is left, and with that of the albedo.
+//!
+//! These are summed up over squares of pixels ([`sums`]), from which a small perceptron tells the share ([`perceptron`]).
+//! Of a noisy frame all of `d` is taken.
+//!
+//! Light that the camera sees directly ([`seen`]: sky, screens, lamps) has no noise but that of antialiasing, and is kept.
+//! Of few samples, though, antialiasing is noise like any other: a gap of a blind before a bright sky is a quarter of the
+//! sky, or nothing.
+
+mod perceptron;
+mod seen;
+mod sums;
+
+use rayon::prelude::*;
+
+use self::{
+    perceptron::{Facts, OUTPUTS},
+    seen::{Seen, film_exposure, is_firefly},
+    sums::LARGEST_RESIDUAL,
+};
+use super::squares::{SQUARE, between};
+use crate::{
+    kernels::{exponential::exp, logarithm::ln},
+    planes::Planes,
+};
+
+/// Exposed radiance that is added to what is denoised before residuals are divided by it: relative errors of what is
+/// darker count less and less.
+const FLOOR: f32 = 0.02;
+
+/// Added to a pixel's own squared residual before its logarithm is compared with that of the mean near by, of which it may be
+/// so many times as large or as small: `e` to this power.
+const OWN_FLOOR: f32 = 1e-6;
+const OWN_RANGE: f32 = 3.0;
+
+/// Shares nearer than this to none or to all of the render are none or all.
+const SNAP: f32 = 1.0 / 64.0;
+
+/// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing; the larger the
+/// share, the more. What is rendered brighter than that by far is noise as long as most around it is.
+const LARGEST_CHANGE: f32 = 1.5;
+
+/// What a frame is taken for that does not tell its number of samples, where it comes to light that is seen directly.
+const UNKNOWN_SAMPLES: u32 = 16;
+
+/// Of no more than the first number of samples, no light is kept because the albedo shows it: its antialiasing is noise,
+/// as all of it is through glass. From the second on, all is.
+const KEPT_SAMPLES: (f32, f32) = (16.0, 64.0);
+
+/// What is known of a frame besides what was denoised.
+pub struct Render<'a> {
+    /// Noisy radiance, (3, H, W), finite.
+    pub radiance: &'a Planes,
+    /// Albedo as rendered, (3, H, W), finite.
+    pub albedo: &'a Planes,
+    /// What radiance is multiplied by so that its log-average is middle grey.
+    pub exposure: f32,
+    /// Samples of a pixel, where the file tells.
+    pub samples: Option<u32>,
+    /// How many times brighter than all others of the 5x5 around it a pixel is a firefly, which is not taken back.
+    pub firefly: f32,
+}
+
+/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more than noise. The share
+/// of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
+///
+/// # Panics
+/// If sizes differ.
+pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) {
+    check(image, render);
+    if image.pixels() == 0 {
+        return;
+    }
+    let seen = Seen { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) };
+    let sums = sums::gather(image, render, &seen);
+    let judged = perceptron::judge(&sums, image.width.div_ceil(SQUARE), render.facts());
+    drop(sums);
+    mix(image, render, &seen, &judged, shares);
+}
+
+/// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of pixels,
+/// (36, H / 4, W / 4) rounded up. For training.
+///
+/// # Panics
+/// If sizes differ.
+pub fn features(image: &Planes, render: &Render) -> Planes {
+    check(image, render);
+    let seen = Seen { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) };
+    let (squares, rows) = (image.width.div_ceil(SQUARE), image.height.div_ceil(SQUARE));
+    let features = perceptron::features(&sums::gather(image, render, &seen), squares, render.facts());
+    let mut planes = Planes::new(perceptron::FEATURES, squares, rows);
+    for (row, features) in features.chunks(perceptron::FEATURES * squares).enumerate() {
+        for (plane, line) in planes.data.chunks_mut(squares * rows).zip(features.chunks(squares)) {
+            plane[row * squares..][..squares].copy_from_slice(line);
+        }
+    }
+    planes
+}
+
+fn check(image: &Planes, render: &Render) {
+    let size = (image.width, image.height);
+    for planes in [render.radiance, render.albedo, image] {
+        let own = (planes.channels, planes.width, planes.height);
+        assert_eq!(own, (3, size.0, size.1), "planes of one frame");
+    }
+}
+
+impl Render<'_> {
+    fn facts(&self) -> Facts {
+        Facts { exposure: self.exposure, samples: self.samples }
+    }
+}
+
+/// Mixes another denoised layer, (C, H, W), with what was rendered of it, by the `shares` of [`shrink`].
+pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
+    let pixels = shares.pixels();
+    let channels = denoised.data.par_chunks_mut(pixels).zip(rendered.data.par_chunks(pixels));
+    channels.for_each(|(denoised, rendered)| {
+        let values = denoised.iter_mut().zip(rendered).zip(&shares.data);
+        values.for_each(|((denoised, rendered), share)| *denoised += (rendered - *denoised) * share);
+    });
+}
+
+/// Mixes every pixel, and writes the shares of the render, where they are asked for.
+fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares: Option<&mut Planes>) {
+    let (width, height) = (image.width, image.height);
+    let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
+    let floor = FLOOR / render.exposure;
+    let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
+    let (few, many) = KEPT_SAMPLES;
+    let is_all_seen = seen.is_all();
+    let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
+    let keeps = if is_all_seen { 1.0 } else { by_samples };
+    let (red, rest) = image.data.split_at_mut(width * height);
+    let (green, blue) = rest.split_at_mut(width * height);
+    let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
+    let shares: Vec<Option<&mut [f32]>> = match shares {
+        Some(shares) => shares.data.chunks_mut(width).map(Some).collect(),
+        None => (0..height).map(|_| None).collect(),
+    };
+    red.zip(green).zip(blue).zip(shares).enumerate().for_each_init(
+        || vec![0.0; OUTPUTS * squares],
+        |line, (y, (((red, green), blue), mut shares))| {
+            let mut note = |x: usize, share: f32| shares.iter_mut().for_each(|row| row[x] = share);
+            let (above, share) = between(y, square_rows);
+            let of =
+                |row: usize| &judged[row.min(square_rows - 1) * OUTPUTS * squares..][..OUTPUTS * squares];
+            for (line, (a, b)) in line.iter_mut().zip(of(above).iter().zip(of(above + 1))) {
+                *line = a + (b - a) * share;
+            }
+            let radiance = [0, 1, 2].map(|c| &render.radiance.channel(c)[y * width..][..width]);
+            for x in 0..width {
+                let (left, share) = between(x, squares);
+                let right = (left + 1).min(squares - 1);
+                let judged = [0, 1, 2].map(|k| {
+                    let line = &line[k * squares..][..squares];
+                    line[left] + (line[right] - line[left]) * share
+                });
+                let noisy = radiance.map(|row| row[x].max(0.0));
+                let colours = [&mut red[x], &mut green[x], &mut blue[x]];
+                let is_seen = is_all_seen || (keeps > 0.0 && seen.is_at(x, y));
+                if is_seen && keeps == 1.0 {
+                    colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
+                    note(x, 1.0);
+                    continue;
+                }
+                let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
+                let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
+                let shrunk = share_of_render(judged, change);
+                let direct = match keeps {
+                    0.0 => 0.0,
+                    _ if is_seen => keeps,
+                    _ => keeps * seen.beyond_white(x, y),
+                };
+                let back = shrunk + direct - shrunk * direct;
+                let is_noise = !is_seen && change >= LARGEST_RESIDUAL && is_firefly(render, x, y);
+                let back = if is_noise { 0.0 } else { back };
+                if back == 1.0 {
+                    colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v = noisy);
+                } else if back > 0.0 {
+                    colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v += (noisy - *v) * back);
+                }
+                note(x, back);
+            }
+        },
+    );
+}
+
+/// The share of the render in a pixel whose light changes by so much if all of it is taken, by what was
+/// [judged](perceptron::judge) of the place.
+fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32) -> f32 {
+    let own = change.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
+    let unusual = (ln(own * own + OWN_FLOOR) - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE;
+    let share = 1.0 / (1.0 + exp(-(logit + slope * unusual)));
+    let share = ((share - SNAP) / (1.0 - 2.0 * SNAP)).clamp(0.0, 1.0);
+    if share == 1.0 {
+        return share;
+    }
+    share * (LARGEST_CHANGE / ((1.0 - share) * change.abs()).max(f32::MIN_POSITIVE)).min(1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Rng;
+
+    const SIZE: (usize, usize) = (93, 70);
+
+    fn planes(value: impl Fn(usize, usize, usize) -> f32) -> Planes {
+        let (w, h) = SIZE;
+        Planes::from_vec(
+            3,
+            w,
+            h,
+            (0..3 * w * h).map(|i| value(i / (w * h), i % w, i % (w * h) / w)).collect(),
+        )
+    }
+
+    /// A picture of fine texture of the light: stripes in both directions, a few pixels wide.
+    fn picture(c: usize, x: usize, y: usize) -> f32 {
+        0.3 + 0.1 * (0.9 * x as f32 + c as f32).sin() * (0.7 * y as f32).cos()
+    }
+
+    /// The picture, each pixel brighter or darker by as much as `noise` at most.
+    fn noisy(noise: f32) -> Planes {
+        let mut rng = Rng::new(7, 0);
+        let (w, h) = SIZE;
+        let grey: Vec<f32> = (0..w * h).map(|_| 1.0 + noise * (2.0 * rng.uniform() - 1.0)).collect();
+        planes(|c, x, y| picture(c, x, y) * grey[y * w + x])
+    }
+
+    fn error(image: &Planes) -> f32 {
+        let truth = planes(picture);
+        let squares: f32 = image.data.iter().zip(&truth.data).map(|(a, b)| (a - b) * (a - b)).sum();
+        squares / truth.data.len() as f32
+    }
+
+    /// What becomes of `denoised` beside `radiance`.
+    fn shrunk(denoised: &Planes, radiance: &Planes, albedo: &Planes, samples: Option<u32>) -> Planes {
+        let mut image = denoised.clone();
+        let render = Render { radiance, albedo, exposure: 0.6, samples, firefly: 32.0 };
+        shrink(&mut image, &render, None);
+        image
+    }
+
+    #[test]
+    fn a_blurred_frame_without_noise_is_taken_back_and_a_noisy_one_is_not() {
+        let (blurred, albedo) = (planes(|_, _, _| 0.3), planes(|_, _, _| 0.5));
+        for samples in [None, Some(64), Some(4096)] {
+            let clean = shrunk(&blurred, &noisy(0.0), &albedo, samples);
+            assert!(
+                error(&clean) < 0.02 * error(&blurred),
+                "{samples:?}: {}",
+                error(&clean) / error(&blurred)
+            );
+        }
+        // 30% noise at 4 samples: the blurred frame is the better one.
+        let radiance = noisy(0.5);
+        assert!(error(&radiance) > error(&blurred));
+        let kept = shrunk(&blurred, &radiance, &albedo, Some(4));
+        assert!(error(&kept) < 1.02 * error(&blurred), "{}", error(&kept) / error(&blurred));
+    }
+
+    #[test]
+    fn of_a_little_noise_the_mixture_is_better_than_both() {
+        let (blurred, albedo) = (planes(|c, x, y| 0.7 * picture(c, x, y) + 0.09), planes(|_, _, _| 0.5));
+        let radiance = noisy(0.12);
+        let mixed = error(&shrunk(&blurred, &radiance, &albedo, Some(64)));
+        assert!(mixed < 0.9 * error(&blurred).min(error(&radiance)), "{mixed}");
+    }
+
+    #[test]
+    fn a_perfect_result_stays() {
+        let (truth, albedo) = (planes(picture), planes(|_, _, _| 0.5));
+        let radiance = noisy(0.3);
+        for samples in [None, Some(4), Some(64)] {
+            let kept = shrunk(&truth, &radiance, &albedo, samples);
+            assert!(
+                error(&kept) < 0.08 * error(&radiance),
+                "{samples:?}: {}",
+                error(&kept) / error(&radiance)
+            );
+        }
+    }
+
+    #[test]
+    fn light_seen_directly_is_kept_and_chance_is_not() {
+        // A screen of 20x10 whose light is in the albedo, a pixel that has its albedo's brightness, and a star.
+        let is_screen = |x: usize, y: usize| (30..50).contains(&x) && (20..30).contains(&y);
+        let light = |c: usize, x: usize, y: usize| match (x, y) {
+            _ if is_screen(x, y) => 3.0 + ((x * 7 + y * 5 + c) % 11) as f32,
+            (70, 50) => 40.0,
+            (60..80, 40..60) => 0.0,
+            _ => 0.25,
+        };
+        let albedo =
+            planes(|c, x, y| if light(c, x, y) == 0.25 && (x, y) != (10, 10) { 0.5 } else { light(c, x, y) });
+        let radiance = planes(light);
+        let image = shrunk(&planes(|_, _, _| 0.3), &radiance, &albedo, Some(64));
+        let at = |c: usize, x: usize, y: usize| image.channel(c)[y * SIZE.0 + x];
+        for (x, y) in [(35, 25), (49, 24), (40, 20), (70, 50)] {
+            assert_eq!([0, 1, 2].map(|c| at(c, x, y)), [0, 1, 2].map(|c| light(c, x, y)), "at {x}, {y}");
+        }
+        let other = [0, 1, 2].map(|c| at(c, 10, 10));
+        assert_eq!(
+            other,
+            [0, 1, 2].map(|c| at(c, 12, 12)),
+            "one pixel of its albedo's brightness is nothing special"
+        );
+    }
+
+    #[test]
+    fn the_exposure_of_the_film_hides_no_light_that_is_seen() {
+        // A screen over a third of the frame; the rest is a noisy wall. The film's exposure multiplies light alone.
+        let albedo = planes(|c, x, y| if x < 30 { 0.2 + ((x * 7 + y * 5 + c) % 11) as f32 } else { 0.5 });
+        let wall = noisy(0.3);
+        let radiance = planes(|c, x, y| (if x < 30 { &albedo } else { &wall }).channel(c)[y * SIZE.0 + x]);
+        let image = shrunk(&planes(picture), &radiance, &albedo, Some(64));
+        assert!((0..3).all(|c| image.channel(c)[..30] == radiance.channel(c)[..30]), "the screen is kept");
+        for film in [0.5, 1.0, 1.3, 4.0, 2f32.powi(-12), 2f32.powi(12)] {
+            let times = |image: &Planes| planes(|c, x, y| film * image.channel(c)[y * SIZE.0 + x]);
+            let render = Render {
+                radiance: &times(&radiance),
+                albedo: &albedo,
+                exposure: 0.6 / film,
+                samples: Some(64),
+                firefly: 32.0,
+            };
+            assert!((film_exposure(&render) / film - 1.0).abs() < 0.003, "{film}");
+            let mut exposed = times(&planes(picture));
+            shrink(&mut exposed, &render, None);
+            let near = |(a, b): (&f32, &f32)| (a / film - b).abs() <= 1e-4 * b.abs();
+            let same = exposed.data.iter().zip(&image.data).filter(|pair| near(*pair)).count();
+            assert!(same == image.data.len(), "{film}: {same} of {}", image.data.len());
+        }
+        // A wall alone has no such light, whatever its noise.
+        let render = Render {
+            radiance: &wall,
+            albedo: &planes(|_, _, _| 0.5),
+            exposure: 1.0,
+            samples: None,
+            firefly: 32.0,
+        };
+        assert_eq!(film_exposure(&render), 1.0);
+    }
+
+    #[test]
+    fn of_few_samples_what_antialiasing_makes_of_a_bright_sky_is_noise() {
+        // Gaps of a blind, of which a quarter of the samples see the sky: 0 to 4 of 4, by chance.
+        let mut rng = Rng::new(3, 0);
+        let (w, h) = SIZE;
+        let hit = |_| (0..4).filter(|_| rng.uniform() < 0.25).count() as f32;
+        let seen: Vec<f32> = (0..w * h).map(hit).collect();
+        let is_wall = |x: usize| x > 70;
+        let sky = planes(|_, x, y| if is_wall(x) { 0.25 } else { 1.25 * seen[y * w + x] });
+        let albedo = planes(|c, x, y| if is_wall(x) { 0.5 } else { sky.channel(c)[y * w + x] });
+        let truth = planes(|_, x, _| if is_wall(x) { 0.25 } else { 1.25 });
+        let off = |image: &Planes| -> f32 {
+            image.data.iter().zip(&truth.data).map(|(a, b)| (a - b) * (a - b)).sum()
+        };
+        let image = shrunk(&truth, &sky, &albedo, Some(4));
+        assert!(off(&image) < 0.05 * off(&sky), "{} of {}", off(&image), off(&sky));
+        // So is what a sky of fine clouds looks like: its noise is in the albedo as well, which it is divided by.
+        let clouds = planes(|_, x, y| if is_wall(x) { 0.25 } else { 0.8 + 0.2 * seen[y * w + x] });
+        let albedo = planes(|c, x, y| if is_wall(x) { 0.5 } else { clouds.channel(c)[y * w + x] });
+        let truth = planes(|_, x, _| if is_wall(x) { 0.25 } else { 1.0 });
+        let image = shrunk(&truth, &clouds, &albedo, Some(4));
+        let off = |image: &Planes| -> f32 {
+            image.data.iter().zip(&truth.data).map(|(a, b)| (a - b) * (a - b)).sum()
+        };
+        assert!(off(&image) < 0.1 * off(&clouds), "{} of {}", off(&image), off(&clouds));
+        // The same light in a frame of nothing else is a picture, and stays.
+        assert!(shrunk(&truth, &sky, &sky, Some(4)) == sky, "a picture has changed");
+    }
+
+    #[test]
+    fn lone_fireflies_do_not_come_back() {
+        let (truth, albedo) = (planes(picture), planes(|_, _, _| 0.5));
+        let mut radiance = noisy(0.02);
+        for (x, y) in [(20, 20), (50, 33), (0, 0), (92, 69)] {
+            (0..3).for_each(|c| radiance.channel_mut(c)[y * SIZE.0 + x] = 5000.0);
+        }
+        let kept = shrunk(&truth, &radiance, &albedo, Some(64));
+        assert!(kept.data.iter().all(|v| *v < 1.0));
+    }
+
+    #[test]
+    fn tiny_frames_of_any_brightness_stay_finite() {
+        for (w, h) in [(1, 1), (1, 9), (9, 1), (2, 3), (4, 4), (5, 17)] {
+            for v in [0.0, 1e-30, 1.0, 65504.0] {
+                let of = |v: f32| Planes::from_vec(3, w, h, vec![v; 3 * w * h]);
+                let mut image = of(v);
+                let render = Render {
+                    radiance: &of(0.5 * v),
+                    albedo: &of(0.7),
+                    exposure: 1.0,
+                    samples: None,
+                    firefly: 32.0,
+                };
+                shrink(&mut image, &render, None);
+                assert!(image.data.iter().all(|x| x.is_finite() && *x <= v && *x >= 0.5 * v), "{w}x{h}, {v}");
+            }
+        }
+    }
+}

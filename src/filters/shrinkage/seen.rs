@@ -1,0 +1,148 @@
+//! Tells light that comes straight to the camera, and fireflies.
+//!
+//! Cycles writes light that is seen directly (sky, screens, lamps) into the albedo as well as into the beauty. The film's
+//! exposure, which multiplies light alone, is found first, from the quotient that most such pixels agree on.
+
+use super::Render;
+use crate::{kernels::logarithm::ln, planes::Planes};
+
+/// A frame whose pixels are all their albedo but for this share is no picture of light on surfaces: all of it is kept.
+const UNLIKE: f64 = 1e-3;
+
+/// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter counts less.
+const ALONE: f32 = 4.0;
+
+/// By how much radiance may differ from the albedo and still be light that is seen directly: a few steps of a half
+/// float, and next to nothing besides.
+pub const SAME: (f32, f32) = (0.004, 1e-6);
+
+/// Light that is seen directly is its albedo times the film's exposure, which Cycles applies to light alone. It is told
+/// from the quotients of light and albedo, counted by these steps of an octave over so many octaves up and down.
+const STEPS: usize = 128;
+const OCTAVES: usize = 20;
+
+/// An exposure needs at least this many pixels, and this many times more of them than its second and third neighbours
+/// have on the average: quotients of what is only lit are spread by noise and by shape.
+const LEAST_EXPOSED: u32 = 16;
+const PEAK: f32 = 8.0;
+
+/// About as many pixels as are counted.
+const COUNTED: usize = 1 << 17;
+
+/// Pixels of the 3x3 around one, itself included, that must be seen directly for it to be: any pixel may be as bright as
+/// its albedo by chance.
+const SEEN_TOGETHER: usize = 6;
+
+/// What light that is seen directly was multiplied by, as most such light of the frame has it; 1 if there is any such.
+pub fn film_exposure(render: &Render) -> f32 {
+    let Render { radiance, albedo, .. } = render;
+    let pixels = radiance.pixels();
+    let per_octave = STEPS as f32 / std::f32::consts::LN_2;
+    let middle = STEPS * OCTAVES;
+    let mut counts = vec![0u32; 2 * middle + 1];
+    for at in (0..pixels).step_by(pixels.div_ceil(COUNTED)) {
+        let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
+        let sums = [light, white].map(|colours| colours.iter().sum::<f32>());
+        if sums.into_iter().all(|sum| sum > f32::MIN_POSITIVE) && equals(light, white, sums[0] / sums[1]) {
+            let step = (ln(sums[0] / sums[1]) * per_octave).round() + middle as f32;
+            if let Some(count) = counts.get_mut(step as usize) {
+                *count += 1;
+            }
+        }
+    }
+    let is_peak = |step: usize| {
+        let around = [step - 3, step - 2, step + 2, step + 3].map(|step| counts[step]);
+        let usual = around.iter().sum::<u32>() as f32 / around.len() as f32;
+        counts[step] >= LEAST_EXPOSED && counts[step] as f32 > PEAK * usual
+    };
+    if is_peak(middle) {
+        return 1.0;
+    }
+    let peaks = (3..counts.len() - 3).filter(|step| is_peak(*step));
+    let highest = peaks.max_by_key(|step| counts[*step]).unwrap_or(middle);
+    // Whole octaves apart from the rest, so that they are exact.
+    let steps = highest as i32 - middle as i32;
+    let (octave, rest) = (steps.div_euclid(STEPS as i32), steps.rem_euclid(STEPS as i32));
+    (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
+}
+
+/// Whether light is white times `film` but for rounding.
+#[inline(always)]
+fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
+    let (relative, absolute) = SAME;
+    (0..3).all(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute))
+}
+
+/// Pixels (x, y) of the square of `2 reach + 1` rows and columns around one that lie in the frame, itself included.
+fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item = (usize, usize)> {
+    let around = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
+    let columns = around(x, planes.width);
+    around(y, planes.height).flat_map(move |y| columns.clone().map(move |x| (x, y)))
+}
+
+/// Tells light that comes straight to the camera.
+pub struct Seen<'a> {
+    pub radiance: &'a Planes,
+    pub albedo: &'a Planes,
+    /// What the film's exposure multiplied light by, and not the albedo.
+    pub film: f32,
+}
+
+impl Seen<'_> {
+    /// Whether a pixel has the brightness of its albedo.
+    fn equals_albedo(&self, at: usize) -> bool {
+        let [light, white] =
+            [self.radiance, self.albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
+        equals(light, white, self.film)
+    }
+
+    /// Whether a frame is nothing but such light.
+    pub fn is_all(&self) -> bool {
+        let pixels = self.radiance.pixels();
+        let most = (UNLIKE * pixels as f64) as usize;
+        (0..pixels).filter(|at| !self.equals_albedo(*at)).take(most + 1).count() <= most
+    }
+
+    /// Whether the light of a pixel is such, as that of its neighbours is.
+    pub fn is_at(&self, x: usize, y: usize) -> bool {
+        let width = self.radiance.width;
+        let equals_albedo = |x: usize, y: usize| self.equals_albedo(y * width + x);
+        // Black is no light, but where a lamp or a star ends it is as good company as any.
+        let is_lit = (0..3).any(|c| self.albedo.channel(c)[y * width + x] > 0.0);
+        is_lit && equals_albedo(x, y) && {
+            let beyond = 9 - near(self.radiance, x, y, 1).count();
+            let seen = near(self.radiance, x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
+            seen + beyond >= SEEN_TOGETHER
+        }
+    }
+
+    /// The share of a pixel's light that is such, or comes by way of mirrors, as far as the albedo shows it beyond
+    /// white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
+    pub fn beyond_white(&self, x: usize, y: usize) -> f32 {
+        let Self { radiance, albedo, film } = self;
+        let beyond = |x: usize, y: usize| {
+            let at = y * radiance.width + x;
+            let colours =
+                (0..3).map(|c| (albedo.channel(c)[at].min(radiance.channel(c)[at] / film) - 1.0, c));
+            colours.fold((0.0, 0), |most, colour| if colour.0 > most.0 { colour } else { most })
+        };
+        let (light, c) = beyond(x, y);
+        if light <= 0.0 {
+            return 0.0;
+        }
+        let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
+        let company = others.map(|(x, y)| beyond(x, y).0).fold(0.0, f32::max);
+        let share = film * light / radiance.channel(c)[y * radiance.width + x];
+        share * (ALONE * company / light).min(1.0)
+    }
+}
+
+/// Whether a pixel is far brighter than all around it.
+pub fn is_firefly(render: &Render, x: usize, y: usize) -> bool {
+    let radiance = render.radiance;
+    let brightest = |(x, y): (usize, usize)| {
+        (0..3).map(|c| radiance.channel(c)[y * radiance.width + x]).fold(0.0, f32::max)
+    };
+    let others = near(radiance, x, y, 2).filter(|&other| other != (x, y)).map(brightest);
+    brightest((x, y)) > render.firefly * others.fold(0.0, f32::max)
+}
