@@ -108,7 +108,8 @@ class Job:
         worker = os.path.join(os.path.dirname(os.path.abspath(__file__)), "worker.py")
         try:
             self._process = subprocess.Popen(
-                [sys.executable, *bpy.app.python_args, worker],
+                # The first releases of 4.2 do not tell what Python is to be started with.
+                [sys.executable, *getattr(bpy.app, "python_args", ()), worker],
                 stdin=subprocess.PIPE, stdout=said, stderr=told,
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
