@@ -25,6 +25,8 @@ def wire(scene, picture):
     tree.links.new(noisy.outputs["Image"], images[0])
     tree.links.new(result.outputs["Image"], images[1])
     tree.links.new(split.outputs[0], viewer.inputs["Image"])
+    # Of several viewers, Blender shows the active one.
+    tree.nodes.active = viewer
     return tree
 
 
