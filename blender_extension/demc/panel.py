@@ -23,7 +23,6 @@ class DEMC_PT_panel(bpy.types.Panel):
         column.prop(settings, "model")
         if settings.model == WEIGHTS_FILE:
             column.prop(settings, "weights")
-        _state(layout, context)
         lacks = passes.missing(scene)
         if lacks:
             box = layout.box()
@@ -35,6 +34,8 @@ class DEMC_PT_panel(bpy.types.Panel):
         column.operator("demc.denoise_render", icon="RENDER_STILL")
         column.operator("demc.denoise_range", icon="RENDER_ANIMATION")
         column.operator("demc.denoise_folder", icon="FILE_FOLDER")
+        # Below the buttons, which stay where they are while it comes and goes.
+        _state(layout, context)
         layout.prop(settings, "folder")
         layout.prop(settings, "after_render")
         layout.prop(settings, "use_compositor")
@@ -82,9 +83,9 @@ def _state(layout, context):
     job = jobs.current()
     if jobs.refusal():
         _paragraph(layout, context, jobs.refusal(), "ERROR")
-    if job is None:
+    elif job is None:
         return
-    if job.state == jobs.RUNNING:
+    elif job.state == jobs.RUNNING:
         row = layout.row()
         row.progress(factor=job.progress, text=_how_far(job))
         row.operator("demc.cancel", text="", icon="X")

@@ -91,7 +91,10 @@ class Extension(unittest.TestCase):
         mine = [node for node in tree.nodes if node.get("demc")]
         split = next(node for node in mine if node.bl_idname == "CompositorNodeSplit")
         sides = [link.from_node.bl_idname for socket in split.inputs for link in socket.links]
-        self.assertEqual(sorted(sides), ["CompositorNodeImage", "CompositorNodeRLayers"])
+        self.assertEqual(sides, ["CompositorNodeImage", "CompositorNodeRLayers"], "the result is at the right")
+        # A window refuses to render a scene whose compositor has no output.
+        outputs = [node for node in tree.nodes if node.bl_idname in ("CompositorNodeComposite", "NodeGroupOutput")]
+        self.assertTrue(outputs and outputs[0].inputs["Image"].is_linked)
         # Again: the picture is the same one, and the nodes are not doubled.
         count = len(tree.nodes)
         bpy.ops.demc.denoise_render()

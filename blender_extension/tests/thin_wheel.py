@@ -9,13 +9,16 @@ import sys
 import zipfile
 
 COMMAND = '''"""The command, as the whole wheel has it."""
+import signal
 import subprocess
 import sys
 
 
 def main():
-    """Runs the program with this process's arguments."""
-    sys.exit(subprocess.run([{program!r}, *sys.argv[1:]]).returncode)
+    """Runs the program with this process's arguments; it ends when this process is asked to."""
+    program = subprocess.Popen([{program!r}, *sys.argv[1:]])
+    signal.signal(signal.SIGTERM, lambda *_: program.terminate())
+    sys.exit(program.wait())
 '''
 WHEEL = "Wheel-Version: 1.0\nGenerator: thin_wheel\nRoot-Is-Purelib: true\nTag: py3-none-manylinux_2_28_x86_64\n"
 
