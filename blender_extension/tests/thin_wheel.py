@@ -9,6 +9,7 @@ import sys
 import zipfile
 
 COMMAND = '''"""The command, as the whole wheel has it."""
+import ctypes
 import signal
 import subprocess
 import sys
@@ -16,7 +17,9 @@ import sys
 
 def main():
     """Runs the program with this process's arguments; it ends when this process is asked to."""
-    program = subprocess.Popen([{program!r}, *sys.argv[1:]])
+    # 1 is PR_SET_PDEATHSIG: where this process is killed, the program dies as well, as if it were of this process.
+    die_with_this = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
+    program = subprocess.Popen([{program!r}, *sys.argv[1:]], preexec_fn=die_with_this)
     signal.signal(signal.SIGTERM, lambda *_: program.terminate())
     sys.exit(program.wait())
 '''
