@@ -325,7 +325,7 @@ def folders():
     bpy.data.images["Render Result"].save_render(str(frames / "shot_0001.exr"), scene=scene())
     for number in range(2, COPIES + 1):
         shutil.copy(frames / "shot_0001.exr", frames / f"shot_{number:04}.exr")
-    scene().demc.folder, scene().demc.model, scene().demc.threads = str(frames), "demc-l", 1
+    scene().demc.folder, scene().demc.model, scene().demc.threads = "//frames", "demc-l", 1
     for how in ("Escape", "the X"):
         yield from click("demc.denoise_folder")
         yield from until(lambda: jobs.is_running() and jobs.current().finished > 2)
