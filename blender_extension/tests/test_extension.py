@@ -20,7 +20,8 @@ MODULE = "bl_ext.user_default.demc"
 
 def handlers():
     """All handlers there are, by name."""
-    return {name: list(getattr(bpy.app.handlers, name)) for name in ("render_init", "render_write", "render_complete")}
+    names = ("render_init", "render_write", "render_complete", "load_pre")
+    return {name: list(getattr(bpy.app.handlers, name)) for name in names}
 
 
 def classes():
@@ -151,6 +152,24 @@ class Extension(unittest.TestCase):
         job.wait()
         self.assertIn(job.state, (jobs.CANCELLED, jobs.DONE))
         self.assertFalse([name for name in self.clean() if name.endswith(".tmp")])
+
+    def test_opening_another_file_ends_a_job(self):
+        jobs, plans = sys.modules[f"{MODULE}.jobs"], sys.modules[f"{MODULE}.plans"]
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        job = plans.of_range(self.scene)
+        jobs.begin(job)
+        bpy.ops.wm.read_homefile(use_empty=True)
+        self.assertEqual((job.state, jobs.current()), (jobs.CANCELLED, None))
+
+    def test_why_a_render_was_not_denoised_is_kept_for_the_panel(self):
+        jobs = sys.modules[f"{MODULE}.jobs"]
+        self.scene.demc.after_render = True
+        bpy.ops.render.render()
+        self.assertIn("Denoising Data", jobs.refusal())
+        self.prepared()
+        bpy.ops.render.render()
+        self.assertIsNone(jobs.refusal())
 
     def test_a_worker_that_fails_is_told_in_words(self):
         self.prepared()

@@ -22,8 +22,8 @@ import numpy
 FOLDER = pathlib.Path(sys.argv[-1])
 BEAT_SECONDS = 0.02
 PATIENCE_SECONDS = 60.0
-# How long Blender may stand still while demc works; drawing the window by software takes a tenth of a second.
-STILL_SECONDS = 1.0
+# How long Blender may stand still while demc works: drawing by software takes half a second on a busy machine.
+STILL_SECONDS = 2.0
 COPIES = 40
 STEP = 6  # pixels between the places where a button is looked for
 
