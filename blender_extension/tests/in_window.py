@@ -16,7 +16,7 @@ import tempfile
 import zlib
 
 WIDTH, HEIGHT = 1400, 900
-PATIENCE_SECONDS = 540
+PATIENCE_SECONDS = 1200
 
 
 def run(command, environment):
