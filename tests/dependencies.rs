@@ -1,13 +1,16 @@
-//! What the program is built of may be given away with it, and comes from crates.io: `deny.toml`, of which
-//! `cargo deny` checks the rest, such as known flaws.
+//! What the program and the Python module are built of may be given away with them, and comes from crates.io: the
+//! `deny.toml` of each, of which `cargo deny` checks the rest, such as known flaws.
 
 use std::{collections::HashSet, path::Path, process::Command};
 
-/// The licences that `deny.toml` allows.
-fn allowed() -> HashSet<String> {
-    let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("deny.toml")).unwrap();
+/// The licences that the `deny.toml` of a package allows.
+fn allowed(package: &Path) -> HashSet<String> {
+    let text = std::fs::read_to_string(package.join("deny.toml")).unwrap();
     let list = text.split_once("allow = [").expect("a list").1.split_once(']').expect("its end").0;
-    list.split(',').map(|name| name.trim().trim_matches('"').to_owned()).collect()
+    list.split(',')
+        .map(|name| name.trim().trim_matches('"').to_owned())
+        .filter(|name| !name.is_empty())
+        .collect()
 }
 
 /// Whether one of the choices that an SPDX expression leaves is allowed throughout.
@@ -67,28 +70,40 @@ fn expressions_are_read_as_spdx_means_them() {
     }
 }
 
-#[test]
-fn every_dependency_may_be_given_away_and_comes_from_the_registry() {
+/// Checks all that the lock file of the package in `folder` holds for this system.
+#[track_caller]
+fn check(folder: &str) {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
     let metadata = Command::new(env!("CARGO"))
         .args(["metadata", "--format-version", "1", "--locked", "--all-features"])
         .args(["--filter-platform", "x86_64-unknown-linux-gnu"])
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .current_dir(&root)
         .output()
         .unwrap();
     assert!(metadata.status.success(), "{}", String::from_utf8_lossy(&metadata.stderr));
     let metadata: serde_json::Value = serde_json::from_slice(&metadata.stdout).unwrap();
     let packages = metadata["packages"].as_array().unwrap();
     assert!(packages.len() > 50, "{} packages", packages.len());
-    let allowed = allowed();
+    let allowed = allowed(&root);
     for package in packages {
         let licence = package["license"].as_str().unwrap_or("none");
         assert!(is_allowed(licence, &allowed), "{} is under {licence}", package["name"]);
         let source = package["source"].as_str();
-        let is_ours = source.is_none() && package["name"] == "demc";
+        let is_ours = source.is_none() && (package["name"] == "demc" || package["name"] == "demc-python");
         assert!(
             is_ours || source.is_some_and(|s| s.contains("crates.io")),
             "{} is from {source:?}",
             package["name"]
         );
     }
+}
+
+#[test]
+fn every_dependency_may_be_given_away_and_comes_from_the_registry() {
+    check("");
+}
+
+#[test]
+fn so_does_every_dependency_of_the_python_module() {
+    check("python");
 }

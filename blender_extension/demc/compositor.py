@@ -1,5 +1,7 @@
 """The result beside the noisy picture in the compositor, with a wipe between both."""
 
+import math
+
 import bpy
 
 _MARK = "demc"
@@ -22,9 +24,14 @@ def wire(scene, picture):
     split = _add(tree, "CompositorNodeSplit", "Noisy | denoised", (left + 320, bottom))
     viewer = _add(tree, "CompositorNodeViewer", "Wipe", (left + 560, bottom))
     images = [socket for socket in split.inputs if socket.type == "RGBA"]
-    tree.links.new(noisy.outputs["Image"], images[0])
-    tree.links.new(result.outputs["Image"], images[1])
+    # The node shows its first image at the right; Blender 5 where its line is turned so, which lies slanting at first.
+    if "Rotation" in split.inputs:
+        split.inputs["Rotation"].default_value = -math.pi / 2
+    tree.links.new(noisy.outputs["Image"], images[1])
+    tree.links.new(result.outputs["Image"], images[0])
     tree.links.new(split.outputs[0], viewer.inputs["Image"])
+    # Of several viewers, Blender shows the active one.
+    tree.nodes.active = viewer
     return tree
 
 
@@ -32,11 +39,21 @@ def _tree(scene):
     # Blender 5 keeps it as a node group that scenes share; before, each scene had one of its own.
     if hasattr(scene, "compositing_node_group"):
         if scene.compositing_node_group is None:
-            scene.compositing_node_group = bpy.data.node_groups.new("Compositor Nodes", "CompositorNodeTree")
+            scene.compositing_node_group = _group(scene)
         return scene.compositing_node_group
     if not scene.use_nodes:
         scene.use_nodes = True
     return scene.node_tree
+
+
+def _group(scene):
+    """What Blender 4 begins with: the render goes to the output. F12 is refused where nothing does."""
+    tree = bpy.data.node_groups.new("Compositor Nodes", "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    render, output = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("NodeGroupOutput")
+    render.scene, output.location = scene, (320, 0)
+    tree.links.new(render.outputs["Image"], output.inputs[0])
+    return tree
 
 
 def _add(tree, kind, label, location):

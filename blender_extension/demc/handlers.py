@@ -1,11 +1,12 @@
 """Denoise After Render: a still when it is done, the frames of an animation when all are."""
 
+import functools
 import os
 
 import bpy
 from bpy.app.handlers import persistent
 
-from . import jobs, outcome, passes, plans
+from . import jobs, outcome, panel, passes, plans
 
 _LOOK_SECONDS = 0.3
 
@@ -28,41 +29,71 @@ def _on_write(scene, _depsgraph=None):
 def _on_complete(scene, _depsgraph=None):
     if not scene.demc.after_render:
         return
-    frames = [path for path in dict.fromkeys(_written) if path.lower().endswith(".exr") and os.path.isfile(path)]
-    lost = bool(_written) and not frames
+    frames = list(dict.fromkeys(_written))
     _written.clear()
+    if bpy.app.background:
+        if _begin(scene, frames):
+            _finish(jobs.current().wait())
+    else:
+        # Not here: this is the thread of the render, where no data may be changed.
+        bpy.app.timers.register(functools.partial(_begin_later, scene.name, frames), first_interval=_LOOK_SECONDS)
+
+
+@persistent
+def _on_load(_path, _unused=None):
+    """Another file is opened: nobody would take the result, and Blender takes the timer away."""
+    jobs.abandon()
+
+
+def _begin(scene, written):
+    """Starts the job for a render, and returns whether there is one."""
+    frames = [path for path in written if path.lower().endswith(".exr") and os.path.isfile(path)]
     try:
-        if lost:
+        if written and not frames:
             lack = passes.missing(scene, frames=True)
             raise jobs.JobError(lack[0].text if lack else "The frames are no EXR files")
-        job = plans.of_files(scene, frames) if frames else plans.of_render(scene)
-        jobs.begin(job)
+        jobs.begin(plans.of_files(scene, frames) if frames else plans.of_render(scene))
     except jobs.JobError as error:
+        jobs.refuse(str(error))
         print(f"demc: {error}")
-        return
-    if bpy.app.background:
-        _finish(job.wait())
-    else:
+        return False
+    return True
+
+
+def _begin_later(name, written):
+    """Called from a timer until the render's thread has ended."""
+    if bpy.app.is_job_running("RENDER"):
+        return _LOOK_SECONDS
+    scene = bpy.data.scenes.get(name)
+    if scene is not None and _begin(scene, written):
         bpy.app.timers.register(_follow, first_interval=_LOOK_SECONDS)
+    panel.show_progress(jobs.current())
+    return None
 
 
 def _follow():
-    """Called from a timer, outside of the render: there, no data may be added."""
+    """Called from a timer until the job has ended."""
     job = jobs.current()
-    if job is None or not job.poll():
-        if job is not None:
-            _finish(job)
+    if job is None:
         return None
-    return _LOOK_SECONDS
+    runs = job.poll()
+    panel.show_progress(job)
+    if runs:
+        return _LOOK_SECONDS
+    _finish(job)
+    return None
 
 
 def _finish(job):
-    outcome.take(job)
+    if outcome.take(job) is not None and not bpy.app.background:
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+            bpy.ops.ed.undo_push(message="Denoise After Render")
     print(f"demc: {job.summary()}")
 
 
 _HANDLERS = (
     ("render_init", _on_init), ("render_write", _on_write), ("render_complete", _on_complete),
+    ("load_pre", _on_load),
 )
 
 

@@ -25,6 +25,8 @@ _LOOK_SECONDS = 0.02
 
 # The job that is running, or the last one: what the panel tells of.
 _current = None
+# Why Denoise After Render began none, where that came after the last one.
+_refusal = None
 
 
 class JobError(Exception):
@@ -34,6 +36,17 @@ class JobError(Exception):
 def current():
     """The job that is running or was the last, or None."""
     return _current
+
+
+def refusal():
+    """Why the last render was not denoised, where nothing has been since; or None."""
+    return _refusal
+
+
+def refuse(words):
+    """Keeps why a render is not denoised, for the panel: no operator is at hand to report it."""
+    global _refusal
+    _refusal = words
 
 
 def is_running():
@@ -48,6 +61,7 @@ def begin(job):
         raise JobError(f"demc is at work ({_current.title}): wait for it, or cancel it first")
     job.start()
     _current = job
+    refuse(None)
 
 
 def abandon():
@@ -56,6 +70,7 @@ def abandon():
     if _current is not None:
         _current.kill()
     _current = None
+    refuse(None)
 
 
 class Job:
@@ -108,7 +123,8 @@ class Job:
         worker = os.path.join(os.path.dirname(os.path.abspath(__file__)), "worker.py")
         try:
             self._process = subprocess.Popen(
-                [sys.executable, *bpy.app.python_args, worker],
+                # The first releases of 4.2 do not tell what Python is to be started with.
+                [sys.executable, *getattr(bpy.app, "python_args", ()), worker],
                 stdin=subprocess.PIPE, stdout=said, stderr=told,
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )

@@ -3,7 +3,7 @@ there are no timers, it waits."""
 
 import bpy
 
-from . import jobs, outcome, passes, plans
+from . import jobs, outcome, panel, passes, plans
 
 _LOOK_SECONDS = 0.2
 
@@ -11,7 +11,8 @@ _LOOK_SECONDS = 0.2
 class _Denoise:
     """Begins the job that `plan` makes of the scene."""
 
-    bl_options = {"REGISTER"}
+    # Not REGISTER: Repeat Last would run `execute`, which waits, and Blender with it.
+    bl_options = set()
     _timer = None
     _job = None
 
@@ -34,25 +35,27 @@ class _Denoise:
         if not self._begin(context):
             return {"CANCELLED"}
         self._timer = context.window_manager.event_timer_add(_LOOK_SECONDS, window=context.window)
-        context.window_manager.progress_begin(0.0, 1.0)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        if event.type == "ESC":
+        if event.type == "ESC" and event.value == "PRESS":
             self._job.stop()
+            return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         runs = self._job.poll()
-        context.window_manager.progress_update(self._job.progress)
-        for area in context.screen.areas if context.screen else ():
-            if area.type == "PROPERTIES":
-                area.tag_redraw()
+        panel.show_progress(self._job)
         if runs:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)
-        context.window_manager.progress_end()
         return self._end()
+
+    def cancel(self, context):
+        """Called where Blender takes the operator away: its window closes, or another file is opened."""
+        context.window_manager.event_timer_remove(self._timer)
+        self._job.kill()
+        panel.show_progress(self._job)
 
     def _begin(self, context):
         try:
@@ -75,6 +78,7 @@ class DEMC_OT_denoise_render(_Denoise, bpy.types.Operator):
     """Denoise the render that is shown, with its passes; the result becomes an image"""
 
     bl_idname, bl_label = "demc.denoise_render", "Denoise This Render"
+    bl_options = {"UNDO"}
     plan = staticmethod(plans.of_render)
 
 

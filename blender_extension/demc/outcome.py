@@ -26,4 +26,14 @@ def take(job):
     image.colorspace_settings.is_data = False
     if scene is not None and scene.demc.use_compositor:
         compositor.wire(scene, image)
+    _show(image)
     return image
+
+
+def _show(image):
+    """Puts the result where the render is shown; the editor's list of images leads back."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            space = area.spaces.active
+            if area.type == "IMAGE_EDITOR" and space.image and space.image.type == "RENDER_RESULT":
+                space.image = image

@@ -1,5 +1,7 @@
 """The panel, Render Properties > demc."""
 
+import textwrap
+
 import bpy
 
 from . import jobs, passes
@@ -21,19 +23,19 @@ class DEMC_PT_panel(bpy.types.Panel):
         column.prop(settings, "model")
         if settings.model == WEIGHTS_FILE:
             column.prop(settings, "weights")
-        _state(layout)
         lacks = passes.missing(scene)
         if lacks:
             box = layout.box()
             for lack in lacks:
-                box.label(text=lack.text, icon="ERROR")
+                _paragraph(box, context, lack.text, "ERROR")
             if any(lack.prepared for lack in lacks):
                 box.operator("demc.prepare")
         column = layout.column(align=True)
         column.operator("demc.denoise_render", icon="RENDER_STILL")
         column.operator("demc.denoise_range", icon="RENDER_ANIMATION")
-        row = column.row(align=True)
-        row.operator("demc.denoise_folder", icon="FILE_FOLDER")
+        column.operator("demc.denoise_folder", icon="FILE_FOLDER")
+        # Below the buttons, which stay where they are while it comes and goes.
+        _state(layout, context)
         layout.prop(settings, "folder")
         layout.prop(settings, "after_render")
         layout.prop(settings, "use_compositor")
@@ -62,17 +64,45 @@ class DEMC_PT_options(bpy.types.Panel):
             layout.prop(settings, "frame_last")
 
 
-def _state(layout):
+def show_progress(job):
+    """Says in the status bar how far a job is while it runs, and has the panel drawn anew. job: may be None."""
+    runs = job is not None and job.state == jobs.RUNNING
+    for workspace in bpy.data.workspaces:
+        workspace.status_text_set(f"demc denoises {_how_far(job)}. Esc cancels" if runs else None)
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "PROPERTIES":
+                area.tag_redraw()
+
+
+def _how_far(job):
+    return f"{job.title}: {job.finished} of {job.total}"
+
+
+def _state(layout, context):
     job = jobs.current()
-    if job is None:
+    if jobs.refusal():
+        _paragraph(layout, context, jobs.refusal(), "ERROR")
+    elif job is None:
         return
-    if job.state == jobs.RUNNING:
+    elif job.state == jobs.RUNNING:
         row = layout.row()
-        row.progress(factor=job.progress, text=f"{job.title}: {job.finished} of {job.total}")
+        row.progress(factor=job.progress, text=_how_far(job))
         row.operator("demc.cancel", text="", icon="X")
     else:
         failed = job.state == jobs.FAILED
-        layout.label(text=job.summary(), icon="ERROR" if failed else "CHECKMARK")
+        _paragraph(layout, context, job.summary(), "ERROR" if failed else "CHECKMARK")
+
+
+def _paragraph(layout, context, text, icon):
+    """Text in as many lines as the panel's width asks for: labels do not wrap, and are cut."""
+    width = context.region.width / context.preferences.system.ui_scale
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    # Widths of the default theme: margins and icon, and a letter.
+    for line in textwrap.wrap(text, max(int((width - 80) / 6.5), 20)):
+        column.label(text=line, icon=icon)
+        icon = "BLANK1"
 
 
 _CLASSES = (DEMC_PT_panel, DEMC_PT_options)

@@ -4,6 +4,8 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 WEIGHTS_FILE = "FILE"
+# Blender 4.5 and later show paths beside the .blend, such as //frames, as wrong where a property does not say so.
+_PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5) else set()
 
 
 class DemcSettings(bpy.types.PropertyGroup):
@@ -21,7 +23,7 @@ class DemcSettings(bpy.types.PropertyGroup):
         default="demc-m",
     )
     weights: StringProperty(
-        name="Weights", description="The .safetensors file of the network", subtype="FILE_PATH")
+        name="Weights", description="The .safetensors file of the network", subtype="FILE_PATH", options=_PATH)
     view_layer: StringProperty(
         name="View Layer", description="The view layer to denoise; empty for the one with the most passes")
     keep_noisy: BoolProperty(
@@ -50,14 +52,14 @@ class DemcSettings(bpy.types.PropertyGroup):
     threads: IntProperty(
         name="Threads", description="Processor threads for denoising; 0 for all", min=0, max=1024, default=0)
     output: StringProperty(
-        name="Output", subtype="DIR_PATH",
+        name="Output", subtype="DIR_PATH", options=_PATH,
         description="Folder for the results. Empty: a folder 'denoised' beside the frames, or beside the .blend "
         "for a single render")
     overwrite: BoolProperty(
         name="Overwrite",
         description="Denoise frames again whose results are there already. Renders are never overwritten")
     folder: StringProperty(
-        name="Folder", subtype="DIR_PATH", description="A folder of multilayer EXR files to denoise")
+        name="Folder", subtype="DIR_PATH", options=_PATH, description="A folder of multilayer EXR files to denoise")
     use_own_range: BoolProperty(
         name="Own Range", description="Denoise other frames than the scene's frame range")
     frame_first: IntProperty(name="First", description="First frame to denoise", default=1)

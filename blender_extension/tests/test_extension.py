@@ -20,7 +20,8 @@ MODULE = "bl_ext.user_default.demc"
 
 def handlers():
     """All handlers there are, by name."""
-    return {name: list(getattr(bpy.app.handlers, name)) for name in ("render_init", "render_write", "render_complete")}
+    names = ("render_init", "render_write", "render_complete", "load_pre")
+    return {name: list(getattr(bpy.app.handlers, name)) for name in names}
 
 
 def classes():
@@ -44,6 +45,8 @@ def scene(folder, size=32):
     made.camera = bpy.context.object
     made.render.engine = "CYCLES"
     made.cycles.samples, made.cycles.device = 2, "CPU"
+    # Debian builds Blender 4.3 without Open Image Denoise, and refuses to render with it.
+    made.cycles.use_denoising = False
     made.render.resolution_x = made.render.resolution_y = size
     made.render.filepath = os.path.join(folder, "shot_")
     made.frame_start, made.frame_end = 1, 2
@@ -91,7 +94,10 @@ class Extension(unittest.TestCase):
         mine = [node for node in tree.nodes if node.get("demc")]
         split = next(node for node in mine if node.bl_idname == "CompositorNodeSplit")
         sides = [link.from_node.bl_idname for socket in split.inputs for link in socket.links]
-        self.assertEqual(sorted(sides), ["CompositorNodeImage", "CompositorNodeRLayers"])
+        self.assertEqual(sides, ["CompositorNodeImage", "CompositorNodeRLayers"], "the result is at the right")
+        # A window refuses to render a scene whose compositor has no output.
+        outputs = [node for node in tree.nodes if node.bl_idname in ("CompositorNodeComposite", "NodeGroupOutput")]
+        self.assertTrue(outputs and outputs[0].inputs["Image"].is_linked)
         # Again: the picture is the same one, and the nodes are not doubled.
         count = len(tree.nodes)
         bpy.ops.demc.denoise_render()
@@ -148,6 +154,24 @@ class Extension(unittest.TestCase):
         job.wait()
         self.assertIn(job.state, (jobs.CANCELLED, jobs.DONE))
         self.assertFalse([name for name in self.clean() if name.endswith(".tmp")])
+
+    def test_opening_another_file_ends_a_job(self):
+        jobs, plans = sys.modules[f"{MODULE}.jobs"], sys.modules[f"{MODULE}.plans"]
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        job = plans.of_range(self.scene)
+        jobs.begin(job)
+        bpy.ops.wm.read_homefile(use_empty=True)
+        self.assertEqual((job.state, jobs.current()), (jobs.CANCELLED, None))
+
+    def test_why_a_render_was_not_denoised_is_kept_for_the_panel(self):
+        jobs = sys.modules[f"{MODULE}.jobs"]
+        self.scene.demc.after_render = True
+        bpy.ops.render.render()
+        self.assertIn("Denoising Data", jobs.refusal())
+        self.prepared()
+        bpy.ops.render.render()
+        self.assertIsNone(jobs.refusal())
 
     def test_a_worker_that_fails_is_told_in_words(self):
         self.prepared()

@@ -9,13 +9,19 @@ import sys
 import zipfile
 
 COMMAND = '''"""The command, as the whole wheel has it."""
+import ctypes
+import signal
 import subprocess
 import sys
 
 
 def main():
-    """Runs the program with this process's arguments."""
-    sys.exit(subprocess.run([{program!r}, *sys.argv[1:]]).returncode)
+    """Runs the program with this process's arguments; it ends when this process is asked to."""
+    # 1 is PR_SET_PDEATHSIG: where this process is killed, the program dies as well, as if it were of this process.
+    die_with_this = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
+    program = subprocess.Popen([{program!r}, *sys.argv[1:]], preexec_fn=die_with_this)
+    signal.signal(signal.SIGTERM, lambda *_: program.terminate())
+    sys.exit(program.wait())
 '''
 WHEEL = "Wheel-Version: 1.0\nGenerator: thin_wheel\nRoot-Is-Purelib: true\nTag: py3-none-manylinux_2_28_x86_64\n"
 
