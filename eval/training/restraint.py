@@ -47,7 +47,7 @@ class Frames:
         around = F.avg_pool2d(truth.mean(1, keepdim=True), 5, 1, 2, count_include_pad=False)
         place = 0.5 * (light + around.clamp_min(0)) + floor
         self.render = ((render - denoised) / place).clamp(-4, 4)
-        self.truth = ((truth - denoised) / place).clamp(-2, 2)
+        self.truth = ((truth - denoised) / place).clamp(-4, 4)
         # The least that a mixture can be expected to reach; the noise of the truth is in both.
         error = lambda image: ((image - self.truth) ** 2).mean((1, 2, 3))
         self.errors = torch.stack([error(0 * self.render), error(self.render)])
