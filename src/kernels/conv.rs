@@ -346,12 +346,11 @@ impl Band<'_> {
                         &inputs,
                         first,
                         [at(first), at(first + 1)],
-                        width,
-                        spread,
+                        (width, spread),
                     );
                 } else {
                     for plane in first..end {
-                        self.row::<S, STEP, 1>(simd, taps, &inputs, plane, [at(plane)], width, spread);
+                        self.row::<S, STEP, 1>(simd, taps, &inputs, plane, [at(plane)], (width, spread));
                     }
                 }
             }
@@ -367,8 +366,7 @@ impl Band<'_> {
         inputs: &[Plane],
         plane: usize,
         output: [*mut Block; OUT],
-        width: usize,
-        spread: usize,
+        (width, spread): (usize, usize),
     ) {
         let tiles = width.div_ceil(S::TILE.1);
         let mut x = 0;

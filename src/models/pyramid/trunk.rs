@@ -84,7 +84,7 @@ pub enum Step {
     Input(Steps),
     /// Halves rows and columns.
     Pool,
-    Conv(Conv),
+    Conv(Box<Conv>),
 }
 
 /// What predicts a level of the pyramid of images.
@@ -137,14 +137,14 @@ impl Builder<'_> {
         let inputs: Vec<usize> = sources.iter().map(|source| self.layers[*source].channels).collect();
         let name = format!("{}{name}", self.prefix);
         let conv = Conv::new(self.rng, &name, &inputs, width, k, Init::Xavier);
-        self.add(Step::Conv(conv), sources, self.layers[sources[0]].level, width)
+        self.add(Step::Conv(conv.into()), sources, self.layers[sources[0]].level, width)
     }
 
     /// A transposed convolution, which doubles rows and columns.
     fn up(&mut self, name: &str, source: usize, width: usize) -> usize {
         let Layer { level, channels, .. } = self.layers[source];
         let conv = Conv::transposed(self.rng, &format!("{}{name}", self.prefix), channels, width);
-        self.add(Step::Conv(conv), &[source], level - 1, width)
+        self.add(Step::Conv(conv.into()), &[source], level - 1, width)
     }
 
     /// A head of so many channels a pixel.
@@ -276,7 +276,7 @@ impl Trunk {
     /// Its convolutions, in a fixed order.
     pub fn convolutions(&mut self) -> impl Iterator<Item = &mut Conv> {
         let layers = self.layers.iter_mut().filter_map(|layer| match &mut layer.step {
-            Step::Conv(conv) => Some(conv),
+            Step::Conv(conv) => Some(&mut **conv),
             _ => None,
         });
         layers.chain(self.heads.iter_mut().map(|head| &mut head.conv))
