@@ -1,8 +1,9 @@
 """Trains what decides how much of the render a denoised frame keeps: src/filters/shrinkage/perceptron.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
-    python restraint.py FEATURES/m FEATURES/s --hold-out              what it reaches on views that it did not see
-    python restraint.py FEATURES/m FEATURES/s --out ../../src/filters/shrinkage/restraint.safetensors
+    python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 --out ../../src/filters/shrinkage/restraint.safetensors
+
+With --hold-out it reports what it reaches on views that it did not see.
 
 What is made least is the squared error of the mixture, relative to the brightness of the place, against references that
 need not be clean: their noise adds the same to every mixture. Each frame counts by how well it can be done. Frames with a
