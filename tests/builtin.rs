@@ -88,7 +88,7 @@ fn write(path: &Path, passes: &PassSet) {
         (Pass::DenoisingNormal, ["X", "Y", "Z"]),
         (Pass::DenoisingAlbedo, ["R", "G", "B"]),
     ] {
-        let planes = passes.get(pass).unwrap();
+        let Some(planes) = passes.get(pass) else { continue };
         for (c, component) in components.iter().enumerate() {
             let samples = FlatSamples::F32(planes.channel(c).to_vec());
             list.push(AnyChannel::new(format!("ViewLayer.{pass}.{component}").as_str(), samples));

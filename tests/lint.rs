@@ -343,7 +343,8 @@ fn missing_passes() {
     let found = lint::frame(&set, &about);
     assert_eq!(found.len(), 1, "{found:?}");
     assert!(
-        found[0].message.contains("demc-m needs") && found[0].remedy.contains("Denoising Data"),
+        found[0].message.contains("without which demc-m loses detail")
+            && found[0].remedy.contains("Denoising Data"),
         "{found:?}"
     );
 }

@@ -176,7 +176,7 @@ fn light_of_one_renderer_is_not_the_albedo_of_another() {
     let names = ["RGBA.R", "RGBA.G", "RGBA.B", "diffuse.R", "diffuse.G", "diffuse.B", "N.X", "N.Y", "N.Z"];
     Render::new().write(&path, &channels(&names));
     let said = said(&path, &[]);
-    assert!(said.contains("no Denoising Albedo") && said.contains("denoise_albedo"), "{said}");
+    assert!(said.contains("done without Denoising Albedo") && said.contains("denoise_albedo"), "{said}");
 }
 
 #[test]

@@ -152,7 +152,8 @@ impl Denoiser for Learned {
         }
         let PassSet { view_layer, renderer, .. } = &shot.passes;
         let mut missed = lacking(&shot.passes);
-        missed.retain(|pass| self.dispensable().contains(pass));
+        // What is there and blank, `demc inspect` tells.
+        missed.retain(|pass| shot.passes.get(*pass).is_none() && self.dispensable().contains(pass));
         let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
         (!missed.is_empty()).then(|| {
             format!(

@@ -46,6 +46,11 @@ const OWN_RANGE: f32 = 3.0;
 /// Shares nearer than this to none or to all of the render are none or all.
 const SNAP: f32 = 1.0 / 64.0;
 
+/// From this many samples on, the more of the render is kept the more samples there are, by this power of their number: few
+/// frames that were learned from had more.
+const FINAL_SAMPLES: f32 = 256.0;
+const FINAL_POWER: f32 = 0.75;
+
 /// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing; the larger the
 /// share, the more. What is rendered brighter than that by far is noise as long as most around it is.
 const LARGEST_CHANGE: f32 = 1.5;
@@ -138,6 +143,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
     let floor = FLOOR / render.exposure;
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
     let (few, many) = KEPT_SAMPLES;
+    let belief = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
@@ -176,7 +182,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
                 }
                 let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
                 let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
-                let shrunk = share_of_render(judged, change);
+                let shrunk = 1.0 - belief * (1.0 - share_of_render(judged, change));
                 let direct = match keeps {
                     0.0 => 0.0,
                     _ if is_seen => keeps,
