@@ -20,7 +20,7 @@ pub use kpcn::{
 };
 pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
 pub use shading::Shading;
-pub use stand_in::{lacking, stand_in, with_stand_ins};
+pub use stand_in::{stand_in, with_stand_ins};
 
 use std::ops::Range;
 

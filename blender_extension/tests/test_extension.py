@@ -143,12 +143,17 @@ class Extension(unittest.TestCase):
         self.scene.demc.model, self.scene.demc.weights = "FILE", ""
         self.refused(bpy.ops.demc.denoise_render, "Choose the weights file")
 
-    def test_a_job_is_cancelled_and_leaves_no_half_file(self):
+    def begun(self):
+        """The module of jobs, and one that denoises an animation just rendered."""
         jobs, plans = sys.modules[f"{MODULE}.jobs"], sys.modules[f"{MODULE}.plans"]
         self.prepared()
         bpy.ops.render.render(animation=True)
         job = plans.of_range(self.scene)
         jobs.begin(job)
+        return jobs, job
+
+    def test_a_job_is_cancelled_and_leaves_no_half_file(self):
+        jobs, job = self.begun()
         self.assertTrue(jobs.is_running() and not bpy.ops.demc.denoise_range.poll())
         job.stop()
         job.wait()
@@ -156,11 +161,7 @@ class Extension(unittest.TestCase):
         self.assertFalse([name for name in self.clean() if name.endswith(".tmp")])
 
     def test_opening_another_file_ends_a_job(self):
-        jobs, plans = sys.modules[f"{MODULE}.jobs"], sys.modules[f"{MODULE}.plans"]
-        self.prepared()
-        bpy.ops.render.render(animation=True)
-        job = plans.of_range(self.scene)
-        jobs.begin(job)
+        jobs, job = self.begun()
         bpy.ops.wm.read_homefile(use_empty=True)
         self.assertEqual((job.state, jobs.current()), (jobs.CANCELLED, None))
 

@@ -111,7 +111,7 @@ def train(frames, chosen, steps, seed):
     for step in range(steps):
         at = chosen[torch.multinomial(weights, BATCH, True, generator=generator)]
         y, x = (int(torch.randint(0, frames.features.shape[2] - squares + 1, (), generator=generator)) for _ in "yx")
-        cut = lambda planes, of: planes[at, :, y * of:(y + squares * 4 // SQUARE) * of, x * of:(x + squares) * of]
+        cut = lambda planes, of: planes[at, :, y * of:(y + squares) * of, x * of:(x + squares) * of]
         features = cut(frames.features, 1).clone()
         log, known = known_samples(frames.samples[at], frames.noise[at], generator)
         features[:, SAMPLES], features[:, KNOWN] = log.view(-1, 1, 1), known.view(-1, 1, 1)

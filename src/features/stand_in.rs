@@ -13,7 +13,7 @@ use crate::{
 const ALBEDO: f32 = 0.5;
 
 /// Of the guides, those that a frame lacks: they are missing, or hold nothing but zeros.
-pub fn lacking(passes: &PassSet) -> Vec<Pass> {
+fn lacking(passes: &PassSet) -> Vec<Pass> {
     let is_blank = |planes: &Planes| planes.data.iter().all(|v| *v == 0.0);
     PREFILTERED_PASSES.into_iter().filter(|pass| passes.get(*pass).is_none_or(is_blank)).collect()
 }
@@ -25,7 +25,7 @@ pub fn stand_in(pass: Pass, (width, height): (usize, usize)) -> Planes {
     Planes::from_vec(3, width, height, vec![value; 3 * width * height])
 }
 
-/// A frame's passes, with something in the place of each guide that it [lacks](lacking).
+/// A frame's passes, with something in the place of each guide that is missing or holds nothing but zeros.
 pub fn with_stand_ins(passes: &PassSet) -> Cow<'_, PassSet> {
     let lacking = lacking(passes);
     if lacking.is_empty() {

@@ -13,7 +13,7 @@ use crate::{
     augment::Augment,
     companion::{Companion, Kind},
     error::remedy,
-    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, lacking, tame_alike, with_stand_ins},
+    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
     filters::shrinkage::{Render, shrink, take_back},
     nn::Precision,
     passes::{Pass, PassSet},
@@ -151,9 +151,9 @@ impl Denoiser for Learned {
             return Some(format!("{}: {note}", self.name));
         }
         let PassSet { view_layer, renderer, .. } = &shot.passes;
-        let mut missed = lacking(&shot.passes);
         // What is there and blank, `demc inspect` tells.
-        missed.retain(|pass| shot.passes.get(*pass).is_none() && self.dispensable().contains(pass));
+        let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none();
+        let missed: Vec<Pass> = self.dispensable().iter().copied().filter(is_missing).collect();
         let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
         (!missed.is_empty()).then(|| {
             format!(

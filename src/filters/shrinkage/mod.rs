@@ -10,10 +10,10 @@
 //! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred detail: with
 //!   its neighbours, with the detail that is left, and with that of the albedo.
 //!
-//! These are summed up over squares of pixels ([`sums`]), from which a small perceptron tells the share ([`perceptron`]).
+//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share (`perceptron`).
 //! Of a noisy frame all of `d` is taken.
 //!
-//! Light that the camera sees directly ([`seen`]: sky, screens, lamps) has no noise but that of antialiasing, and is kept.
+//! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing, and is kept.
 //! Of few samples, though, antialiasing is noise like any other: a gap of a blind before a bright sky is a quarter of the
 //! sky, or nothing.
 
@@ -24,8 +24,8 @@ mod sums;
 use rayon::prelude::*;
 
 use self::{
-    perceptron::{Facts, OUTPUTS},
-    seen::{Seen, film_exposure, is_firefly},
+    perceptron::OUTPUTS,
+    seen::{Seen, is_firefly},
     sums::LARGEST_RESIDUAL,
 };
 use super::squares::{SQUARE, between};
@@ -46,9 +46,13 @@ const OWN_RANGE: f32 = 3.0;
 /// Shares nearer than this to none or to all of the render are none or all.
 const SNAP: f32 = 1.0 / 64.0;
 
+/// Of one sample, as far as files tell, no share below the first counts; of `n` samples, none below the second over `n`. What
+/// looks like a picture in a frame of few samples is noise more often than not.
+const DOUBT: (f32, f32) = (0.5, 2.0);
+
 /// From this many samples on, the more of the render is kept the more samples there are, by this power of their number: few
 /// frames that were learned from had more.
-const FINAL_SAMPLES: f32 = 256.0;
+const FINAL_SAMPLES: f32 = 192.0;
 const FINAL_POWER: f32 = 0.75;
 
 /// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing; the larger the
@@ -86,9 +90,9 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
     if image.pixels() == 0 {
         return;
     }
-    let seen = Seen { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) };
+    let seen = Seen::of(render);
     let sums = sums::gather(image, render, &seen);
-    let judged = perceptron::judge(&sums, image.width.div_ceil(SQUARE), render.facts());
+    let judged = perceptron::judge(&sums, image.width.div_ceil(SQUARE), render);
     drop(sums);
     mix(image, render, &seen, &judged, shares);
 }
@@ -100,9 +104,9 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
 /// If sizes differ.
 pub fn features(image: &Planes, render: &Render) -> Planes {
     check(image, render);
-    let seen = Seen { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) };
     let (squares, rows) = (image.width.div_ceil(SQUARE), image.height.div_ceil(SQUARE));
-    let features = perceptron::features(&sums::gather(image, render, &seen), squares, render.facts());
+    let sums = sums::gather(image, render, &Seen::of(render));
+    let features = perceptron::features(&sums, squares, render);
     let mut planes = Planes::new(perceptron::FEATURES, squares, rows);
     for (row, features) in features.chunks(perceptron::FEATURES * squares).enumerate() {
         for (plane, line) in planes.data.chunks_mut(squares * rows).zip(features.chunks(squares)) {
@@ -117,12 +121,6 @@ fn check(image: &Planes, render: &Render) {
     for planes in [render.radiance, render.albedo, image] {
         let own = (planes.channels, planes.width, planes.height);
         assert_eq!(own, (3, size.0, size.1), "planes of one frame");
-    }
-}
-
-impl Render<'_> {
-    fn facts(&self) -> Facts {
-        Facts { exposure: self.exposure, samples: self.samples }
     }
 }
 
@@ -143,6 +141,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
     let floor = FLOOR / render.exposure;
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
     let (few, many) = KEPT_SAMPLES;
+    let doubt = render.samples.map_or(0.0, |_| (DOUBT.1 / samples).min(DOUBT.0)).max(SNAP);
     let belief = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
@@ -182,7 +181,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
                 }
                 let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
                 let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
-                let shrunk = 1.0 - belief * (1.0 - share_of_render(judged, change));
+                let shrunk = 1.0 - belief * (1.0 - share_of_render(judged, change, doubt));
                 let direct = match keeps {
                     0.0 => 0.0,
                     _ if is_seen => keeps,
@@ -203,12 +202,12 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
 }
 
 /// The share of the render in a pixel whose light changes by so much if all of it is taken, by what was
-/// [judged](perceptron::judge) of the place.
-fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32) -> f32 {
+/// [judged](perceptron::judge) of the place; shares below `doubt` are none.
+fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32, doubt: f32) -> f32 {
     let own = change.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
     let unusual = (ln(own * own + OWN_FLOOR) - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE;
     let share = 1.0 / (1.0 + exp(-(logit + slope * unusual)));
-    let share = ((share - SNAP) / (1.0 - 2.0 * SNAP)).clamp(0.0, 1.0);
+    let share = ((share - doubt) / (1.0 - SNAP - doubt)).clamp(0.0, 1.0);
     if share == 1.0 {
         return share;
     }
@@ -217,7 +216,7 @@ fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{seen::film_exposure, *};
     use crate::rng::Rng;
 
     const SIZE: (usize, usize) = (93, 70);

@@ -10,7 +10,10 @@ use std::sync::LazyLock;
 use rayon::prelude::*;
 use safetensors::SafeTensors;
 
-use super::sums::{BY_DETAIL, COUNT, CUT, DETAIL, LIGHT, NEXT, NOISE, RESIDUAL, SUMS};
+use super::{
+    Render,
+    sums::{BY_DETAIL, COUNT, CUT, DETAIL, LIGHT, NEXT, NOISE, RESIDUAL, SUMS},
+};
 use crate::{
     filters::squares,
     kernels::{
@@ -70,23 +73,14 @@ static WEIGHTS: LazyLock<Weights> = LazyLock::new(|| {
     }
 });
 
-/// What is known of a frame besides its sums.
-#[derive(Clone, Copy)]
-pub struct Facts {
-    /// What radiance is multiplied by so that its log-average is middle grey.
-    pub exposure: f32,
-    /// Samples of a pixel, where the file tells.
-    pub samples: Option<u32>,
-}
-
 /// [`FEATURES`] lines of every row of squares.
-pub fn features(sums: &[f32], squares: usize, facts: Facts) -> Vec<f32> {
-    each_row(sums, squares, FEATURES, facts, |features, output| output.copy_from_slice(features))
+pub fn features(sums: &[f32], squares: usize, render: &Render) -> Vec<f32> {
+    each_row(sums, squares, FEATURES, render, |features, output| output.copy_from_slice(features))
 }
 
 /// [`OUTPUTS`] lines of every row of squares.
-pub fn judge(sums: &[f32], squares: usize, facts: Facts) -> Vec<f32> {
-    each_row(sums, squares, OUTPUTS, facts, |features, output| {
+pub fn judge(sums: &[f32], squares: usize, render: &Render) -> Vec<f32> {
+    each_row(sums, squares, OUTPUTS, render, |features, output| {
         let Weights { first, second, last } = &*WEIGHTS;
         let mut hidden = [(); 2].map(|()| vec![0.0; HIDDEN * squares]);
         let [one, two] = &mut hidden;
@@ -132,7 +126,7 @@ fn each_row(
     sums: &[f32],
     squares: usize,
     lines: usize,
-    facts: Facts,
+    render: &Render,
     make: impl Fn(&[f32], &mut [f32]) + Sync,
 ) -> Vec<f32> {
     let sums: Vec<&[f32]> = sums.chunks(SUMS * squares).collect();
@@ -152,13 +146,13 @@ fn each_row(
                 vectorised::run(Describe { sums: around, features, squares });
                 if place == 0 {
                     let light = around[LIGHT * squares..].iter().zip(&around[COUNT * squares..]);
-                    let brightness = |(sum, count): (&f32, &f32)| ln(sum / count * facts.exposure + BLACK);
+                    let brightness = |(sum, count): (&f32, &f32)| ln(sum / count * render.exposure + BLACK);
                     of_frame.iter_mut().zip(light).take(squares).for_each(|(v, of)| *v = brightness(of));
                 }
             }
-            let samples = facts.samples.map_or(0.0, |samples| (samples.max(1) as f32).log2());
+            let samples = render.samples.map_or(0.0, |samples| (samples.max(1) as f32).log2());
             of_frame[squares..2 * squares].fill(samples);
-            of_frame[2 * squares..].fill(if facts.samples.is_some() { 1.0 } else { 0.0 });
+            of_frame[2 * squares..].fill(if render.samples.is_some() { 1.0 } else { 0.0 });
             make(features, made);
         },
     );

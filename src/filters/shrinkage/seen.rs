@@ -88,6 +88,13 @@ pub struct Seen<'a> {
     pub film: f32,
 }
 
+impl<'a> Seen<'a> {
+    /// In a frame.
+    pub fn of(render: &Render<'a>) -> Self {
+        Self { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) }
+    }
+}
+
 impl Seen<'_> {
     /// Whether a pixel has the brightness of its albedo.
     fn equals_albedo(&self, at: usize) -> bool {
