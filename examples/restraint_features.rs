@@ -6,7 +6,9 @@
 //!
 //! For each pair, and for the pair with a part of its noise (where the reference has guides, cleaned by
 //! `eval/training/clean_references.py`), a safetensors file of 32-bit floats: `features` (36, H/4, W/4), `render`,
-//! `denoised` and `truth` (3, H, W), and `facts`: exposure, samples, and the share of the noise.
+//! `denoised`, `result` (what is kept of it with the shipped weights), `truth` and `clean` (the reference as rendered, and as it
+//! was denoised, if it was; 3, H, W), `shares` (1, H, W; of the render in the result), and `facts`: exposure, samples, and the
+//! share of the noise.
 
 use std::path::Path;
 
@@ -48,7 +50,8 @@ fn main() -> Result<()> {
             let uniform = Weights::uniform(noisy.width, noisy.height, radius);
             let denoised = nl_means::filter(&denoised, &uniform);
             let path = folder.join(format!("{at:05}_{}_{step}.safetensors", pair.id()));
-            write(&path, &frame, &denoised, &truth, (pair.spp, share))?;
+            let clean = reference.require(Pass::Combined, "training")?;
+            write(&path, &frame, &denoised, (&truth, clean), (pair.spp, share))?;
         }
     }
     Ok(())
@@ -74,7 +77,7 @@ fn write(
     path: &Path,
     frame: &PassSet,
     denoised: &Planes,
-    truth: &Planes,
+    (truth, clean): (&Planes, &Planes),
     (spp, share): (u32, f32),
 ) -> Result<()> {
     let radiance = frame.require(Pass::Combined, "training")?;
@@ -82,12 +85,17 @@ fn write(
     let exposure = features::exposure(radiance);
     let render = Render { radiance, albedo, exposure, samples: Some(spp), firefly: features::FIREFLY };
     let features = shrinkage::features(denoised, &render);
+    let (mut result, mut shares) = (denoised.clone(), Planes::new(1, denoised.width, denoised.height));
+    shrinkage::shrink(&mut result, &render, Some(&mut shares));
     let facts = Planes::from_vec(3, 1, 1, vec![exposure, spp as f32, share]);
     let planes = [
         ("features", &features),
         ("render", radiance),
         ("denoised", denoised),
+        ("result", &result),
+        ("shares", &shares),
         ("truth", truth),
+        ("clean", clean),
         ("facts", &facts),
     ];
     let bytes = planes.map(|(name, planes)| {

@@ -14,6 +14,7 @@ mod manual;
 mod methods;
 mod models;
 mod peak_memory;
+mod ranking;
 mod report;
 mod sources;
 mod stability;

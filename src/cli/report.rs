@@ -14,6 +14,7 @@ use serde::Deserialize;
 
 use super::inputs::{self, Search};
 use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
+use super::ranking::{Ranking, parse_wish};
 use crate::{Error, Result};
 
 /// Arguments of `demc report`.
@@ -21,7 +22,7 @@ use crate::{Error, Result};
 #[command(after_help = "\
 Examples:
   demc report logs/*.jsonl
-  demc report logs/*.jsonl --of renders")]
+  demc report logs/*.jsonl --of renders --by-error 0.005")]
 pub struct Args {
     /// Files of what `demc denoise --json` printed, one or several tasks in each
     #[arg(required = true, value_name = "LOG")]
@@ -31,6 +32,11 @@ pub struct Args {
     /// killed does not
     #[arg(long, value_name = "INPUT", num_args = 1..)]
     of: Vec<PathBuf>,
+
+    /// Also list the frames by their expected RelMSE, the worst first; with a number, also how many samples those above it want
+    #[arg(long, value_name = "RELMSE", num_args = 0..=1, value_parser = parse_wish)]
+    #[allow(clippy::option_option, reason = "not at all, the list, what is wanted besides")]
+    by_error: Option<Option<f64>>,
 
     /// Search the directories of --of with all that are in them
     #[arg(long, requires = "of")]
@@ -44,6 +50,8 @@ struct Line {
     status: Status,
     error: Option<String>,
     seconds: Option<f64>,
+    expected_error: Option<f64>,
+    samples: Option<u32>,
 }
 
 #[derive(Clone, Copy, Deserialize, PartialEq, Eq)]
@@ -58,6 +66,8 @@ enum Status {
 struct Fate {
     status: Status,
     error: String,
+    /// The result's expected RelMSE, and the samples of its render.
+    expected: Option<(f64, Option<u32>)>,
 }
 
 /// Prints the report.
@@ -110,6 +120,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
     }
     print_line(&totals);
+    if let Some(wish) = args.by_error {
+        let mut ranking = Ranking::new(wish);
+        for (input, frame) in &frames {
+            if let Some((error, samples)) = frame.expected {
+                ranking.add(input.display().to_string(), error, samples);
+            }
+        }
+        ranking.print();
+    }
     Ok(if failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
@@ -123,7 +142,8 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     let known = frames.get(&line.input).map(|frame| rank(frame.status));
     if known.is_none_or(|known| known <= rank(line.status)) {
         let error = line.error.unwrap_or_default();
-        frames.insert(line.input, Fate { status: line.status, error });
+        let expected = line.expected_error.map(|error| (error, line.samples));
+        frames.insert(line.input, Fate { status: line.status, error, expected });
     }
 }
 

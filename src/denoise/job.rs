@@ -14,8 +14,8 @@ use super::{
 use crate::{
     Error, Result,
     companion::Companion,
-    frame::{Frame, NewChannel, Recoded},
-    models::Denoiser,
+    frame::{Frame, NewChannel, Recoded, SampleKind},
+    models::{Denoiser, ExpectedError},
     passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
@@ -57,6 +57,8 @@ pub struct Options {
     pub passes: bool,
     /// Whether the left and the right edge of a frame meet.
     pub wrap: Wrap,
+    /// Whether a layer tells how far off each pixel is expected to be.
+    pub confidence: bool,
 }
 
 impl Default for Options {
@@ -73,6 +75,7 @@ impl Default for Options {
             sources: Sources::default(),
             passes: false,
             wrap: Wrap::Auto,
+            confidence: false,
         }
     }
 }
@@ -109,6 +112,8 @@ pub struct Report {
     pub samples: Option<u32>,
     /// Whether Blender had denoised Combined, and what it was before was taken.
     pub was_denoised: bool,
+    /// The result's expected RelMSE, where the model can tell, as the mean of its views.
+    pub expected_error: Option<f64>,
     /// Seconds in the model alone.
     pub seconds: f64,
     /// NaN and infinite input values repaired, by pass.
@@ -151,8 +156,9 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     if options.view_layer.is_none() {
         report.notes.extend(note_other_layers(&layers, chosen));
     }
-    if let Some(added) = &options.layer {
-        let name = layer_name(&chosen.name, added);
+    let added = [options.layer.clone(), options.confidence.then(|| error_layer(options))];
+    for added in added.into_iter().flatten() {
+        let name = layer_name(&chosen.name, &added);
         if frame.has_foreign_layer(&name) {
             let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
             return Err(Error::invalid(input, why));
@@ -210,10 +216,17 @@ fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
         let name = model.name();
         return wrong(format!("{name} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l"));
     }
-    if options.temporal.is_some() && (options.passes || options.alpha == Alpha::Denoise) {
-        return wrong(
-            "--passes and --alpha denoise work frame by frame; leave out --temporal, or them".into(),
-        );
+    if options.confidence && !model.expects_errors() {
+        let name = model.name();
+        return wrong(format!(
+            "{name} does not tell how far off it is; --confidence takes demc-s, demc-m or demc-l"
+        ));
+    }
+    let by_frame = options.passes || options.confidence || options.alpha == Alpha::Denoise;
+    if options.temporal.is_some() && by_frame {
+        let why =
+            "--passes, --confidence and --alpha denoise work frame by frame; leave out --temporal, or them";
+        return wrong(why.into());
     }
     Ok(())
 }
@@ -235,6 +248,7 @@ pub struct Denoised {
     radiance: Planes,
     alpha: Option<Planes>,
     lights: Vec<(Source, Planes)>,
+    error: Option<ExpectedError>,
 }
 
 /// Runs the model over each view.
@@ -249,12 +263,13 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let radiance = run(&shot, &mut along.companions, model, options, report)?;
+        let (radiance, error) = run(&shot, &mut along.companions, model, options, report)?;
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
         // What was read is of no more use.
         drop(shot);
         let (denoised_alpha, lights) = along.finish(frame, layer);
-        finish(&path, radiance, (denoised_alpha.or(alpha), lights), model, report)
+        let done = finish(&path, radiance, (denoised_alpha.or(alpha), lights), model, report)?;
+        Ok(Denoised { error, ..done })
     })
 }
 
@@ -266,7 +281,7 @@ pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Plan
     model.check(&shot.passes)?;
     let mut report = Report::default();
     rayon::scope(|_| {
-        let radiance = run(shot, &mut [], model, options, &mut report)?;
+        let (radiance, _) = run(shot, &mut [], model, options, &mut report)?;
         finite(radiance, model.name(), &shot.passes.path, &mut report)
     })
 }
@@ -306,11 +321,11 @@ pub(super) fn run(
     model: &dyn Denoiser,
     options: &Options,
     report: &mut Report,
-) -> Result<Planes> {
+) -> Result<(Planes, Option<ExpectedError>)> {
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
-    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_along(shot, along, options.tile);
-    let radiance =
+    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_expecting(shot, along, options.tile);
+    let (radiance, error) =
         if shot.wraps { wrap::joined(shot, companions, denoise)? } else { denoise(shot, companions)? };
     report.seconds += start.elapsed().as_secs_f64();
     let size = (shot.passes.width, shot.passes.height);
@@ -320,7 +335,7 @@ pub(super) fn run(
             format!("model {} returned an image of the wrong size; choose another model", model.name()),
         ));
     }
-    Ok(radiance)
+    Ok((radiance, error))
 }
 
 /// What is stored of the view of a file: radiance, alpha, and light passes.
@@ -338,7 +353,7 @@ pub(super) fn finish(
     let radiance = useful(radiance)?;
     let lights = lights.into_iter().map(|(source, light)| Ok((source, useful(light)?)));
     let lights = lights.collect::<Result<_>>()?;
-    Ok(Denoised { radiance, alpha, lights })
+    Ok(Denoised { radiance, alpha, lights, error: None })
 }
 
 /// Whatever a model returns, what is written is finite.
@@ -384,7 +399,9 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
 /// As [`store`].
 pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<(Frame, Report)> {
     let Views { mut frame, views, mut report } = denoised;
-    for (layer, Denoised { radiance, alpha, lights }) in &views {
+    let errors: Vec<f64> = views.iter().filter_map(|(_, view)| Some(view.error.as_ref()?.mean())).collect();
+    report.expected_error = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
+    for (layer, Denoised { radiance, alpha, lights, error }) in &views {
         let beauty = (&layer.passes[&Pass::Combined], COMBINED, radiance, alpha.as_ref());
         let lights = lights.iter().map(|(source, light)| {
             let at = source.channels(layer);
@@ -395,6 +412,18 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
                 let part = frame.parts()[at.part].name.clone();
                 let what = part.map_or("all channels".into(), |n| format!("part '{n}'"));
                 report.notes.push(format!("{what}: {recoded}"));
+            }
+        }
+        let at = beauty.0;
+        if let Some(error) = error {
+            frame.set_expected_error(at.part, &view_name(layer), error.mean());
+            let name = layer_name(&layer.name, &error_layer(options));
+            // One that an earlier result had would not be true of this one.
+            if options.confidence || frame.is_own_layer(&name) {
+                let values = error.plane();
+                let channel =
+                    NewChannel { component: "X", kind: SampleKind::Float, values: values.channel(0) };
+                frame.set_layer(at.part, &name, layer.view.as_deref(), &[channel])?;
             }
         }
     }
@@ -447,6 +476,19 @@ fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
     match pass {
         COMBINED => layer_name(&layer.name, added),
         _ => layer_name(&layer.name, &format!("{pass}.{added}")),
+    }
+}
+
+/// The name of the layer that tells how far off a result is expected to be.
+fn error_layer(options: &Options) -> String {
+    format!("{} Error", options.layer.as_deref().unwrap_or(COMBINED))
+}
+
+/// The name of a view layer, and of its stereo view.
+fn view_name(layer: &Layer) -> String {
+    match &layer.view {
+        None => layer.name.clone(),
+        Some(view) => layer_name(&layer.name, view),
     }
 }
 
@@ -508,6 +550,9 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
         lights.iter().filter_map(|pass| layer.passes.get(pass)).chain(layer.light_groups.values());
     if options.passes && !lights.any(is_own) {
         return lacks("denoised light passes");
+    }
+    if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
+        return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
     }
     let Some(write) = options.preview else { return Ok(()) };
     let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));

@@ -1,7 +1,10 @@
 //! Frames whose left and right edges meet, as those of an all-round panorama do: each edge is denoised with what lies beyond
 //! the other, so that no seam shows where a viewer joins them.
 
-use crate::{Result, companion::Companion, frame::Frame, passes::PassSet, planes::Planes, shot::Shot};
+use crate::{
+    Result, companion::Companion, frame::Frame, models::ExpectedError, passes::PassSet, planes::Planes,
+    shot::Shot,
+};
 
 /// Whether the left and the right edge of a frame meet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -37,8 +40,8 @@ const MARGIN: usize = 256;
 pub(super) fn joined(
     shot: &Shot,
     companions: &mut [Companion],
-    run: impl FnOnce(&Shot, &mut [Companion]) -> Result<Planes>,
-) -> Result<Planes> {
+    run: impl FnOnce(&Shot, &mut [Companion]) -> Result<(Planes, Option<ExpectedError>)>,
+) -> Result<(Planes, Option<ExpectedError>)> {
     let widened = |set: &PassSet| set.map((set.width + 2 * MARGIN, set.height), |_, planes| widen(planes));
     let mut wide = Shot::new(widened(&shot.passes));
     wide.halves = shot.halves.as_ref().map(|halves| halves.each_ref().map(widened));
@@ -46,11 +49,11 @@ pub(super) fn joined(
     for companion in &mut *companions {
         companion.planes = widen(&companion.planes);
     }
-    let radiance = run(&wide, companions)?;
+    let (radiance, error) = run(&wide, companions)?;
     for Companion { planes, rendered, .. } in companions {
         [planes, rendered].into_iter().for_each(|planes| *planes = narrow(planes));
     }
-    Ok(narrow(&radiance))
+    Ok((narrow(&radiance), error.map(|error| error.without_margins(MARGIN))))
 }
 
 /// Goes on at either edge with what lies beyond the other.

@@ -35,8 +35,10 @@ pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 /// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is
 /// replaced.
 const MARK: &str = "demc";
+/// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its view layer.
+const EXPECTED_ERROR: &str = "demcExpectedError";
 /// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
-const OWN: [&str; 5] = [MARK, "name", "preview", "chunkCount", "idManifest"];
+const OWN: [&str; 6] = [MARK, EXPECTED_ERROR, "name", "preview", "chunkCount", "idManifest"];
 /// What a part without a name is called in a file of several, which must have one.
 const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
@@ -73,6 +75,16 @@ impl fmt::Display for Recoded {
 
 /// Channels by full name, bound for one part.
 type Named<'a> = Vec<(String, NewChannel<'a>)>;
+
+/// What [`Frame::set_expected_error`] noted in a part.
+fn expected_errors(attributes: &Attributes) -> Vec<(String, f64)> {
+    let text = attributes.text(EXPECTED_ERROR).unwrap_or_default();
+    let read = |line: &str| {
+        let (error, name) = line.split_once(' ')?;
+        Some((name.to_owned(), error.parse().ok()?))
+    };
+    text.lines().filter_map(read).collect()
+}
 
 impl Frame {
     /// Adds the layer `name` (such as `ViewLayer.Denoised`) with the data window of the part `beside`,
@@ -118,6 +130,22 @@ impl Frame {
         };
         self.mark(part, name);
         Ok(recoded)
+    }
+
+    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one), whose beauty is
+    /// in a part.
+    pub fn set_expected_error(&mut self, part: usize, view_layer: &str, error: f64) {
+        let attributes = &mut self.stored[part].attributes;
+        let mut errors = expected_errors(attributes);
+        errors.retain(|(name, _)| name != view_layer);
+        errors.push((view_layer.into(), error));
+        let lines: Vec<String> = errors.iter().map(|(name, error)| format!("{error:.3e} {name}")).collect();
+        attributes.set_text(EXPECTED_ERROR, &lines.join("\n"));
+    }
+
+    /// The view layers whose results note their expected RelMSE, and that.
+    pub fn expected_errors(&self) -> Vec<(String, f64)> {
+        self.stored.iter().flat_map(|stored| expected_errors(&stored.attributes)).collect()
     }
 
     /// Lists a layer among those that demc made.

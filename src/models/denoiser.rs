@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use super::ExpectedError;
 use crate::{
     Error, Result,
     companion::Companion,
@@ -87,6 +88,24 @@ pub trait Denoiser: Send + Sync {
     ) -> Result<Planes> {
         refuse_companions(self.name(), companions)?;
         self.denoise_tiled(shot, tile)
+    }
+
+    /// As [`Denoiser::denoise_along`], and how far off the result is expected to be, where the method can tell.
+    ///
+    /// # Errors
+    /// As [`Denoiser::denoise_along`].
+    fn denoise_expecting(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<(Planes, Option<ExpectedError>)> {
+        Ok((self.denoise_along(shot, companions, tile)?, None))
+    }
+
+    /// Whether it tells that.
+    fn expects_errors(&self) -> bool {
+        false
     }
 
     /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own

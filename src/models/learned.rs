@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{
-    Denoiser,
+    Denoiser, ExpectedError,
     denoiser::refuse_companions,
     network::{Architecture, Network},
     weights_file::{self, Metadata},
@@ -14,7 +14,7 @@ use crate::{
     companion::{Companion, Kind},
     error::remedy,
     features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
-    filters::shrinkage::{Render, shrink, take_back},
+    filters::shrinkage::{Render, shrink, shrink_expecting, take_back},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -182,49 +182,77 @@ impl Denoiser for Learned {
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
-        let passes = &shot.passes;
-        if self.metadata.network.architecture != Architecture::Pyramid {
-            refuse_companions(&self.name, companions)?;
-            return self.network.infer(passes, tile);
-        }
-        let (place, size) = rendered(passes);
-        let whole = (passes.width, passes.height);
-        if size == whole {
-            return self.restrained(passes, companions, tile);
-        }
-        companions.iter_mut().for_each(|companion| companion.planes = companion.planes.window(place, size));
-        let part = self.restrained(&passes.window(place, size), companions, tile)?;
-        companions
-            .iter_mut()
-            .for_each(|companion| companion.planes = companion.planes.placed_in(whole, place));
-        Ok(part.placed_in(whole, place))
+        Ok(self.denoise_rendered(shot, companions, tile, false)?.0)
+    }
+
+    fn expects_errors(&self) -> bool {
+        self.metadata.network.architecture == Architecture::Pyramid
+    }
+
+    fn denoise_expecting(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<(Planes, Option<ExpectedError>)> {
+        self.denoise_rendered(shot, companions, tile, true)
     }
 }
 
 impl Learned {
+    /// The part of a frame that was rendered, denoised in its place; with the error to be expected if it `expects` one.
+    fn denoise_rendered(
+        &self,
+        shot: &Shot,
+        companions: &mut [Companion],
+        tile: Option<usize>,
+        expects: bool,
+    ) -> Result<(Planes, Option<ExpectedError>)> {
+        let passes = &shot.passes;
+        if self.metadata.network.architecture != Architecture::Pyramid {
+            refuse_companions(&self.name, companions)?;
+            return Ok((self.network.infer(passes, tile)?, None));
+        }
+        let (place, size) = rendered(passes);
+        let whole = (passes.width, passes.height);
+        if size == whole {
+            return self.restrained(passes, companions, tile, expects);
+        }
+        companions.iter_mut().for_each(|companion| companion.planes = companion.planes.window(place, size));
+        let (part, error) = self.restrained(&passes.window(place, size), companions, tile, expects)?;
+        companions
+            .iter_mut()
+            .for_each(|companion| companion.planes = companion.planes.placed_in(whole, place));
+        Ok((part.placed_in(whole, place), error.map(|error| error.placed_in(whole, place))))
+    }
+
     /// What the network makes of a frame, and no more of it than there was noise.
     fn restrained(
         &self,
         passes: &PassSet,
         companions: &mut [Companion],
         tile: Option<usize>,
-    ) -> Result<Planes> {
+        expects: bool,
+    ) -> Result<(Planes, Option<ExpectedError>)> {
         let passes = &*with_stand_ins(passes);
         let mut image = self.looks(passes, companions, tile)?;
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
         let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
-        if companions.is_empty() {
-            shrink(&mut image, &render, None);
-            return Ok(image);
+        let size = (image.width, image.height);
+        let mut shares = (!companions.is_empty()).then(|| Planes::unwritten(1, size.0, size.1));
+        let error = if expects {
+            let squares = shrink_expecting(&mut image, &render, shares.as_mut());
+            Some(ExpectedError::new(squares, size))
+        } else {
+            shrink(&mut image, &render, shares.as_mut());
+            None
+        };
+        for (companion, shares) in companions.iter_mut().zip(shares.iter().cycle()) {
+            take_back(&mut companion.planes, &std::mem::take(&mut companion.rendered), shares);
         }
-        let mut shares = Planes::unwritten(1, image.width, image.height);
-        shrink(&mut image, &render, Some(&mut shares));
-        for companion in companions {
-            take_back(&mut companion.planes, &std::mem::take(&mut companion.rendered), &shares);
-        }
-        Ok(image)
+        Ok((image, error))
     }
 
     /// What the network makes of a frame, all of it: see [`shrink`].

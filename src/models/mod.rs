@@ -3,6 +3,7 @@
 pub mod catalogue;
 pub mod demc;
 mod denoiser;
+mod expected_error;
 pub mod kpcn;
 pub mod lbf;
 pub mod learned;
@@ -15,6 +16,7 @@ pub mod weights_file;
 use std::path::Path;
 
 pub use denoiser::{Denoiser, Run};
+pub use expected_error::ExpectedError;
 
 use network::{Architecture, Config, Design, Network};
 

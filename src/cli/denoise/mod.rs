@@ -19,13 +19,14 @@ use progress::{Progress, Style};
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::{
     inputs::{self, Inputs, Search},
+    ranking::{Ranking, parse_wish},
     sources::{GuideFiles, Names},
     stop,
 };
 use crate::{
     Error, Result,
     denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, Wrap, preview},
-    frame::prepare_folder,
+    frame::{Frame, prepare_folder},
     models,
 };
 
@@ -117,6 +118,17 @@ pub struct Args {
     #[arg(long)]
     passes: bool,
 
+    /// Add a layer that tells how far off each pixel is expected to be: `<layer> Error`, the squared error relative to the
+    /// squared light, which RelMSE is the mean of
+    #[arg(long)]
+    confidence: bool,
+
+    /// List the frames by their expected RelMSE at the end, the worst first; with a number, also how many samples those above
+    /// it want
+    #[arg(long, value_name = "RELMSE", num_args = 0..=1, value_parser = parse_wish, conflicts_with_all = ["json", "temporal"])]
+    #[allow(clippy::option_option, reason = "not at all, the list, what is wanted besides")]
+    report: Option<Option<f64>>,
+
     #[command(flatten)]
     names: Names,
 
@@ -171,6 +183,13 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let is_one = matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
     let sources = args.guides.sources(&args.names, is_one)?;
     let model = models::open(&args.model)?;
+    if args.report.is_some() && !model.expects_errors() {
+        let model = model.name();
+        return Err(Error::Usage(format!(
+            "{model} does not tell how far off it is; --report takes demc-s, demc-m or demc-l"
+        )));
+    }
+    let mut ranking = args.report.map(Ranking::new);
     prepare_folder(&args.out)?;
     if let Work::List { jobs, .. } = &work {
         let folders: BTreeSet<&Path> = jobs.iter().filter_map(|job| job.output.parent()).collect();
@@ -191,6 +210,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         },
         sources,
         passes: args.passes,
+        confidence: args.confidence,
         wrap: match args.wrap {
             WrapChoice::Auto => Wrap::Auto,
             WrapChoice::X => Wrap::X,
@@ -226,13 +246,37 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let batch = batch.at_once(args.jobs.into());
     let stopper = batch.stopper();
     stop::on_request(move || stopper.stop())?;
-    let end = batch.run(|job, outcome| progress.report(job, outcome));
+    let end = batch.run(|job, outcome| {
+        progress.report(job, outcome);
+        if let Some(ranking) = &mut ranking {
+            rank(ranking, job, outcome);
+        }
+    });
     let failed = progress.finish(end == End::Stopped);
+    if let Some(ranking) = ranking {
+        ranking.print();
+    }
     Ok(match end {
         End::Stopped => ExitCode::from(stop::INTERRUPTED),
         End::Complete if failed > 0 => ExitCode::from(SOME_FAILED),
         End::Complete => ExitCode::SUCCESS,
     })
+}
+
+/// Adds a frame to the list of expected errors; what was there already has noted its own.
+fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
+    let (errors, samples): (Vec<f64>, _) = match outcome {
+        Outcome::Done(report) => (report.expected_error.into_iter().collect(), report.samples),
+        Outcome::Skipped => match Frame::read_headers(&job.output) {
+            Ok(result) => (result.expected_errors().into_iter().map(|(_, error)| error).collect(), None),
+            Err(_) => return,
+        },
+        Outcome::Failed(_) => return,
+    };
+    if !errors.is_empty() {
+        let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+        ranking.add(job.input.display().to_string(), mean, samples);
+    }
 }
 
 /// What there is to do.

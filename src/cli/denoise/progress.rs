@@ -60,6 +60,8 @@ struct Details<'a> {
     samples: Option<u32>,
     /// Whether Blender had denoised Combined, and its pass Noisy Image was taken.
     was_denoised: bool,
+    /// The result's expected RelMSE; null where the model does not tell.
+    expected_error: Option<f64>,
     seconds: f64,
     non_finite: &'a std::collections::BTreeMap<String, usize>,
     notes: &'a [String],
@@ -216,6 +218,7 @@ fn json_line(job: &Job, outcome: &Outcome) -> String {
             light_groups: &r.light_groups,
             samples: r.samples,
             was_denoised: r.was_denoised,
+            expected_error: r.expected_error,
             seconds: r.seconds,
             non_finite: &r.repaired,
             notes: &r.notes,

@@ -24,11 +24,19 @@ pub struct FileReport {
     pub layout: &'static str,
     pub parts: Vec<PartReport>,
     pub layers: Vec<LayerReport>,
+    /// The expected RelMSE of the results that it holds, where demc noted it, by view layer.
+    pub expected_errors: Vec<ExpectedError>,
     /// What is wrong with the file, or with the shot that it belongs to.
     pub findings: Vec<Finding>,
     /// The first view layer with a beauty, to be held against that of the frame that follows.
     #[serde(skip)]
     pub trace: Option<Trace>,
+}
+
+#[derive(Serialize)]
+pub struct ExpectedError {
+    pub view_layer: String,
+    pub relmse: f64,
 }
 
 #[derive(Serialize)]
@@ -132,6 +140,11 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
         layout: if frame.is_multi_part() { "multi-part" } else { "single-part" },
         parts: parts.collect(),
         layers: Vec::new(),
+        expected_errors: frame
+            .expected_errors()
+            .into_iter()
+            .map(|(view_layer, relmse)| ExpectedError { view_layer, relmse })
+            .collect(),
         findings: windows(&frame),
         trace: None,
     };

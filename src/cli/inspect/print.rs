@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::examine::{FileReport, LayerReport, ModelReport};
+use super::examine::{ExpectedError, FileReport, LayerReport, ModelReport};
 use crate::lint::Finding;
 
 /// The whole report; the caller ends the last line.
@@ -37,6 +37,9 @@ fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
         report.layout,
         kinds.join(" and ")
     )?;
+    for ExpectedError { view_layer, relmse } in &report.expected_errors {
+        writeln!(out, "  denoised '{view_layer}': expected RelMSE {relmse:.2e}")?;
+    }
     write_findings(out, "  ", &report.findings)?;
     report.layers.iter().try_for_each(|layer| write_layer(out, layer))
 }

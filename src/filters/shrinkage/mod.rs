@@ -10,21 +10,24 @@
 //! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred detail: with
 //!   its neighbours, with the detail that is left, and with that of the albedo.
 //!
-//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share (`perceptron`).
-//! Of a noisy frame all of `d` is taken.
+//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share (`restraint`).
+//! Of a noisy frame all of `d` is taken. By the same sums another one tells how far off the result is (`expected`).
 //!
 //! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing, and is kept.
 //! Of few samples, though, antialiasing is noise like any other: a gap of a blind before a bright sky is a quarter of the
 //! sky, or nothing.
 
+mod expected;
+mod features;
 mod perceptron;
+mod restraint;
 mod seen;
 mod sums;
 
 use rayon::prelude::*;
 
 use self::{
-    perceptron::OUTPUTS,
+    restraint::OUTPUTS,
     seen::{Seen, is_firefly},
     sums::LARGEST_RESIDUAL,
 };
@@ -86,15 +89,30 @@ pub struct Render<'a> {
 /// # Panics
 /// If sizes differ.
 pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) {
+    drop(shrink_by_sums(image, render, shares));
+}
+
+/// As [`shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the result, relative to the
+/// squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
+///
+/// # Panics
+/// If sizes differ.
+pub fn shrink_expecting(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) -> Planes {
+    let sums = shrink_by_sums(image, render, shares);
+    expected::errors(image, render, &sums)
+}
+
+/// Shrinks; returns the sums that it was done by.
+fn shrink_by_sums(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) -> Vec<f32> {
     check(image, render);
     if image.pixels() == 0 {
-        return;
+        return Vec::new();
     }
     let seen = Seen::of(render);
     let sums = sums::gather(image, render, &seen);
-    let judged = perceptron::judge(&sums, image.width.div_ceil(SQUARE), render);
-    drop(sums);
+    let judged = restraint::judge(&sums, image.width.div_ceil(SQUARE), render);
     mix(image, render, &seen, &judged, shares);
+    sums
 }
 
 /// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of pixels,
@@ -106,9 +124,11 @@ pub fn features(image: &Planes, render: &Render) -> Planes {
     check(image, render);
     let (squares, rows) = (image.width.div_ceil(SQUARE), image.height.div_ceil(SQUARE));
     let sums = sums::gather(image, render, &Seen::of(render));
-    let features = perceptron::features(&sums, squares, render);
-    let mut planes = Planes::new(perceptron::FEATURES, squares, rows);
-    for (row, features) in features.chunks(perceptron::FEATURES * squares).enumerate() {
+    let lines = features::FEATURES;
+    let of_rows =
+        features::each_row(&sums, squares, lines, render, |_, features, made| made.copy_from_slice(features));
+    let mut planes = Planes::new(lines, squares, rows);
+    for (row, features) in of_rows.chunks(lines * squares).enumerate() {
         for (plane, line) in planes.data.chunks_mut(squares * rows).zip(features.chunks(squares)) {
             plane[row * squares..][..squares].copy_from_slice(line);
         }
@@ -202,7 +222,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
 }
 
 /// The share of the render in a pixel whose light changes by so much if all of it is taken, by what was
-/// [judged](perceptron::judge) of the place; shares below `doubt` are none.
+/// [judged](restraint::judge) of the place; shares below `doubt` are none.
 fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32, doubt: f32) -> f32 {
     let own = change.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
     let unusual = (ln(own * own + OWN_FLOOR) - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE;

@@ -1,0 +1,184 @@
+"""Trains what tells how far off a denoised frame is: src/filters/shrinkage/expected.rs.
+
+    cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s, demc-l likewise)
+    python expected_error.py FEATURES/* --hold-out --out ../../src/filters/shrinkage/expected.safetensors
+
+With --hold-out it reports what it reaches on views that it did not see: the rank correlation with the true error over
+squares of 8x8 pixels, and for each tenth of them, ordered by what was expected, the true error over the expected one.
+
+What is learned is the mean of the squared error over squares of 4x4 pixels, relative to the reference's squared light: what
+is made least is the deviance of a gamma distribution, t / e + ln(e) for an error t and an expected e, which an e equal to the
+mean of t makes least however wide t is spread. The product of the differences to two references that share no noise is, in
+the mean, the squared error without their noise. So a pair is listed twice, the second time with `_b` after its scene's name
+and another reference; of a pair that is listed once, the reference as rendered and as it was denoised serve as two. Needs
+torch and safetensors.
+"""
+
+import argparse
+import glob
+import os
+import re
+import zlib
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file, save_file
+from torch import nn
+from torch.nn import functional as F
+
+# As in perceptron.rs, expected.rs and mod.rs beside it.
+SQUARE, HIDDEN, LEAK = 4, 24, 0.1
+FLOOR, BLACK, TINY, LARGEST_CHANGE, LEAST, MOST = 0.02, 0.001, 1e-8, 100.0, -14.0, 4.0
+WINDOW = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0])
+SAMPLES, KNOWN = 34, 35
+
+# Added to both errors: what is smaller counts as alike.
+SMALL = 2e-6
+BATCH, HELD_OUT = 32, 5
+
+
+def means(image, size=SQUARE):
+    """Means over squares, (C, H / size, W / size)."""
+    return F.avg_pool2d(torch.from_numpy(np.ascontiguousarray(image))[None], size)[0]
+
+
+def around(squares):
+    """Weighted means over 5x5 squares."""
+    kernel = (WINDOW[:, None] * WINDOW)[None, None]
+    total = lambda planes: F.conv2d(planes[None], kernel, padding=2)[0]
+    return total(squares) / total(torch.ones_like(squares))
+
+
+def read(folders):
+    """All frames as they were rendered: features (38, h, w), errors (1, h, w) and facts (scene, samples), each."""
+    paths = {}
+    for path in sorted(path for folder in folders for path in glob.glob(os.path.join(folder, "*_0.safetensors"))):
+        scene, again, samples = re.match(r"\d+_(.+?)(_b)?_(\d+)spp_0", os.path.basename(path)).groups()
+        paths.setdefault((os.path.dirname(path), scene, int(samples)), {})[bool(again)] = path
+    frames = []
+    for (_, scene, samples), of in paths.items():
+        tensors = load_file(of[False])
+        height, width = (size // (2 * SQUARE) * 2 * SQUARE for size in tensors["result"].shape[1:])
+        result, render, first, clean = (tensors[name][:, :height, :width] for name in ("result", "render", "truth", "clean"))
+        second = load_file(of[True])["truth"][:, :height, :width] if True in of else clean
+        exposure = tensors["facts"].flatten()[0]
+        floor = FLOOR / exposure
+        light = 0.5 * (first + second)
+        error = (result - first) * (result - second) / (light**2 + min(floor**2, BLACK))
+        change = ((render.clip(0) - result) / (result + floor)).mean(0, keepdims=True)
+        changed = means(np.minimum(change**2, LARGEST_CHANGE))
+        log = lambda planes: torch.log(planes + TINY)
+        features = torch.from_numpy(tensors["features"])[:, :height // SQUARE, :width // SQUARE]
+        features = torch.cat([features, log(changed), log(around(changed))])
+        frames.append((features.float(), means(error).mean(0, keepdim=True).float(), scene, samples))
+    return frames
+
+
+class Perceptron(nn.Module):
+    """What perceptron.rs computes, of standardised features: the logarithm of the error that is expected."""
+
+    def __init__(self, features):
+        super().__init__()
+        self.first, self.second, self.last = nn.Conv2d(features, HIDDEN, 1), nn.Conv2d(HIDDEN, HIDDEN, 1), nn.Conv2d(HIDDEN, 1, 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.constant_(self.last.bias, -6)
+
+    def forward(self, standard):
+        hidden = F.leaky_relu(self.second(F.leaky_relu(self.first(standard), LEAK)), LEAK)
+        return self.last(hidden).clamp(LEAST, MOST)
+
+
+def train(frames, steps, seed):
+    """The perceptron, and the mean and deviation of the features."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    features = torch.stack([frame[0] for frame in frames])
+    errors = torch.stack([frame[1] for frame in frames])
+    logs = torch.tensor([np.log2(frame[3]) for frame in frames]).float()
+    mean, deviation = features.mean((0, 2, 3)), features.std((0, 2, 3)) + 1e-3
+    for column, (m, d) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
+        mean[column], deviation[column] = m, d
+    model = Perceptron(features.shape[1])
+    optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
+    # Each number of samples is drawn as often as any other, however many frames it has.
+    of_count = {count: sum(frame[3] == count for frame in frames) for count in {frame[3] for frame in frames}}
+    weights = torch.tensor([1 / max(of_count[frame[3]], 20) for frame in frames])
+    for step in range(steps):
+        at = torch.multinomial(weights, BATCH, True, generator=generator)
+        seen = features[at].clone()
+        known = (torch.rand(BATCH, generator=generator) < 0.75).float()
+        blurred = (logs[at] + 0.4 * torch.randn(BATCH, generator=generator)).clamp_min(0)
+        seen[:, SAMPLES], seen[:, KNOWN] = (blurred * known).view(-1, 1, 1), known.view(-1, 1, 1)
+        expected = model((seen - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)).exp()
+        # Over squares of 8x8, by which it is judged; the largest ones count by their logarithm.
+        expected, error = (F.avg_pool2d(planes, 2) + SMALL for planes in (expected, errors[at]))
+        ratio = error / expected
+        ratio = torch.where(ratio > 30, 30 + 30 * torch.log(ratio.clamp_min(1) / 30), ratio).clamp_min(-3)
+        loss = (ratio + torch.log(expected)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+        if (step + 1) % 1000 == 0:
+            print(f"step {step + 1}: {loss.item():.3f}", flush=True)
+    return model, mean, deviation
+
+
+def ranks(values):
+    """The place of each value in their order."""
+    return np.argsort(np.argsort(values))
+
+
+def report(name, frames, model, mean, deviation):
+    """Prints how what is expected of frames goes with what is true."""
+    if not frames:
+        return
+    pairs = []
+    for features, error, _, samples in frames:
+        features = features.clone()
+        features[SAMPLES], features[KNOWN] = float(np.log2(samples)), 1.0
+        with torch.no_grad():
+            expected = model(((features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1))[None])[0].exp()
+        pairs.append([F.avg_pool2d(planes, 2).flatten().numpy() for planes in (expected, error)])
+    expected, error = (np.concatenate(part) for part in zip(*pairs))
+    correlate = lambda pair: np.corrcoef(*map(ranks, pair))[0, 1]
+    inside = np.nanmean([correlate(pair) for pair in pairs])
+    of_frames = np.log([pair[1].mean().clip(1e-7) / pair[0].mean() for pair in pairs]).std()
+    tenths = np.array_split(np.argsort(expected), 10)
+    factors = " ".join(f"{error[tenth].mean() / expected[tenth].mean():.2f}" for tenth in tenths)
+    print(f"{name}: {len(frames)} frames; rank {correlate((expected, error)):.3f}, within a frame {inside:.3f}; tenths {factors}; "
+          f"mean {error.mean():.5f} / {expected.mean():.5f}, of frames within e^{of_frames:.2f}")
+
+
+def main():
+    """Entry point of the script."""
+    parser = argparse.ArgumentParser(prog="expected_error.py", description="Trains how far off a result is expected to be.")
+    parser.add_argument("folders", nargs="+", help="what restraint_features.rs wrote, frames of one size")
+    parser.add_argument("--out", help="safetensors file to write")
+    parser.add_argument("--hold-out", action="store_true", help=f"leave one scene in {HELD_OUT} out, and report on those")
+    parser.add_argument("--test", nargs="+", default=[], help="folders of other frames to report on")
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    frames = read(options.folders)
+    is_held_out = lambda frame: options.hold_out and zlib.crc32(frame[2].encode()) % HELD_OUT == 0
+    chosen = [frame for frame in frames if not is_held_out(frame)]
+    trained = train(chosen, options.steps, options.seed)
+    for name, part in (("trained on", chosen), ("held out", [frame for frame in frames if is_held_out(frame)]),
+                       ("test", read(options.test))):
+        report(name, part, *trained)
+        for samples in sorted({frame[3] for frame in part}) if name != "trained on" else ():
+            report(f"  {samples} spp", [frame for frame in part if frame[3] == samples], *trained)
+    if options.out:
+        model, mean, deviation = trained
+        # The standardisation goes into the first layer.
+        flat = {name: value.detach().flatten(1) if value.dim() > 1 else value.detach() for name, value in model.state_dict().items()}
+        flat["first.weight"] = flat["first.weight"] / deviation
+        flat["first.bias"] = flat["first.bias"] - flat["first.weight"] @ mean
+        save_file({name: value.numpy().copy() for name, value in flat.items()}, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+//! Frames by how far off they are expected to be: which want more samples, and how many.
+
+use super::lines::print_line;
+use crate::{Error, Result};
+
+/// The RelMSE of a result falls with the samples of its render by this power of their number: what the built-in models reach
+/// on 41 generated views of 1 to 256 samples, in the median.
+const POWER: f64 = 0.5;
+
+/// Expected errors of frames.
+pub struct Ranking {
+    /// The RelMSE that frames should have.
+    wish: Option<f64>,
+    frames: Vec<Ranked>,
+}
+
+struct Ranked {
+    error: f64,
+    input: String,
+    samples: Option<u32>,
+}
+
+/// A RelMSE that is wished for, from the command line.
+///
+/// # Errors
+/// It is no positive number.
+pub fn parse_wish(text: &str) -> Result<f64> {
+    let wish: Option<f64> = text.parse().ok().filter(|wish: &f64| wish.is_finite() && *wish > 0.0);
+    wish.ok_or_else(|| Error::Usage("wants a RelMSE, such as 0.005".into()))
+}
+
+impl Ranking {
+    /// An empty one.
+    pub fn new(wish: Option<f64>) -> Self {
+        Self { wish, frames: Vec::new() }
+    }
+
+    /// Adds a frame by its file, the expected RelMSE of its result and the samples of its render.
+    pub fn add(&mut self, input: String, error: f64, samples: Option<u32>) {
+        self.frames.push(Ranked { error, input, samples });
+    }
+
+    /// Prints the frames, the worst first.
+    pub fn print(mut self) {
+        if self.frames.is_empty() {
+            print_line("no result tells how far off it is expected to be");
+            return;
+        }
+        print_line("expected RelMSE, the worst first:");
+        self.frames.sort_by(|a, b| b.error.total_cmp(&a.error).then_with(|| a.input.cmp(&b.input)));
+        for frame in &self.frames {
+            print_line(&format!("{:.2e}  {}{}", frame.error, frame.input, self.wanted(frame)));
+        }
+    }
+
+    /// How many samples a frame wants.
+    fn wanted(&self, frame: &Ranked) -> String {
+        let Some(wish) = self.wish.filter(|wish| frame.error > *wish) else { return String::new() };
+        let times = (frame.error / wish).powf(1.0 / POWER);
+        match frame.samples {
+            None => format!("  wants about {} times its samples", digits(times)),
+            Some(samples) => {
+                let wanted = digits(times * f64::from(samples));
+                format!("  {samples} samples, wants about {wanted}")
+            }
+        }
+    }
+}
+
+/// A number by its first two digits: more of it is not known.
+fn digits(number: f64) -> String {
+    let unit = 10f64.powf((number.log10().floor() - 1.0).max(0.0));
+    format!("{:.0}", (number / unit).ceil() * unit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_of_the_error_takes_four_times_the_samples() {
+        let ranking = Ranking::new(Some(0.01));
+        let wanted = |error, samples| ranking.wanted(&Ranked { error, input: String::new(), samples });
+        assert_eq!(wanted(0.02, Some(16)), "  16 samples, wants about 64");
+        assert_eq!(wanted(0.02, None), "  wants about 4 times its samples");
+        assert_eq!(wanted(0.01, Some(16)), "");
+        assert_eq!(wanted(0.0353, Some(100)), "  100 samples, wants about 1300");
+        assert_eq!(
+            Ranking::new(None).wanted(&Ranked { error: 9.0, input: String::new(), samples: None }),
+            ""
+        );
+    }
+
+    #[test]
+    fn a_wish_is_a_positive_number() {
+        assert_eq!(parse_wish("5e-3").ok(), Some(0.005));
+        for wrong in ["0", "-1", "inf", "nan", "low"] {
+            assert!(parse_wish(wrong).is_err(), "{wrong}");
+        }
+    }
+}

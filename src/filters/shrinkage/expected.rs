@@ -1,0 +1,101 @@
+//! How far off a result is expected to be, learned from results and their references.
+//!
+//! In: the sums over squares of pixels that the share of the render was told by, and what is left of the difference to the
+//! render. Out: the squared error to be expected in each square, relative to the squared light there. The perceptron was trained
+//! by `eval/training/expected_error.py` on results of the built-in models for frames of 1 to 256 samples.
+
+use std::sync::LazyLock;
+
+use rayon::prelude::*;
+
+use super::{
+    FLOOR, Render,
+    features::{FEATURES, TINY, WINDOWS, each_row},
+    perceptron::Perceptron,
+};
+use crate::{
+    filters::squares::{self, SQUARE},
+    kernels::{exponential::exp, logarithm::ln},
+    metrics::error::RELMSE_EPSILON,
+    planes::Planes,
+};
+
+/// What is read besides: the logarithm of the mean squared change that is left, of a square and around it.
+const INPUTS: usize = FEATURES + 2;
+
+/// Relative squared changes are cut at this.
+const LARGEST_CHANGE: f32 = 100.0;
+
+/// Logarithms of the least and the largest error that is expected.
+const LEAST: f32 = -14.0;
+const MOST: f32 = 4.0;
+
+static PERCEPTRON: LazyLock<Perceptron> =
+    LazyLock::new(|| Perceptron::read(include_bytes!("expected.safetensors"), INPUTS, 1));
+
+/// The squared error to be expected in each square of pixels, (1, H / 4, W / 4) rounded up: what RelMSE is the mean of.
+pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
+    let squares = result.width.div_ceil(SQUARE);
+    if result.pixels() == 0 {
+        return Planes::new(1, squares, result.height.div_ceil(SQUARE));
+    }
+    let of_squares = changes(result, render);
+    let window = WINDOWS[1];
+    let rows: Vec<&[f32]> = of_squares.chunks(3 * squares).map(|row| &row[..2 * squares]).collect();
+    let errors = each_row(sums, squares, 1, render, |row, features, error| {
+        let lines = window.iter().enumerate().filter_map(|(tap, weight)| {
+            Some((*weight, *rows.get((row + tap).checked_sub(window.len() / 2)?)?))
+        });
+        let (mut of_rows, mut around) = (vec![0.0; 2 * squares], vec![0.0; 2 * squares]);
+        squares::around(lines, squares, window, &mut of_rows, &mut around);
+        let mut inputs = vec![0.0; INPUTS * squares];
+        inputs[..FEATURES * squares].copy_from_slice(features);
+        let (own, near) = inputs[FEATURES * squares..].split_at_mut(squares);
+        own.iter_mut().zip(rows[row]).for_each(|(log, change)| *log = ln(change + TINY));
+        let (changes, weights) = around.split_at(squares);
+        let means = changes.iter().zip(weights).map(|(sum, weight)| sum / weight);
+        near.iter_mut().zip(means).for_each(|(log, change)| *log = ln(change + TINY));
+        PERCEPTRON.apply(&inputs, squares, error);
+        let units = &of_squares[(3 * row + 2) * squares..][..squares];
+        error.iter_mut().zip(units).for_each(|(v, unit)| *v = exp(v.clamp(LEAST, MOST)) * unit);
+    });
+    Planes::from_vec(1, squares, rows.len(), errors)
+}
+
+/// Three lines of each row of squares: the mean squared change that is left between render and result, relative; ones; and what
+/// an error is multiplied by to be what RelMSE is the mean of. The perceptron knows the frame's exposure and not its
+/// brightness, and dark frames err relative to less light.
+fn changes(result: &Planes, render: &Render) -> Vec<f32> {
+    let (width, height) = (result.width, result.height);
+    let squares = width.div_ceil(SQUARE);
+    let floor = FLOOR / render.exposure;
+    let least = (floor * floor).min(RELMSE_EPSILON as f32);
+    let mut lines = vec![0.0; height.div_ceil(SQUARE) * 3 * squares];
+    lines.par_chunks_mut(3 * squares).enumerate().for_each(|(row, lines)| {
+        let (changes, rest) = lines.split_at_mut(squares);
+        let (ones, units) = rest.split_at_mut(squares);
+        ones.fill(1.0);
+        let rows = row * SQUARE..((row + 1) * SQUARE).min(height);
+        for y in rows.clone() {
+            let [noisy, clean] = [render.radiance, result]
+                .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+            for x in 0..width {
+                let change: f32 =
+                    (0..3).map(|c| (noisy[c][x].max(0.0) - clean[c][x]) / (clean[c][x] + floor)).sum::<f32>()
+                        / 3.0;
+                let unit: f32 = (0..3)
+                    .map(|c| clean[c][x] * clean[c][x])
+                    .map(|square| (square + least) / (square + RELMSE_EPSILON as f32))
+                    .sum();
+                changes[x / SQUARE] += (change * change).min(LARGEST_CHANGE);
+                units[x / SQUARE] += unit / 3.0;
+            }
+        }
+        for (square, (change, unit)) in changes.iter_mut().zip(units).enumerate() {
+            let pixels = rows.len() * (width - square * SQUARE).min(SQUARE);
+            *change /= pixels as f32;
+            *unit /= pixels as f32;
+        }
+    });
+    lines
+}

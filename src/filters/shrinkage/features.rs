@@ -1,0 +1,108 @@
+//! What is read of the sums over squares of pixels, for the [perceptrons](super::perceptron) that judge by it: logarithms of mean
+//! squares and correlations, over three neighbourhoods of the square.
+
+use rayon::prelude::*;
+
+use super::{
+    Render,
+    sums::{BY_DETAIL, COUNT, CUT, DETAIL, LIGHT, NEXT, NOISE, RESIDUAL, SUMS},
+};
+use crate::{
+    filters::squares,
+    kernels::{
+        logarithm::ln,
+        vectorised::{self, Vectorised},
+    },
+};
+
+/// Binomial weights of the squares of each neighbourhood.
+pub const WINDOWS: [&[f32]; 3] =
+    [&[1.0, 2.0, 1.0], &[1.0, 4.0, 6.0, 4.0, 1.0], &[1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]];
+
+/// What is read of each neighbourhood, and in all: besides these the brightness of the place, the logarithm to base 2 of
+/// the number of samples, and whether it is known.
+const OF_WINDOW: usize = 11;
+pub const FEATURES: usize = WINDOWS.len() * OF_WINDOW + 3;
+
+/// Added before logarithms, and to what is divided by.
+pub const TINY: f32 = 1e-8;
+
+/// Exposed radiance that is added before the brightness's logarithm.
+const BLACK: f32 = 0.02;
+
+/// What `make` makes of every row of squares, given its number and its features, [`FEATURES`] lines: so many lines each.
+pub fn each_row(
+    sums: &[f32],
+    squares: usize,
+    lines: usize,
+    render: &Render,
+    make: impl Fn(usize, &[f32], &mut [f32]) + Sync,
+) -> Vec<f32> {
+    let sums: Vec<&[f32]> = sums.chunks(SUMS * squares).collect();
+    let mut made = vec![0.0; sums.len() * lines * squares];
+    let memory = || (vec![0.0; SUMS * squares], vec![0.0; SUMS * squares], vec![0.0; FEATURES * squares]);
+    made.par_chunks_mut(lines * squares).enumerate().for_each_init(
+        memory,
+        |(of_rows, around, features), (row, made)| {
+            let (of_windows, of_frame) = features.split_at_mut(WINDOWS.len() * OF_WINDOW * squares);
+            for (place, (window, features)) in
+                WINDOWS.iter().zip(of_windows.chunks_exact_mut(OF_WINDOW * squares)).enumerate()
+            {
+                let lines = window.iter().enumerate().filter_map(|(tap, weight)| {
+                    Some((*weight, *sums.get((row + tap).checked_sub(window.len() / 2)?)?))
+                });
+                squares::around(lines, squares, window, of_rows, around);
+                vectorised::run(Describe { sums: around, features, squares });
+                if place == 0 {
+                    let light = around[LIGHT * squares..].iter().zip(&around[COUNT * squares..]);
+                    let brightness = |(sum, count): (&f32, &f32)| ln(sum / count * render.exposure + BLACK);
+                    of_frame.iter_mut().zip(light).take(squares).for_each(|(v, of)| *v = brightness(of));
+                }
+            }
+            let samples = render.samples.map_or(0.0, |samples| (samples.max(1) as f32).log2());
+            of_frame[squares..2 * squares].fill(samples);
+            of_frame[2 * squares..].fill(if render.samples.is_some() { 1.0 } else { 0.0 });
+            make(row, features, made);
+        },
+    );
+    made
+}
+
+/// Makes features of the sums over a neighbourhood: logarithms of mean squares, and correlations.
+struct Describe<'a> {
+    sums: &'a [f32],
+    /// [`OF_WINDOW`] lines.
+    features: &'a mut [f32],
+    squares: usize,
+}
+
+impl Vectorised for Describe<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { sums, features, squares } = self;
+        for s in 0..squares {
+            let per_pixel = 1.0 / sums[COUNT * squares + s];
+            let mean = |line: usize| sums[line * squares + s] * per_pixel;
+            let level = |line: usize| ln(mean(line).max(0.0) + TINY);
+            let residual = mean(RESIDUAL);
+            let share = |line: usize| mean(line) / (residual + TINY);
+            let alike = |line: usize, with: usize| {
+                mean(line) / (mean(with) * residual + TINY * TINY).max(f32::MIN_POSITIVE).sqrt()
+            };
+            let described: [f32; OF_WINDOW] = [
+                level(RESIDUAL),
+                level(NOISE[0]),
+                level(NOISE[1]),
+                level(CUT),
+                level(DETAIL[0]),
+                level(DETAIL[1]),
+                share(NEXT[0]),
+                share(NEXT[1]),
+                share(BY_DETAIL[2]),
+                alike(BY_DETAIL[0], DETAIL[0]),
+                alike(BY_DETAIL[1], DETAIL[1]),
+            ];
+            described.into_iter().enumerate().for_each(|(line, v)| features[line * squares + s] = v);
+        }
+    }
+}

@@ -1,0 +1,215 @@
+//! What demc says of its own results: how far off each pixel is expected to be, which frames want more samples.
+//!
+//! The frames were never trained on: a house at 4 samples, and a corner of another scene at 64.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{
+    demc,
+    files::{data, read_exr, samples, values},
+};
+use demc::{
+    metrics::error::relative_squared_error,
+    passes::{self, Pass},
+};
+use exr::prelude::FlatSamples;
+use predicates::{prelude::*, str::contains};
+use serde_json::Value;
+
+/// Pixels to each side of the blocks over which errors are compared.
+const BLOCK: usize = 8;
+
+/// A squared relative error that is none: what a frame without noise must come back within.
+const NO_ERROR: f64 = 1e-4;
+
+fn kept_frames() -> [(PathBuf, PathBuf); 2] {
+    let example = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example").join(name);
+    let pair = |name: &str| data("no_harm").join(name);
+    [
+        (example("house_0004spp.exr"), example("house_ref.exr")),
+        (pair("principled_0064spp.exr"), pair("principled_ref.exr")),
+    ]
+}
+
+/// Means over blocks of a plane of `width` columns.
+fn blocks(values: &[f64], width: usize) -> Vec<f64> {
+    let height = values.len() / width;
+    let mut means = Vec::new();
+    for y in (0..height / BLOCK * BLOCK).step_by(BLOCK) {
+        for x in (0..width / BLOCK * BLOCK).step_by(BLOCK) {
+            let rows = (y..y + BLOCK).flat_map(|y| &values[y * width + x..][..BLOCK]);
+            means.push(rows.sum::<f64>() / (BLOCK * BLOCK) as f64);
+        }
+    }
+    means
+}
+
+/// The place of each value in their order.
+fn ranks(values: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|a, b| values[*a].total_cmp(&values[*b]));
+    let mut ranks = vec![0.0; values.len()];
+    order.into_iter().enumerate().for_each(|(rank, at)| ranks[at] = rank as f64);
+    ranks
+}
+
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let n = a.len() as f64;
+    let [mean_a, mean_b] = [a, b].map(|values| values.iter().sum::<f64>() / n);
+    let product =
+        |x: &[f64], y: &[f64], (mx, my)| -> f64 { x.iter().zip(y).map(|(x, y)| (x - mx) * (y - my)).sum() };
+    product(a, b, (mean_a, mean_b))
+        / (product(a, a, (mean_a, mean_a)) * product(b, b, (mean_b, mean_b))).sqrt()
+}
+
+/// Denoises with `--confidence`; returns the result and what `--json` says of it.
+fn denoise(input: &Path, out: &Path, model: &str) -> (PathBuf, Value) {
+    let output = demc()
+        .args(["denoise", "--confidence", "--json", "--model", model])
+        .arg(input)
+        .arg("--out")
+        .arg(out)
+        .output();
+    let output = output.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    (out.join(input.file_name().unwrap()), serde_json::from_slice(&output.stdout).unwrap())
+}
+
+#[test]
+fn what_is_expected_goes_with_what_is_true() {
+    let dir = tempfile::tempdir().unwrap();
+    for model in ["demc-s", "demc-m", "demc-l"] {
+        let (mut expected, mut true_errors) = (Vec::new(), Vec::new());
+        for (noisy, reference) in kept_frames() {
+            let (result, _) = denoise(&noisy, &dir.path().join(model), model);
+            let image = read_exr(&result);
+            let width = image.layer_data[0].size.width();
+            let layer = values(&image, "ViewLayer.Denoised Error.X");
+            assert!(matches!(samples(&image, "ViewLayer.Denoised Error.X"), Some(FlatSamples::F32(_))));
+            let reference = passes::load(&reference, None).unwrap();
+            let reference = reference.get(Pass::Combined).unwrap();
+            let mut errors = vec![0.0; layer.len()];
+            for (c, name) in ["R", "G", "B"].into_iter().enumerate() {
+                let denoised = values(&image, &format!("ViewLayer.Denoised.{name}"));
+                for (error, (x, r)) in errors.iter_mut().zip(denoised.iter().zip(reference.channel(c))) {
+                    *error += relative_squared_error(f64::from(*x), f64::from(*r)) / 3.0;
+                }
+            }
+            let layer: Vec<f64> = layer.into_iter().map(f64::from).collect();
+            expected.extend(blocks(&layer, width));
+            true_errors.extend(blocks(&errors, width));
+        }
+        let rank = correlation(&ranks(&expected), &ranks(&true_errors));
+        let mut order: Vec<usize> = (0..expected.len()).collect();
+        order.sort_by(|a, b| expected[*a].total_cmp(&expected[*b]));
+        let sum = |values: &[f64], at: &[usize]| at.iter().map(|at| values[*at] + NO_ERROR).sum::<f64>();
+        let tenths = order.chunks(order.len().div_ceil(10));
+        let factors: Vec<f64> = tenths.map(|at| sum(&true_errors, at) / sum(&expected, at)).collect();
+        eprintln!("{model}: rank {rank:.3}, true over expected {factors:.2?}");
+        assert!(rank >= 0.8, "{model}: {rank}");
+        for factor in &factors {
+            assert!((1.0 / 1.5..=1.5).contains(factor), "{model}: {factors:.2?}");
+        }
+    }
+}
+
+#[test]
+fn the_frame_s_mean_is_told_by_json_inspect_and_the_layer_alike() {
+    let dir = tempfile::tempdir().unwrap();
+    let (result, json) = denoise(&data("s0000_room_0004spp.exr"), dir.path(), "demc-s");
+    let told = json["expected_error"].as_f64().unwrap();
+    let layer = values(&read_exr(&result), "ViewLayer.Denoised Error.X");
+    let mean = layer.iter().map(|v| f64::from(*v)).sum::<f64>() / layer.len() as f64;
+    assert!(layer.iter().all(|v| *v > 0.0) && (mean / told - 1.0).abs() < 0.1, "{mean} beside {told}");
+    let inspected = demc().args(["inspect", "--json"]).arg(&result).output().unwrap();
+    let inspected: Value = serde_json::from_slice(&inspected.stdout).unwrap();
+    let report = inspected.as_array().map_or(&inspected, |files| &files[0]);
+    let noted = &report["expected_errors"][0];
+    assert_eq!(noted["view_layer"], "ViewLayer");
+    assert!((noted["relmse"].as_f64().unwrap() / told - 1.0).abs() < 1e-3);
+    demc()
+        .arg("inspect")
+        .arg(&result)
+        .assert()
+        .success()
+        .stdout(contains("denoised 'ViewLayer': expected RelMSE"));
+}
+
+#[test]
+fn a_finished_result_without_the_layer_is_not_taken_for_one_with_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = data("s0000_room_0004spp.exr");
+    let run =
+        |more: &[&str]| demc().arg("denoise").arg(&input).arg("--out").arg(dir.path()).args(more).assert();
+    run(&["--model", "demc-s"]).success();
+    run(&["--model", "demc-s", "--confidence"])
+        .code(1)
+        .stderr(contains("exists without 'ViewLayer.Denoised Error'"));
+    run(&["--model", "demc-s", "--confidence", "--overwrite"]).success();
+    run(&["--model", "demc-s", "--confidence"]).success().stdout(contains("is there already"));
+}
+
+#[test]
+fn frames_are_listed_by_what_is_expected_with_the_samples_they_want() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let inputs = kept_frames().map(|(noisy, _)| noisy);
+    let run = |more: &[&str]| {
+        let mut command = demc();
+        command
+            .args(["denoise", "--model", "demc-s"])
+            .args(&inputs)
+            .arg("--out")
+            .arg(&out)
+            .args(more)
+            .output()
+            .unwrap()
+    };
+    let listed = |text: &[u8]| {
+        let text = String::from_utf8_lossy(text).into_owned();
+        let after = text.split_once("the worst first:\n").unwrap_or_else(|| panic!("{text}")).1;
+        after.lines().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let lines = listed(&run(&["--report", "1e-6"]).stdout);
+    assert_eq!(lines.len(), 2);
+    let error = |line: &str| line.split(' ').next().unwrap().parse::<f64>().unwrap();
+    assert!(error(&lines[0]) >= error(&lines[1]), "{lines:?}");
+    assert!(
+        lines.iter().any(|line| line.contains("house") && line.contains("  4 samples, wants about")),
+        "{lines:?}"
+    );
+    // The same of results that are there already.
+    let again = listed(&run(&["--report"]).stdout);
+    assert_eq!(again.len(), 2);
+    assert!(
+        again.iter().zip(&lines).all(|(again, line)| line.starts_with(again.as_str())),
+        "{again:?}, {lines:?}"
+    );
+    // And of the lines of many tasks.
+    let log = dir.path().join("task.jsonl");
+    std::fs::write(&log, run(&["--json", "--overwrite"]).stdout).unwrap();
+    let report = demc().arg("report").arg(&log).args(["--by-error", "1e-6"]).output().unwrap();
+    assert_eq!(listed(&report.stdout), lines);
+}
+
+#[test]
+fn a_method_that_cannot_tell_says_so_before_any_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |more: &[&str]| {
+        demc()
+            .arg("denoise")
+            .arg(data("s0000_room_0004spp.exr"))
+            .arg("--out")
+            .arg(dir.path())
+            .args(more)
+            .assert()
+    };
+    for option in ["--confidence", "--report"] {
+        let does_not_tell = contains("noisy does not tell how far off it is");
+        run(&["--model", "noisy", option]).failure().stderr(does_not_tell.and(contains(option)));
+        run(&["--temporal", option]).failure().stderr(contains("--temporal"));
+    }
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+}
