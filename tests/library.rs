@@ -12,7 +12,7 @@ use demc::{
     Error, Result,
     denoise::{self, Batch, End, Job, Options, Outcome},
     models::{self, Denoiser},
-    passes::Pass,
+    passes::{Pass, PassSet},
     planes::Planes,
     shot::{self, Shot},
 };
@@ -143,4 +143,20 @@ fn a_panorama_has_no_seam() {
     };
     let (joined, apart) = (far(true), far(false));
     assert!(joined < 1e-3 && apart > 0.05, "{joined} where edges meet, {apart} where they do not");
+}
+
+#[test]
+fn a_frame_without_noise_stays_as_it_is_and_no_error_is_expected_of_it() {
+    let model = models::open("demc-s").unwrap();
+    let light = |i: usize| if i.is_multiple_of(7) { 3.0 + i as f32 / 100.0 } else { 0.25 };
+    let sky = Planes::from_vec(3, 37, 21, (0..3 * 37 * 21).map(light).collect());
+    for frame in [sky, Planes::new(3, 37, 21)] {
+        let mut passes = PassSet::new("frame.exr", "ViewLayer", frame.width, frame.height);
+        for pass in [Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+            passes.insert(pass, frame.clone());
+        }
+        let (result, error) = model.denoise_expecting(&Shot::new(passes), &mut [], None).unwrap();
+        assert!(result == frame, "it has changed");
+        assert_eq!(error.unwrap().mean(), 0.0);
+    }
 }

@@ -36,6 +36,9 @@ SAMPLES, KNOWN = 34, 35
 SMALL = 2e-6
 BATCH, HELD_OUT = 32, 5
 
+# A squared relative error that is none, added to both where their quotient is reported.
+NO_ERROR = 1e-4
+
 
 def means(image, size=SQUARE):
     """Means over squares, (C, H / size, W / size)."""
@@ -147,7 +150,7 @@ def report(name, frames, model, mean, deviation):
     inside = np.nanmean([correlate(pair) for pair in pairs])
     of_frames = np.log([pair[1].mean().clip(1e-7) / pair[0].mean() for pair in pairs]).std()
     tenths = np.array_split(np.argsort(expected), 10)
-    factors = " ".join(f"{error[tenth].mean() / expected[tenth].mean():.2f}" for tenth in tenths)
+    factors = " ".join(f"{(error[tenth].mean() + NO_ERROR) / (expected[tenth].mean() + NO_ERROR):.2f}" for tenth in tenths)
     print(f"{name}: {len(frames)} frames; rank {correlate((expected, error)):.3f}, within a frame {inside:.3f}; tenths {factors}; "
           f"mean {error.mean():.5f} / {expected.mean():.5f}, of frames within e^{of_frames:.2f}")
 

@@ -14,7 +14,8 @@ use crate::{
     companion::{Companion, Kind},
     error::remedy,
     features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
-    filters::shrinkage::{Render, shrink, shrink_expecting, take_back},
+    filters::shrinkage::{Render, is_kept_whole, shrink, shrink_expecting, take_back},
+    filters::squares::SQUARE,
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -235,12 +236,19 @@ impl Learned {
         expects: bool,
     ) -> Result<(Planes, Option<ExpectedError>)> {
         let passes = &*with_stand_ins(passes);
-        let mut image = self.looks(passes, companions, tile)?;
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
         let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
-        let size = (image.width, image.height);
+        let size = (passes.width, passes.height);
+        // A clear sky, a black frame: all would be taken back that a network made of it.
+        if is_kept_whole(&render) {
+            let squares = Planes::new(1, size.0.div_ceil(SQUARE), size.1.div_ceil(SQUARE));
+            let mut image = radiance.clone();
+            image.data.iter_mut().for_each(|v| *v = v.max(0.0));
+            return Ok((image, expects.then(|| ExpectedError::new(squares, size))));
+        }
+        let mut image = self.looks(passes, companions, tile)?;
         let mut shares = (!companions.is_empty()).then(|| Planes::unwritten(1, size.0, size.1));
         let error = if expects {
             let squares = shrink_expecting(&mut image, &render, shares.as_mut());

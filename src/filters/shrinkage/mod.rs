@@ -92,6 +92,12 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
     drop(shrink_by_sums(image, render, shares));
 }
 
+/// Whether a frame is nothing but light that the camera sees directly, or black: [`shrink`] keeps all of it, whatever was
+/// denoised.
+pub fn is_kept_whole(render: &Render) -> bool {
+    render.radiance.data.iter().all(|v| *v <= 0.0) || Seen::of(render).is_all()
+}
+
 /// As [`shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the result, relative to the
 /// squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
 ///
