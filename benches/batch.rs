@@ -8,8 +8,8 @@
 //! ```
 //! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
 //! repeated, each time at another brightness, until the frame is full (by default the example of this
-//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a random
-//! number, so that nothing compresses.
+//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a
+//! random number, so that nothing compresses.
 
 use std::{
     fs,
@@ -39,7 +39,8 @@ struct Options {
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those up first.
+    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
+    // up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut options = Options {
         only: None,
@@ -75,8 +76,8 @@ fn main() {
     }
 }
 
-/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every value by up to
-/// a share `noise` of it: pixels that do not compress are the worst for memory.
+/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every
+/// value by up to a share `noise` of it: pixels that do not compress are the worst for memory.
 fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {

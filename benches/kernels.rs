@@ -1,6 +1,6 @@
 //! GFLOP/s of the kernels beside the FMA peak of this machine: `cargo bench --bench kernels`.
-//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by squares, of the FLOPs of the convolution tap by tap.
-//! `DEMC_TIER=avx2` benches that tier.
+//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by squares, of the FLOPs of the convolution
+//! tap by tap. `DEMC_TIER=avx2` benches that tier.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,

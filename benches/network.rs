@@ -57,7 +57,8 @@ struct Options {
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those up first.
+    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
+    // up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut args = std::env::args().skip(1).filter(|a| a != "--bench");
     let mut options = Options { rounds: 5, small: false, words: Vec::new() };

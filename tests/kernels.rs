@@ -397,8 +397,8 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
             ((v.abs() * 255.0).round() - f32::from(zero)) * step
         })
         .collect();
-    // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that no other weight is
-    // rounded.
+    // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that
+    // no other weight is rounded.
     let adds = engine.adds_in_16_bits(geometry);
     let (largest, others) = if adds { (124.0, 31.0) } else { (127.0, 127.0) };
     let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];

@@ -1,6 +1,7 @@
 //! `demc report`: what the JSON lines of many `demc denoise --json` come to, on a farm one file a task.
 //!
-//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit status.
+//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit
+//! status.
 
 use std::{
     collections::BTreeMap,
@@ -27,8 +28,8 @@ pub struct Args {
     #[arg(required = true, value_name = "LOG")]
     logs: Vec<PathBuf>,
 
-    /// Also name those of these inputs (files, directories, quoted globs) that no task tells of, as one that was
-    /// killed does not
+    /// Also name those of these inputs (files, directories, quoted globs) that no task tells of, as one that
+    /// was killed does not
     #[arg(long, value_name = "INPUT", num_args = 1..)]
     of: Vec<PathBuf>,
 

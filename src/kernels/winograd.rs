@@ -1,12 +1,14 @@
 //! 3x3 convolutions by squares of 4x4 outputs, with a quarter of the multiplications.
 //!
-//! A square `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a kernel `g`, where `*`
-//! multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin and Gray 2016, F(4x4, 3x3); the
-//! points are 0, 1, -1, 2, -2 and infinity). Rows of `G` are taken times 24, 6, 6, 24, 24, 6 here, which leaves whole numbers, and
-//! what `A` then makes of sums is 9 x 2^k times the output.
+//! A square `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a
+//! kernel `g`, where `*` multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin
+//! and Gray 2016, F(4x4, 3x3); the points are 0, 1, -1, 2, -2 and infinity). Rows of `G` are taken times 24,
+//! 6, 6, 24, 24, 6 here, which leaves whole numbers, and what `A` then makes of sums is 9 x 2^k times the
+//! output.
 //!
-//! [`convolve`] does so in f32. Rounding then depends on where a square begins, so it serves training, not inference, whose
-//! results are the same to the bit however a frame is cut. In 8 bits nothing is rounded ([`super::narrow`]).
+//! [`convolve`] does so in f32. Rounding then depends on where a square begins, so it serves training, not
+//! inference, whose results are the same to the bit however a frame is cut. In 8 bits nothing is rounded
+//! ([`super::narrow`]).
 
 use std::num::Wrapping;
 
@@ -146,7 +148,8 @@ pub fn clear() {
     POINTS_FREE.clear();
 }
 
-/// Whether squares make a convolution of frames of so many columns faster: where there are few, weights are read for too few of them.
+/// Whether squares make a convolution of frames of so many columns faster: where there are few, weights are
+/// read for too few of them.
 pub fn serves(width: usize) -> bool {
     width >= 32
 }
@@ -229,7 +232,8 @@ struct Rows<'a> {
     y: usize,
 }
 
-/// An input plane: where the rows of the patches begin, those beyond the border nowhere, and how many of its lanes are in use.
+/// An input plane: where the rows of the patches begin, those beyond the border nowhere, and how many of its
+/// lanes are in use.
 struct Plane {
     rows: [Option<*const Block>; PATCH],
     lanes: usize,
@@ -250,7 +254,8 @@ impl Kernel for Rows<'_> {
                 planes.push(Plane { rows: std::array::from_fn(row), lanes: s.lanes(plane) });
             }
         }
-        // Points lie one value further apart than they need to, so that not all are in the same few sets of a cache.
+        // Points lie one value further apart than they need to, so that not all are in the same few sets of a
+        // cache.
         let (point, product) = (planes.len() * SQUARES + 1, OUTPUTS * SQUARES + 1);
         let mut points = POINTS_FREE.take(POINTS * point, Block::default());
         let mut products = POINTS_FREE.take(POINTS * product, Block::default());
@@ -365,7 +370,8 @@ impl Rows<'_> {
         }
     }
 
-    /// Makes outputs of a square's products, which lie `stride` blocks apart, and stores those that are pixels.
+    /// Makes outputs of a square's products, which lie `stride` blocks apart, and stores those that are
+    /// pixels.
     #[inline(always)]
     unsafe fn interpolate<S: Simd>(
         &self,
@@ -406,7 +412,8 @@ impl Rows<'_> {
     }
 }
 
-/// The products of `COUNT` squares at a point for `OUT` output planes, where points, weights and products begin.
+/// The products of `COUNT` squares at a point for `OUT` output planes, where points, weights and products
+/// begin.
 ///
 /// # Safety
 /// All of them can be read and written.

@@ -11,8 +11,8 @@ use crate::kernels::{
     narrow::Operand,
 };
 
-/// The gradient of one activation or field while the tape runs backward; `None` until something flows in. Nobody waits for the
-/// lock: it lets what has no tape go to another thread.
+/// The gradient of one activation or field while the tape runs backward; `None` until something flows in.
+/// Nobody waits for the lock: it lets what has no tape go to another thread.
 #[derive(Debug)]
 pub(super) struct Gradient<B>(Arc<Mutex<Option<B>>>);
 
@@ -194,7 +194,8 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         values.saved.data.view().data().iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
-    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a gradient.
+    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a
+    /// gradient.
     pub(super) fn output(data: Data, tape: T, learns: bool) -> (Self, Saved) {
         let saved = Saved { data: Arc::new(data), gradient: learns.then(Gradient::default) };
         (Self { saved: saved.clone(), tape }, saved)

@@ -106,7 +106,8 @@ impl Band<'_> {
         let accumulate = self.epilogue.accumulate;
         let mut position = from;
         while position < end {
-            // Positions run from the left border, over the pixels, to the right border, and may begin or end in either.
+            // Positions run from the left border, over the pixels, to the right border, and may begin or end
+            // in either.
             let line = position / grid.stride();
             let left = line * grid.stride() + grid.pad;
             let pixels = position.max(left)..end.min(left + grid.w);

@@ -1,8 +1,8 @@
 //! Convolutions and input gradients of narrow factors, the geometries of [`crate::kernels::conv`].
 //!
-//! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for a
-//! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
-//! then taps. Where squares of outputs are computed together, they are as `winograd::pack` says.
+//! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for
+//! a pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the
+//! operands, then taps. Where squares of outputs are computed together, they are as `winograd::pack` says.
 
 use std::ops::Range;
 
@@ -115,9 +115,9 @@ impl Weights {
         }
     }
 
-    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels in 8 bits
-    /// of some step, of which one is zero. Steps of sources become part of the weights; each output then has a step of its
-    /// own, as fine as its largest weights allow.
+    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels
+    /// in 8 bits of some step, of which one is zero. Steps of sources become part of the weights; each output
+    /// then has a step of its own, as fine as its largest weights allow.
     ///
     /// # Panics
     /// If `weights` has the wrong length, or a phase of a transposed layer would need a shift of its own.
@@ -189,7 +189,8 @@ impl Weights {
         Self { fit_16_bits: in_16_bits, scale, shift, ..packed }
     }
 
-    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has them.
+    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has
+    /// them.
     fn build(
         geometry: Geometry,
         inputs: Vec<(usize, Format)>,
@@ -255,7 +256,8 @@ fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     pairs
 }
 
-/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added up in 16 bits or not.
+/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added
+/// up in 16 bits or not.
 fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     let mut largest = 0.0f32;
     // Of the first two channels of either row and of the others, of either sign.
@@ -268,8 +270,8 @@ fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
-/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as neighbouring pixels differ
-/// little.
+/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as
+/// neighbouring pixels differ little.
 fn round(taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
@@ -287,8 +289,8 @@ pub enum Output<'a> {
     /// To a narrow one, without adding to it; the upper 16 of 32 channels become zero where it has none. Only
     /// a ReLU's output goes into 8 bits.
     Narrow(&'a mut Operand),
-    /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor` times its
-    /// size (see [`crate::kernels::layout`]).
+    /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor`
+    /// times its size (see [`crate::kernels::layout`]).
     Planes {
         /// Of the activation.
         shape: Shape,

@@ -1,11 +1,11 @@
-//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter of
-//! the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
+//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter
+//! of the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
 //! multiplies matrix tiles (AMX).
 //!
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
-//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones. Where products are
-//! dear, 3x3 convolutions go by squares of outputs, with fewer of them (`winograd.rs`).
+//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones.
+//! Where products are dear, 3x3 convolutions go by squares of outputs, with fewer of them (`winograd.rs`).
 //!
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.
@@ -38,8 +38,8 @@ use super::{
 pub enum Format {
     /// bfloat16: f32 with 8 bits of mantissa.
     Bf16,
-    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign. Sums
-    /// are exact.
+    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign.
+    /// Sums are exact.
     Int8(Steps),
 }
 
@@ -96,8 +96,9 @@ const GROUP: usize = 4;
 /// Largest weight in steps.
 const WEIGHT_STEPS: f32 = 127.0;
 
-/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves, before rounding them adds up to
-/// one step each: 128 times the largest activation is the most that 16 bits hold.
+/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves,
+/// before rounding them adds up to one step each: 128 times the largest activation is the most that 16 bits
+/// hold.
 const FITTING_STEPS: f32 = 124.0 - 1e-4;
 
 /// Largest activation in steps.

@@ -62,8 +62,8 @@ impl Channels {
 /// An output gradient, positions interleaved two by two.
 #[derive(Debug)]
 pub struct Pairs {
-    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so that no tap
-    /// reaches beyond the first position of the input.
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so
+    /// that no tap reaches beyond the first position of the input.
     data: Pooled<Wide>,
     rows: usize,
     grid: Grid,
@@ -109,7 +109,8 @@ impl Pairs {
     }
 }
 
-/// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
+/// Adds the weight gradient of one source to `gradient`; see
+/// [`crate::kernels::weight_grad::weight_gradient`].
 ///
 /// # Panics
 /// If sizes, borders or lengths do not fit together.

@@ -1,9 +1,11 @@
-//! 3x3 convolutions in 8 bits by squares of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as tap by tap.
+//! 3x3 convolutions in 8 bits by squares of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as
+//! tap by tap.
 //!
-//! Fractions would be rounded, and what comes out would depend on where a square begins. Whole numbers modulo 2^32 do without: weights
-//! at the points take 16 bits, and sums of their products make 9 x 2^k times the output. Nine has an inverse modulo 2^32, and a shift takes the
-//! rest away. So nothing but an output times 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last
-//! row or column may be anything.
+//! Fractions would be rounded, and what comes out would depend on where a square begins. Whole numbers modulo
+//! 2^32 do without: weights at the points take 16 bits, and sums of their products make 9 x 2^k times the
+//! output. Nine has an inverse modulo 2^32, and a shift takes the rest away. So nothing but an output times
+//! 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last row or column may be
+//! anything.
 
 use std::num::Wrapping;
 
@@ -15,8 +17,9 @@ use crate::kernels::{
     winograd::{PATCH, POINTS, SIDE, evaluate_kernel},
 };
 
-/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before rounding them adds one step
-/// to each at most: 2^6 times that times the largest activation fits into 32 bits.
+/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before
+/// rounding them adds one step to each at most: 2^6 times that times the largest activation fits into 32
+/// bits.
 pub const FITTING_SUM: f32 = 130_000.0;
 
 /// Up to 32 channels of a source, half a [`Wide`] of it, which take all of one between the transforms.
@@ -50,8 +53,8 @@ pub fn groups(parts: &[Part]) -> Vec<u8> {
     parts.iter().map(|part| part.count.div_ceil(WIDE / super::GROUP) as u8).collect()
 }
 
-/// Packs the weights `kernel(output, input)` of a layer, in steps: `[output plane][point][part][16 rows]`, each row holding the weights
-/// of 16 outputs for a pair of input channels side by side.
+/// Packs the weights `kernel(output, input)` of a layer, in steps: `[output plane][point][part][16 rows]`,
+/// each row holding the weights of 16 outputs for a pair of input channels side by side.
 pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i16; 9] + Sync) -> Vec<Wide> {
     let rows_of_plane = POINTS * parts.len() * LANES;
     let mut rows = vec![Wide::ZERO; outputs.div_ceil(LANES) * rows_of_plane];
@@ -83,7 +86,8 @@ impl Kernel for Squares<'_> {
     fn run<S: Simd>(self, simd: S) {
         let Squares { band, parts } = self;
         let (grid, engine, planes) = (band.grid, band.engine, &band.phases[0]);
-        // Points lie one value further apart than they need to, so that not all are in the same few sets of a cache.
+        // Points lie one value further apart than they need to, so that not all are in the same few sets of a
+        // cache.
         let (point, product) = (parts.len() * SQUARES + 1, 2 * SQUARES + 1);
         let rows_of_plane = POINTS * parts.len() * LANES;
         let mut points = allocate(POINTS * point);
@@ -98,7 +102,8 @@ impl Kernel for Squares<'_> {
                 for (p, part) in parts.iter().enumerate() {
                     for half in 0..part.count.div_ceil(LANES) {
                         let lane = part.half * WIDE + half * LANES;
-                        // SAFETY: `convolve` made sure of the border; slack covers what a last square reads beyond it. Points hold two bytes a channel.
+                        // SAFETY: `convolve` made sure of the border; slack covers what a last square reads
+                        // beyond it. Points hold two bytes a channel.
                         unsafe {
                             let patch = starts
                                 .map(|start| planes[part.plane].input.add(start + x).cast::<u8>().add(lane));

@@ -54,7 +54,8 @@ impl Backend for Avx2 {
         // Columns of a patch at the points, the last two of which are the next patch's first.
         let mut columns = [[nothing; PATCH]; PATCH];
         for square in 0..squares {
-            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that as points.
+            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that
+            // as points.
             unsafe {
                 for x in if square == 0 { 0 } else { PATCH - SIDE }..PATCH {
                     let mut column = [nothing; PATCH];

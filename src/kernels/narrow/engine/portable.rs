@@ -1,4 +1,5 @@
-//! What an engine does, by plain loops: the oracle of the other engines, which do so what they have no instructions for.
+//! What an engine does, by plain loops: the oracle of the other engines, which do so what they have no
+//! instructions for.
 
 use std::num::Wrapping;
 
@@ -12,8 +13,8 @@ use crate::kernels::{
     winograd::{self, PATCH, POWERS, SIDE},
 };
 
-/// A way to multiply narrow matrices, by plain loops where it has no instructions. A value proves that the processor has
-/// those: only [`Backend::detect`] makes one.
+/// A way to multiply narrow matrices, by plain loops where it has no instructions. A value proves that the
+/// processor has those: only [`Backend::detect`] makes one.
 pub trait Backend: Copy {
     /// What `DEMC_ENGINE` calls it, but for its capitals.
     const NAME: &str;
