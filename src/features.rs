@@ -298,7 +298,7 @@ fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
 /// The pixels (x, y) of the 5x5 around one, itself included, that lie within a frame of `w` columns and `h`
 /// rows.
 #[inline]
-fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
+fn neighbours((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
     const REACH: usize = 2;
     let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     let columns = around(x, w);

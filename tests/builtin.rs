@@ -320,7 +320,7 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let twice = models::open("demc-l").unwrap();
     let mut once = find("demc-m").unwrap().learned().unwrap().with_precision("demc-m", None).unwrap();
     let (network, frame) = (once.network(), window(50, 37));
-    // In 51 columns, the first of the turned frame is the one that was added, and what shared a square is
+    // In 51 columns, the first of the turned frame is the one that was added, and what shared a quad is
     // apart.
     let grown = |passes: &PassSet, of: &[Pass]| upside_down(&passes.padded_rows(of, 0..37, (51, 37)));
     // Both looks have the clean guides of the first.

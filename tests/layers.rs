@@ -479,7 +479,7 @@ fn redividing_as_plain_loops_do() {
     });
 }
 
-/// Channels of several blocks as planes, each its own and each four in a row a square.
+/// Channels of several blocks as planes, each its own and each four in a row a quad.
 #[test]
 fn channels_become_planes_as_plain_loops_do() {
     let (n, c, h, w) = (2, 37, 2, 19);

@@ -27,7 +27,7 @@ impl Wrap {
 }
 
 /// Columns of the other edge that an edge is denoised with: as many as the built-in networks see to either
-/// side of a pixel, and a multiple of what they halve a frame by, so that their squares lie where they did.
+/// side of a pixel, and a multiple of what they halve a frame by, so that their quads lie where they did.
 const MARGIN: usize = 256;
 
 /// What `run` makes of a shot, and of what goes along with it, that has more columns at either edge, which

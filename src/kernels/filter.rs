@@ -381,7 +381,7 @@ impl Kernel for Backward<'_, '_> {
     }
 }
 
-/// Halves (3, H, W): each 2x2 square weighted by `exp(confidence)`, where confidence beyond +-40 counts as
+/// Halves (3, H, W): each quad weighted by `exp(confidence)`, where confidence beyond +-40 counts as
 /// that and has no gradient. `total` (1, H/2, W/2) gets the sums of weights.
 ///
 /// # Panics
@@ -395,12 +395,12 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
     let rows = [image, confidence];
     each_row(w, [output], total, |y, [output], total| {
-        vectorised::run(Squares { size, y, rows, output, total })
+        vectorised::run(Quads { size, y, rows, output, total })
     });
 }
 
 /// One row of what [`reduce`] makes.
-struct Squares<'a> {
+struct Quads<'a> {
     size: Size,
     y: usize,
     /// The image and the confidence.
@@ -409,7 +409,7 @@ struct Squares<'a> {
     total: &'a mut [f32],
 }
 
-impl Vectorised for Squares<'_> {
+impl Vectorised for Quads<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { size: Size { w, .. }, y, rows: [image, confidence], output, total } = self;

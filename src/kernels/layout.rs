@@ -1,8 +1,8 @@
 //! Between planar images and blocked activations, sixteen pixels at a time.
 //!
 //! For a factor of 1 a channel is a plane. For a factor of 2 four consecutive channels are the pixels of
-//! a 2x2 square of one plane (space to depth), which is how a half-resolution network reads and writes a
-//! full-resolution image.
+//! a quad (2x2 pixels) of one plane (space to depth), which is how a half-resolution network reads and writes
+//! a full-resolution image.
 
 use rayon::prelude::*;
 
@@ -24,12 +24,12 @@ impl Map {
     /// # Panics
     /// If `len` values are not whole planes, or more than the activation's channels.
     fn new(shape: Shape, first: usize, factor: usize, len: usize) -> Self {
-        assert!(factor == 1 || factor == 2, "squares have 1 or 2 pixels a side");
+        assert!(factor == 1 || factor == 2, "quads have 1 or 2 pixels a side");
         let channels = len / (shape.n * shape.h * shape.w).max(1);
         let area = factor * factor;
         assert_eq!(len, shape.n * (channels / area) * area * shape.h * shape.w, "planes must be whole");
         assert!(first + channels <= shape.c, "more planes than channels");
-        assert!(first.is_multiple_of(area), "squares must be whole");
+        assert!(first.is_multiple_of(area), "quads must be whole");
         Self { shape, first, channels, factor }
     }
 
@@ -321,7 +321,7 @@ impl Map {
     }
 }
 
-/// Row `y` of image `n` of an activation whose channels are the pixels of 2x2 squares of planes, as
+/// Row `y` of image `n` of an activation whose channels are the pixels of quads of planes, as
 /// [`to_blocked`] makes it: 16 pixels at a time, each as up to two blocked planes from `plane` on. `put`
 /// takes the pixels' first column and their blocks; there is no second plane where it has no channels.
 pub(super) struct HalvedRow<'a, F> {

@@ -73,11 +73,12 @@ impl Shape {
         Self { h, w, ..self }
     }
 
-    /// The extent of an activation whose channels are the pixels of this one's 2x2 squares (space to depth).
+    /// The extent of an activation whose channels are the pixels of this one's quads, 2x2 pixels each (space
+    /// to depth).
     ///
     /// # Panics
     /// If rows or columns are odd.
-    pub fn squares(self) -> Self {
+    pub fn quads(self) -> Self {
         assert!(self.h.is_multiple_of(2) && self.w.is_multiple_of(2), "only even sizes halve");
         self.with_channels(4 * self.c).with_size(self.h / 2, self.w / 2)
     }

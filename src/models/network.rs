@@ -109,7 +109,7 @@ impl Architecture {
 }
 
 /// Parameters of as many 3x3 convolutions between as many channels as each level has.
-pub fn squares(convolutions: usize, widths: &[usize]) -> usize {
+pub fn convolution_weights(convolutions: usize, widths: &[usize]) -> usize {
     convolutions * 9 * widths.iter().map(|width| width * width).sum::<usize>()
 }
 
@@ -227,7 +227,7 @@ pub trait Network: Send + Sync {
     fn reach(&self) -> usize;
 
     /// Denoised radiance of a frame, (3, H, W), worked on in parts of `tile` rows (and columns, where the
-    /// network wants squares), whatever their size to the same bits.
+    /// network is cut both ways), whatever their size to the same bits.
     ///
     /// # Errors
     /// A pass is missing.

@@ -1,7 +1,7 @@
 //! The built-in network: a dual encoder at half resolution that predicts kernels instead of colours.
 //!
 //! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
-//! follows what measurement favoured: the trunk works on 2x2 squares (space to depth), and each level
+//! follows what measurement favoured: the trunk works on quads, 2x2 pixels (space to depth), and each level
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
 //! al. 2018), after it was blended with what filtering made of the level below: a level's own kernels
 //! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
@@ -31,7 +31,9 @@ mod trunk;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate, squares};
+use super::network::{
+    Architecture, Batch, Config, Design, Network, Stacked, Taped, convolution_weights, duplicate,
+};
 use crate::{
     Result,
     companion::Companion,
@@ -89,7 +91,9 @@ pub static DESIGN: Design = Design {
     inputs: "guides/logarithm/1",
     levels: LEVELS,
     prefilter_levels: LEVELS,
-    least_parameters: |config| squares(2, &config.widths) + squares(2, &config.prefilter),
+    least_parameters: |config| {
+        convolution_weights(2, &config.widths) + convolution_weights(2, &config.prefilter)
+    },
     build: |config, seed| Box::new(Pyramid::new(config, seed)),
 };
 

@@ -100,13 +100,13 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         Self::constant(Data::F32(data))
     }
 
-    /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each 2x2 square
+    /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each quad
     /// become channels (space to depth). (N, C, H, W) -> (N, 4C, H/2, W/2)
     ///
     /// # Panics
     /// If rows or columns are odd, or the length of `values` is not what `shape` demands.
     pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
-        let mut data = Buffer::new(shape.squares());
+        let mut data = Buffer::new(shape.quads());
         to_blocked(values, 2, data.view_mut());
         Self::constant(Data::F32(data))
     }

@@ -223,7 +223,7 @@ impl Arithmetic {
     }
 }
 
-/// [`conv::convolve`] in training: by squares of outputs where that is faster, though sums are then rounded
+/// [`conv::convolve`] in training: by cells of outputs where that is faster, though sums are then rounded
 /// otherwise where a frame is cut otherwise.
 fn convolve_taped(
     tier: Tier,

@@ -143,11 +143,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     }
 
     /// Channels `first..first + channels` of a layer's output as planes, each value at its own pixel for
-    /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a 2x2 square.
+    /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a quad.
     /// (N, K, H, W) -> (N, channels / factor^2, factor * H, factor * W)
     ///
     /// # Panics
-    /// If there are not as many channels, or they are not whole squares from `first` on.
+    /// If there are not as many channels, or they are not whole quads from `first` on.
     pub fn from_activation(activation: Activation<T>, first: usize, channels: usize, factor: usize) -> Self {
         let activation = activation.into_f32();
         let shape = activation.shape();
@@ -227,7 +227,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each 2x2 square weighted by
+    /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each quad weighted by
     /// `exp(confidence)`, (N, 1, H, W). See [`reduce`].
     ///
     /// # Panics
@@ -297,8 +297,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Its channels and then those of another field of the same size: (N, C, H, W) and (N, D, H, W) -> (N, C
-    /// + D, H, W)
+    /// Its channels and then those of another field of the same size:
+    /// (N, C, H, W) and (N, D, H, W) -> (N, C + D, H, W)
     ///
     /// # Panics
     /// If sizes differ.

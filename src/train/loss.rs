@@ -122,7 +122,7 @@ fn relmse(
     scale: &[f32],
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
     let weight = weights(reference, scale);
-    squares(image, reference, raw, weight)
+    weighted_error(image, reference, raw, weight)
 }
 
 /// The logarithm's gradient by way of weights: those of each image divided by its error. That is against the
@@ -145,7 +145,7 @@ fn geomean(
         (error / SMALL_ERROR).ln_1p()
     });
     let logarithms: Vec<f32> = logarithms.collect(); // in the order of images, whatever the threads do
-    let loss = squares(image, reference, raw, weight);
+    let loss = weighted_error(image, reference, raw, weight);
     // Same gradient, but the value of the logarithm.
     let value = logarithms.iter().sum::<f32>() / images as f32;
     let shift = value - loss.as_vec()[0];
@@ -164,7 +164,7 @@ fn weights(reference: &[f32], scale: &[f32]) -> Vec<f32> {
 }
 
 /// The mean of weighted squared errors against the raw reference, if there is one.
-fn squares(
+fn weighted_error(
     image: Images<Taped>,
     reference: &[f32],
     raw: Option<Vec<f32>>,

@@ -137,7 +137,7 @@ pub fn weight_gradient(
                 let (dy, dx) = (signed(t / k) - signed(k / 2), signed(t % k) - signed(k / 2));
                 (dy * signed(grid.stride()) + dx, 0)
             }
-            // out[2m + k - 1] += in[m] w[k]: the gradient at square m + (k - 1) div 2, pixel (k - 1) mod 2.
+            // out[2m + k - 1] += in[m] w[k]: the gradient at quad m + (k - 1) div 2, pixel (k - 1) mod 2.
             _ => {
                 let (ky, kx) = (signed(t / 4) - 1, signed(t % 4) - 1);
                 let shift = ky.div_euclid(2) * signed(grid.stride()) + kx.div_euclid(2);

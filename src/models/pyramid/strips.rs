@@ -3,7 +3,7 @@
 //! are through.
 //!
 //! What bands keep under way grows with their width. So frames that are wider than most are denoised in
-//! vertical strips, each with as many columns beside its own as they depend on. A strip begins where squares
+//! vertical strips, each with as many columns beside its own as they depend on. A strip begins where quads
 //! of pixels do at every level. What depends on the whole frame, exposures and shading, is computed once.
 
 use std::ops::Range;

@@ -82,7 +82,7 @@ pub struct Layer {
 /// What a layer does.
 #[derive(Clone)]
 pub enum Step {
-    /// Makes channels of the 2x2 squares of an input, which in 8 bits may have these values.
+    /// Makes channels of the quads of an input, which in 8 bits may have these values.
     Input(Steps),
     /// Halves rows and columns.
     Pool,
@@ -257,7 +257,7 @@ impl Trunk {
             reaches.push(before.unwrap_or(0) + layer.reach());
         }
         // The head of full resolution leaves half a pixel of the finest level behind. Then come the kernels,
-        // and below full resolution a pixel for the corners of an upsampling and half a one for the squares
+        // and below full resolution a pixel for the corners of an upsampling and half a one for the quads
         // of an image.
         let layers = reaches.into_iter().max().unwrap_or(0) + 1;
         let kernels: usize = (0..=LEVELS).map(|level| (self.kernel(level) / 2) << level).sum();
@@ -366,7 +366,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     }
 }
 
-/// Some planes of a head's output; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk.
+/// Some planes of a head's output; `factor` 2 where each quad of pixels shares one pixel of the trunk.
 /// The tape goes with the first that are asked for.
 fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
     mut head: Activation<T>,

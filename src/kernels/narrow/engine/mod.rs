@@ -21,9 +21,9 @@ use crate::kernels::{
 };
 use portable::{Backend, Portable};
 
-/// Squares side by side that are transformed, multiplied and transformed back together ([`super::winograd`]):
+/// Cells side by side that are transformed, multiplied and transformed back together ([`super::winograd`]):
 /// what they need meanwhile stays in the second-level cache.
-pub const SQUARES: usize = 16;
+pub const CELLS: usize = 16;
 
 /// The inverse of 9 modulo 2^32.
 const NINTH: u32 = 0x38e3_8e39;
@@ -148,10 +148,10 @@ impl Engine {
         with_backend!(self, backend => backend.prefers_int8())
     }
 
-    /// Whether it has convolutions of 8 bits of a geometry by squares of outputs ([`super::winograd`]) rather
+    /// Whether it has convolutions of 8 bits of a geometry by cells of outputs ([`super::winograd`]) rather
     /// than tap by tap.
-    pub(super) fn prefers_squares(self, geometry: Geometry) -> bool {
-        with_backend!(self, backend => backend.prefers_squares(geometry))
+    pub(super) fn prefers_winograd(self, geometry: Geometry) -> bool {
+        with_backend!(self, backend => backend.prefers_winograd(geometry))
     }
 
     /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels, in a
@@ -180,9 +180,9 @@ impl Engine {
         }
     }
 
-    /// 16 channels of 8 bits of the patches of `squares` squares side by side, at the 36 points of
+    /// 16 channels of 8 bits of the patches of `cells` cells side by side, at the 36 points of
     /// [`super::winograd`]: `patch` is where each row of the first begins, `points` where the first point of
-    /// the first square goes. Squares follow one another, and points lie `stride` squares apart, a [`Wide`]
+    /// the first cell goes. Cells follow one another, and points lie `stride` cells apart, a [`Wide`]
     /// each.
     ///
     /// # Safety
@@ -190,20 +190,20 @@ impl Engine {
     pub(super) unsafe fn evaluate(
         self,
         patch: [*const u8; PATCH],
-        squares: usize,
+        cells: usize,
         points: *mut u8,
         stride: usize,
     ) {
         // SAFETY: the caller's promise.
-        unsafe { with_backend!(self, backend => backend.evaluate(patch, squares, points, stride)) }
+        unsafe { with_backend!(self, backend => backend.evaluate(patch, cells, points, stride)) }
     }
 
-    /// `products[o][square] = sum over parts of points[part][square] * weights[o][part]` at one point, for
+    /// `products[o][cell] = sum over parts of points[part][cell] * weights[o][part]` at one point, for
     /// `outputs` (1 or 2) output planes whose weights lie `plane` rows apart. `groups` tell how many groups
     /// of rows each part needs; the other weights are zero.
     ///
     /// # Safety
-    /// Parts, and output planes' products, lie [`SQUARES`] values apart, and all of them can be read and
+    /// Parts, and output planes' products, lie [`CELLS`] values apart, and all of them can be read and
     /// written.
     pub(super) unsafe fn multiply_points(
         self,
@@ -211,22 +211,22 @@ impl Engine {
         points: *const Wide,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
-        squares: usize,
+        cells: usize,
         products: *mut Wide,
     ) {
         // SAFETY: the caller's promise.
         unsafe {
             for o in 0..outputs {
-                let (weights, products) = (weights.add(o * plane), products.add(o * SQUARES));
+                let (weights, products) = (weights.add(o * plane), products.add(o * CELLS));
                 with_backend!(self, backend => {
-                    backend.multiply_points(groups, points, weights, squares, products);
+                    backend.multiply_points(groups, points, weights, cells, products);
                 });
             }
         }
     }
 
-    /// The sums of a square for one output plane, from its products at the points, which lie `stride` values
-    /// apart: row `y` of the square goes to `sums[y]` of the output plane and from the column that `place`
+    /// The sums of a cell for one output plane, from its products at the points, which lie `stride` values
+    /// apart: row `y` of the cell goes to `sums[y]` of the output plane and from the column that `place`
     /// says.
     ///
     /// # Safety
