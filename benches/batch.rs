@@ -8,8 +8,8 @@
 //! ```
 //! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
 //! repeated, each time at another brightness, until the frame is full (by default the example of this
-//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a random
-//! number, so that nothing compresses.
+//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a
+//! random number, so that nothing compresses.
 
 use std::{
     fs,
@@ -29,7 +29,8 @@ use exr::prelude::*;
 use half::f16;
 use rayon::prelude::*;
 
-struct Options {
+/// What the command line says.
+struct Arguments {
     only: Option<String>,
     frames: usize,
     size: Option<(usize, usize)>,
@@ -39,9 +40,10 @@ struct Options {
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those up first.
+    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
+    // up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
-    let mut options = Options {
+    let mut arguments = Arguments {
         only: None,
         frames: 32,
         size: None,
@@ -53,30 +55,30 @@ fn main() {
     while let Some(arg) = args.next() {
         let value = args.next().unwrap_or_else(|| panic!("{arg} wants a value"));
         match arg.as_str() {
-            "--only" => options.only = Some(value),
-            "--frames" => options.frames = value.parse().expect("--frames wants a number"),
+            "--only" => arguments.only = Some(value),
+            "--frames" => arguments.frames = value.parse().expect("--frames wants a number"),
             "--size" => {
                 let (width, height) = value.split_once('x').expect("--size wants WxH");
                 let number = |text: &str| text.parse().expect("--size wants numbers");
-                options.size = Some((number(width), number(height)));
+                arguments.size = Some((number(width), number(height)));
             }
-            "--noise" => options.noise = value.parse().expect("--noise wants a number"),
-            "--model" => options.model = value,
-            "--source" => options.source = value.into(),
+            "--noise" => arguments.noise = value.parse().expect("--noise wants a number"),
+            "--model" => arguments.model = value,
+            "--source" => arguments.source = value.into(),
             _ => panic!("{arg}: unknown; see the top of benches/batch.rs"),
         }
     }
-    let wants = |what: &str| options.only.as_deref().is_none_or(|only| only == what);
+    let wants = |what: &str| arguments.only.as_deref().is_none_or(|only| only == what);
     if wants("overlap") {
-        overlap(&options);
+        overlap(&arguments);
     }
     if wants("memory") {
-        memory(&options);
+        memory(&arguments);
     }
 }
 
-/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every value by up to
-/// a share `noise` of it: pixels that do not compress are the worst for memory.
+/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every
+/// value by up to a share `noise` of it: pixels that do not compress are the worst for memory.
 fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {
@@ -173,19 +175,19 @@ fn describe(costs: &[Cost]) -> String {
     format!("{wall:.3} s ({cpu:.2} s of processor time)")
 }
 
-fn overlap(options: &Options) {
-    let size = options.size.unwrap_or((1920, 1080));
+fn overlap(arguments: &Arguments) {
+    let size = arguments.size.unwrap_or((1920, 1080));
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let (input, out) = (folder.path().join("in"), folder.path().join("out"));
     fs::create_dir(&input).expect("the temporary folder is writable");
     let first = input.join("shot.0001.exr");
-    enlarge(&options.source, size, options.noise, &first);
-    for i in 2..=options.frames {
+    enlarge(&arguments.source, size, arguments.noise, &first);
+    for i in 2..=arguments.frames {
         fs::copy(&first, input.join(format!("shot.{i:04}.exr"))).expect("the temporary folder has room");
     }
 
     // Each stage alone, with all threads.
-    let model = models::open(&options.model).expect("a model by that name");
+    let model = models::open(&arguments.model).expect("a model by that name");
     let wanted: Vec<Pass> = [Pass::Combined, Pass::Alpha].iter().chain(model.passes()).copied().collect();
     let (mut reads, mut denoises, mut writes) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..=5 {
@@ -205,10 +207,10 @@ fn overlap(options: &Options) {
             writes.push(write);
         }
     }
-    let pure = median(denoises.iter().map(|c| c.wall).collect()) * options.frames as f64;
-    let (wall, peak) = denoise(&input, &out, &options.model);
-    let (frames, threads) = (options.frames, rayon::current_num_threads());
-    println!("{frames} frames of {}x{}, {threads} threads, {}", size.0, size.1, options.model);
+    let pure = median(denoises.iter().map(|c| c.wall).collect()) * arguments.frames as f64;
+    let (wall, peak) = denoise(&input, &out, &arguments.model);
+    let (frames, threads) = (arguments.frames, rayon::current_num_threads());
+    println!("{frames} frames of {}x{}, {threads} threads, {}", size.0, size.1, arguments.model);
     for (stage, costs) in [("read", &reads), ("denoise", &denoises), ("write", &writes)] {
         println!("{stage:<8} one frame alone: {}", describe(costs));
     }
@@ -235,19 +237,19 @@ fn store(mut frame: Frame, image: &demc::planes::Planes, to: &Path) {
     frame.write(to).expect("the temporary folder has room");
 }
 
-fn memory(options: &Options) {
-    let size = options.size.unwrap_or((7680, 4320));
+fn memory(arguments: &Arguments) {
+    let size = arguments.size.unwrap_or((7680, 4320));
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let (input, out) = (folder.path().join("huge.exr"), folder.path().join("out"));
-    enlarge(&options.source, size, options.noise, &input);
+    enlarge(&arguments.source, size, arguments.noise, &input);
     let bytes = fs::metadata(&input).expect("just written").len();
-    let (seconds, peak) = denoise(&input, &out, &options.model);
+    let (seconds, peak) = denoise(&input, &out, &arguments.model);
     let file = bytes as f64 / f64::from(1 << 20);
     println!(
         "{}x{} with the passes of {}: a file of {file:.0} MiB, {seconds:.1} s",
         size.0,
         size.1,
-        options.source.display()
+        arguments.source.display()
     );
     match peak {
         Some(peak) => println!("memory at the peak: {peak:.0} MiB (target 3072)"),

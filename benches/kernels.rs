@@ -1,6 +1,6 @@
 //! GFLOP/s of the kernels beside the FMA peak of this machine: `cargo bench --bench kernels`.
-//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by squares, of the FLOPs of the convolution tap by tap.
-//! `DEMC_TIER=avx2` benches that tier.
+//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by Winograd, of the FLOPs of the convolution
+//! tap by tap. `DEMC_TIER=avx2` benches that tier.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
@@ -124,7 +124,7 @@ fn conv3x3(bencher: Bencher, layer: Layer) {
 
 /// As training computes it, whose weights are new in every step.
 #[divan::bench(args = LAYERS.into_iter().filter(|layer| winograd::serves(layer.4)))]
-fn conv3x3_squares(bencher: Bencher, layer: Layer) {
+fn conv3x3_winograd(bencher: Bencher, layer: Layer) {
     let (n, i, o, h, w) = layer;
     let tier = Tier::detect();
     let (shape, out_shape) = (Shape::new(n, i, h, w), Shape::new(n, o, h, w));

@@ -50,33 +50,35 @@ struct Job {
     make: Box<dyn Fn() -> Box<dyn FnMut()>>,
 }
 
-struct Options {
+/// What the command line says.
+struct Arguments {
     rounds: usize,
     small: bool,
     words: Vec<String>,
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those up first.
+    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
+    // up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut args = std::env::args().skip(1).filter(|a| a != "--bench");
-    let mut options = Options { rounds: 5, small: false, words: Vec::new() };
+    let mut arguments = Arguments { rounds: 5, small: false, words: Vec::new() };
     let (mut worker, mut sizes) = (false, None);
     while let Some(arg) = args.next() {
         let mut value = || args.next().unwrap_or_else(|| panic!("{arg} wants a value"));
         match arg.as_str() {
-            "--rounds" => options.rounds = value().parse().expect("--rounds wants a number"),
+            "--rounds" => arguments.rounds = value().parse().expect("--rounds wants a number"),
             "--sizes" => sizes = Some(PathBuf::from(value())),
-            "--small" => options.small = true,
+            "--small" => arguments.small = true,
             "--worker" => worker = true,
-            word if !word.starts_with('-') => options.words.push(word.into()),
+            word if !word.starts_with('-') => arguments.words.push(word.into()),
             other => panic!("{other}: unknown; see the top of benches/network.rs"),
         }
     }
     match sizes {
-        Some(csv) => cost_by_size(&csv, &options),
-        None if worker => serve(&jobs(options.small)),
-        None => compare(&options),
+        Some(csv) => cost_by_size(&csv, &arguments),
+        None if worker => serve(&jobs(arguments.small)),
+        None => compare(&arguments),
     }
 }
 
@@ -212,14 +214,14 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 /// All jobs in turns: one turn to warm up, then `rounds`.
-fn compare(options: &Options) {
-    let mut jobs = jobs(options.small);
-    let wanted = |name: &str| options.words.is_empty() || options.words.iter().any(|w| name.contains(w));
+fn compare(arguments: &Arguments) {
+    let mut jobs = jobs(arguments.small);
+    let wanted = |name: &str| arguments.words.is_empty() || arguments.words.iter().any(|w| name.contains(w));
     jobs.retain(|job| wanted(&job.name) || job.name.ends_with("peak"));
     let mut running: Vec<_> = jobs.iter().map(|job| (job.make)()).collect();
     let mut times = vec![Vec::new(); jobs.len()];
-    for round in 0..=options.rounds {
-        eprintln!("round {round} of {}", options.rounds);
+    for round in 0..=arguments.rounds {
+        eprintln!("round {round} of {}", arguments.rounds);
         for (run, times) in running.iter_mut().zip(&mut times) {
             let time = seconds(run);
             if round > 0 {
@@ -260,15 +262,15 @@ fn serve(jobs: &[Job]) {
 }
 
 /// Sizes in turns, each warm: what a pixel costs in a small and in a huge frame.
-fn cost_by_size(csv: &PathBuf, options: &Options) {
-    let sizes: Vec<(usize, usize)> = if options.small { vec![(96, 64), (160, 96)] } else { SIZES.into() };
-    let usual = if options.small { sizes[1] } else { USUAL };
+fn cost_by_size(csv: &PathBuf, arguments: &Arguments) {
+    let sizes: Vec<(usize, usize)> = if arguments.small { vec![(96, 64), (160, 96)] } else { SIZES.into() };
+    let usual = if arguments.small { sizes[1] } else { USUAL };
     let mut rows = Vec::new();
-    let wanted = |name: &str| options.words.is_empty() || options.words.iter().any(|word| word == name);
+    let wanted = |name: &str| arguments.words.is_empty() || arguments.words.iter().any(|word| word == name);
     for name in LADDER.into_iter().filter(|name| wanted(name)) {
         let model = models::open(name).expect("it is built in");
         let mut times = vec![Vec::new(); sizes.len()];
-        for round in 1..=options.rounds {
+        for round in 1..=arguments.rounds {
             for (&(width, height), times) in sizes.iter().zip(&mut times) {
                 let shot = Shot::new(frame(width, height));
                 clear_buffers();

@@ -1,5 +1,5 @@
-"""Builds the extension: target/extension/demc-<version>.zip, which Blender installs (Preferences > Get Extensions >
-Install from Disk). Takes the wheel that `python/build_wheel.sh` makes.
+"""Builds the extension: target/extension/demc-<version>.zip, which Blender installs (Preferences > Get
+Extensions > Install from Disk). Takes the wheel that `python/build_wheel.sh` makes.
 
     python3 blender_extension/build.py [WHEEL ...] [--out FILE]
 """

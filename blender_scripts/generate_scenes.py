@@ -306,7 +306,8 @@ class Records:
 
 def render_crop(options, ledger, scene, region, crop, facts):
     """Renders a crop: noisy images with all passes, their means, then the reference with its guides; where it
-    is denoised, also the Noisy Image that it was denoised from. `facts` are what the ledger tells of it too."""
+    is denoised, also the Noisy Image that it was denoised from. `facts` are what the ledger tells of it
+    too."""
     layers = [layer for layer in scene.view_layers if layer.use][:1]
     facts = facts | {"view": crop.name, "frame": "{}x{}+{}+{}".format(*region[2:], *region[:2])}
     with Edits() as edits:
@@ -368,7 +369,8 @@ def render_crop(options, ledger, scene, region, crop, facts):
 
 
 def render_compact(scene, path):
-    """Renders, drops what no network reads, stores the rest as half in one part; returns processor seconds."""
+    """Renders, drops what no network reads, stores the rest as half in one part; returns processor
+    seconds."""
     partial = f"{path}.render.tmp"
     start = time.process_time()
     rendering.render_to(scene, partial)

@@ -2,10 +2,10 @@
 
     python import_furniture.py --out DIR LIBRARY.sh3f ...
 
-Debian's package sweethome3d-furniture holds five such libraries with 820 models of the Blend Swap community, Scopia,
-Kator Legaz and Reallusion (CC0 or CC-BY 3.0). Each model becomes DIR/models/NAME.glb in the size its catalogue states,
-standing on z = 0 and looking to -Y; models.tsv tells category, size, author and licence. Models that are there are
-skipped, those that cannot be read are named and left out.
+Debian's package sweethome3d-furniture holds five such libraries with 820 models of the Blend Swap community,
+Scopia, Kator Legaz and Reallusion (CC0 or CC-BY 3.0). Each model becomes DIR/models/NAME.glb in the size its
+catalogue states, standing on z = 0 and looking to -Y; models.tsv tells category, size, author and licence.
+Models that are there are skipped, those that cannot be read are named and left out.
 """
 
 import argparse

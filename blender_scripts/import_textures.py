@@ -2,9 +2,10 @@
 
     python import_textures.py --out DIR FOLDER ...
 
-Meant for the textures of free games: Debian's supertuxkart-data (mostly CC-BY-SA) holds some 550 that fit. What a name
-says decides what an image is used for ("old_brick_wall.jpg": brick); images without such a word, normal and gloss
-maps, pictures with holes and small ones are left out. DIR/textures/KIND_NAME/color.jpg is 512 pixels wide at most.
+Meant for the textures of free games: Debian's supertuxkart-data (mostly CC-BY-SA) holds some 550 that fit.
+What a name says decides what an image is used for ("old_brick_wall.jpg": brick); images without such a word,
+normal and gloss maps, pictures with holes and small ones are left out. DIR/textures/KIND_NAME/color.jpg is
+512 pixels wide at most.
 """
 
 import argparse

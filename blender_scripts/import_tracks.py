@@ -2,10 +2,10 @@
 
     python import_tracks.py --out DIR [--hdri DIR] DATA
 
-Debian's supertuxkart-data (mostly CC-BY-SA) holds some 40 tracks under DATA/tracks, modelled by artists: villages,
-temples, forests, caves, castles. Each becomes DIR/NAME.blend: its meshes, what it takes from DATA/library, its lights
-and sun, an environment of --hdri that suits its hour, and cameras where karts drive. Tracks that are there are skipped,
-those that cannot be read are named and left out.
+Debian's supertuxkart-data (mostly CC-BY-SA) holds some 40 tracks under DATA/tracks, modelled by artists:
+villages, temples, forests, caves, castles. Each becomes DIR/NAME.blend: its meshes, what it takes from
+DATA/library, its lights and sun, an environment of --hdri that suits its hour, and cameras where karts drive.
+Tracks that are there are skipped, those that cannot be read are named and left out.
 """
 
 import argparse
@@ -66,7 +66,8 @@ class Reader:
 
 
 class Spm:
-    """A mesh file, version 1: `textures`, names of one or two per material, and arrays per vertex in Blender's axes."""
+    """A mesh file, version 1: `textures`, names of one or two per material, and arrays per vertex in
+    Blender's axes."""
 
     def __init__(self, path):
         reader = Reader(path)
@@ -87,7 +88,8 @@ class Spm:
                 form = "I" if count > 65535 else "H" if count > 255 else "B"
                 triangles = np.frombuffer(reader.data, "<" + form.replace("I", "u4").replace("H", "u2").replace("B", "u1"), indices, reader.at)
                 reader.at += triangles.nbytes
-                faces.append(triangles.reshape(-1, 3)[:, ::-1].astype(np.int32) + first)  # mirrored with the axes
+                # Mirrored with the axes.
+                faces.append(triangles.reshape(-1, 3)[:, ::-1].astype(np.int32) + first)
                 of_face += [material] * len(faces[-1])
             if kind & 7 == 0:
                 reader.at += 24  # bounds of the sector

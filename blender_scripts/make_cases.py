@@ -2,8 +2,9 @@
 
     python make_cases.py NOISY REFERENCE --out DIR
 
-Needs numpy alone. NOISY has Combined, Denoising Albedo and Denoising Normal; a REFERENCE of development_set.py has
-clean guides too. Writes <case>_<spp>spp.exr and <case>_ref.exr (32-bit float), a folder that `demc eval` takes:
+Needs numpy alone. NOISY has Combined, Denoising Albedo and Denoising Normal; a REFERENCE of
+development_set.py has clean guides too. Writes <case>_<spp>spp.exr and <case>_ref.exr (32-bit float), a
+folder that `demc eval` takes:
 
     identity      the reference as input: comes out as it went in
     black         no light at all: stays so

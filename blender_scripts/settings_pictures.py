@@ -54,8 +54,8 @@ def parse(arguments):
 
 
 def corner(stage, lamps=0):
-    """The corner of a closed room: books, a head, a ball. A spot turned to the ceiling gives most of the light,
-    or many small lamps below it do. Returns what places the camera."""
+    """The corner of a closed room: books, a head, a ball. A spot turned to the ceiling gives most of the
+    light, or many small lamps below it do. Returns what places the camera."""
     rng = stage.rng
     wall, floor = materials.paint(rng, (0.7, 0.8)), materials.tiles(rng)
     for size, at in (((5, 0.1, 2.6), (0, 1.5, 1.3)), ((0.1, 5, 2.6), (-1.7, 0, 1.3)), ((0.1, 5, 2.6), (2.3, 0, 1.3)),
@@ -326,7 +326,8 @@ class Page:
         self.size = (self.step[0] * (len(columns) + 1) - _GAP, _TITLE + 2 * self.step[1] - _GAP)
         reference = self._image(columns[0].reference, "Combined", "Combined")
         light = reference @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-        self.exposure = 0.35 / max(np.minimum(light, np.percentile(light, 98)).mean(), 1e-6)  # that of demc's metrics
+        # That of demc's metrics.
+        self.exposure = 0.35 / max(np.minimum(light, np.percentile(light, 98)).mean(), 1e-6)
 
     def _image(self, path, layer, alpha_layer):
         image = color(path, layer)

@@ -5,10 +5,10 @@
 //! ```
 //!
 //! For each pair, and for the pair with a part of its noise (where the reference has guides, cleaned by
-//! `eval/training/clean_references.py`), a safetensors file of 32-bit floats: `features` (36, H/4, W/4), `render`,
-//! `denoised`, `result` (what is kept of it with the shipped weights), `truth` and `clean` (the reference as rendered, and as it
-//! was denoised, if it was; 3, H, W), `shares` (1, H, W; of the render in the result), and `facts`: exposure, samples, and the
-//! share of the noise.
+//! `eval/training/clean_references.py`), a safetensors file of 32-bit floats: `features` (36, H/4, W/4),
+//! `render`, `denoised`, `result` (what is kept of it with the shipped weights), `truth` and `clean` (the
+//! reference as rendered, and as it was denoised, if it was; 3, H, W), `shares` (1, H, W; of the render in
+//! the result), and `facts`: exposure, samples, and the share of the noise.
 
 use std::path::Path;
 
@@ -25,8 +25,8 @@ use demc::{
 };
 use safetensors::{Dtype, tensor::TensorView};
 
-/// Shares of the noise that a frame is seen with: without any, a result must go back to its input. And how far what is
-/// denoised is blurred besides, in pixels to each side: there are worse denoisers.
+/// Shares of the noise that a frame is seen with: without any, a result must go back to its input. And how
+/// far what is denoised is blurred besides, in pixels to each side: there are worse denoisers.
 const SEEN: [(f32, usize); 8] =
     [(1.0, 0), (0.6, 0), (0.3, 0), (0.1, 0), (0.0, 0), (0.3, 2), (0.1, 4), (0.0, 2)];
 
@@ -57,8 +57,9 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// The frame with a share of its noise, and what is true of it: of all of its noise the reference as rendered, which need
-/// not be clean but must be unbiased, and of less the cleaned one, which the rest of the noise was taken from.
+/// The frame with a share of its noise, and what is true of it: of all of its noise the reference as
+/// rendered, which need not be clean but must be unbiased, and of less the cleaned one, which the rest of the
+/// noise was taken from.
 fn with_noise(noisy: &PassSet, reference: &PassSet, share: f32) -> Option<(PassSet, Planes)> {
     let clean = reference.get(Pass::Combined)?;
     if share == 1.0 {

@@ -1,9 +1,9 @@
 //! Changes to a frame that leave it as good a picture: flips, quarter turns, a permutation of RGB, exposure.
 //!
-//! A pass of vectors must change with the picture. Camera-space normals and motion turn as the image turns. World
-//! space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
-//! world, so the same flip and turn are applied to the horizontal axes of normals and positions,
-//! about the vertical one, which gravity makes special.
+//! A pass of vectors must change with the picture. Camera-space normals and motion turn as the image turns.
+//! World space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
+//! world, so the same flip and turn are applied to the horizontal axes of normals and positions, about the
+//! vertical one, which gravity makes special.
 
 use crate::{
     passes::{Pass, PassSet, Quantity},
@@ -151,7 +151,8 @@ mod tests {
         assert_eq!((turned, flipped), (start.clone(), start));
     }
 
-    /// Pixel (x, y), y downwards, was at (x + X, y - Y) one frame before and will be at (x - Z, y + W) one later.
+    /// Pixel (x, y), y downwards, was at (x + X, y - Y) one frame before and will be at (x - Z, y + W) one
+    /// later.
     #[test]
     fn motion_leads_to_the_same_places_of_a_picture_that_was_flipped_and_turned() {
         const SIDE: usize = 5;

@@ -1,21 +1,24 @@
-//! Companions: layers of a frame that are denoised along with its beauty, by what the beauty's network decides.
+//! Companions: layers of a frame that are denoised along with its beauty, by what the beauty's network
+//! decides.
 //!
-//! A network that predicts kernels decides from the beauty and its guides which neighbours each pixel is averaged
-//! with. Those averages, and all that follows them, are linear in the radiance. So any layer can go the same way: light
-//! passes that add up to the beauty add up to the denoised beauty, and alpha keeps fitting the colours it goes with.
+//! A network that predicts kernels decides from the beauty and its guides which neighbours each pixel is
+//! averaged with. Those averages, and all that follows them, are linear in the radiance. So any layer can go
+//! the same way: light passes that add up to the beauty add up to the denoised beauty, and alpha keeps
+//! fitting the colours it goes with.
 
 use crate::planes::Planes;
 
 /// How far a companion goes the beauty's way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// A part of the beauty's light: all that happens to the beauty happens to it, so that parts keep adding up.
+    /// A part of the beauty's light: all that happens to the beauty happens to it, so that parts keep adding
+    /// up.
     Light,
-    /// A surface's colour. It is divided by the albedo, averaged by the beauty's kernels and multiplied again, so that
-    /// texture stays sharp, but gets none of the gains by which light is corrected.
+    /// A surface's colour. It is divided by the albedo, averaged by the beauty's kernels and multiplied
+    /// again, so that texture stays sharp, but gets none of the gains by which light is corrected.
     Colour,
-    /// A share, such as alpha: an average by the beauty's kernels alone, so that it stays between the least and the most
-    /// of what was rendered.
+    /// A share, such as alpha: an average by the beauty's kernels alone, so that it stays between the least
+    /// and the most of what was rendered.
     Share,
 }
 

@@ -123,8 +123,8 @@ impl std::error::Error for Error {
     }
 }
 
-/// What `step` makes of the frame in a file. A defect that shows in one frame must not cost the results of all others: a panic
-/// becomes the failure of its file.
+/// What `step` makes of the frame in a file. A defect that shows in one frame must not cost the results of
+/// all others: a panic becomes the failure of its file.
 ///
 /// # Errors
 /// Those of `step`, or it panicked.

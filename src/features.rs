@@ -171,8 +171,8 @@ impl Refined {
     }
 }
 
-/// What a built-in network reads of a frame, as [`light_inputs`] makes it, each of the frame's size. `T` is an image, or
-/// those of several frames.
+/// What a built-in network reads of a frame, as [`light_inputs`] makes it, each of the frame's size. `T` is
+/// an image, or those of several frames.
 #[derive(Clone, Debug)]
 pub struct LightInputs<T = Planes> {
     /// Exposed radiance over the divisor, (3, H, W): what the network filters.
@@ -181,8 +181,9 @@ pub struct LightInputs<T = Planes> {
     pub divisor: T,
     /// Input of the radiance encoder: the log-encoded light, (3, H, W).
     pub encoded: T,
-    /// Input of the guide encoder, (7, H, W): the denoised albedo (3), the camera-space normal as rendered (3), whose
-    /// noise is correlated with that of the radiance, and the mean of `ratio` over the colours (1).
+    /// Input of the guide encoder, (7, H, W): the denoised albedo (3), the camera-space normal as rendered
+    /// (3), whose noise is correlated with that of the radiance, and the mean of `ratio` over the colours
+    /// (1).
     pub guide: T,
     /// Logarithm of the divisor over the divisor that the noisy albedo would give, (3, H, W).
     pub ratio: T,
@@ -205,8 +206,8 @@ impl<T> LightInputs<T> {
     }
 }
 
-/// The built-in networks' inputs. `exposure` is that of the whole frame; `passes` may be some rows of it. What the network
-/// makes of them is to be multiplied by the inverse of the exposure.
+/// The built-in networks' inputs. `exposure` is that of the whole frame; `passes` may be some rows of it.
+/// What the network makes of them is to be multiplied by the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
@@ -297,7 +298,7 @@ fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
 /// The pixels (x, y) of the 5x5 around one, itself included, that lie within a frame of `w` columns and `h`
 /// rows.
 #[inline]
-fn square((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
+fn neighbours((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
     const REACH: usize = 2;
     let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
     let columns = around(x, w);
@@ -327,8 +328,8 @@ fn divisor(albedo: f32) -> f32 {
 /// counts about as much as the same error of an albedo of a few tenths, and less where the component is long.
 const NORMAL_SCALE: f32 = 0.1;
 
-/// What a prefilter reads of a frame, as [`guide_inputs`] makes it, each (3, H, W). `T` is an image, or those of several
-/// frames.
+/// What a prefilter reads of a frame, as [`guide_inputs`] makes it, each (3, H, W). `T` is an image, or those
+/// of several frames.
 #[derive(Clone, Debug)]
 pub struct GuideInputs<T = Planes> {
     /// The exposed divisor that the noisy albedo gives.

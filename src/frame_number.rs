@@ -1,5 +1,6 @@
-//! What a file's name tells: the number of a frame, which stands at its end, of any width, as Blender writes it before the
-//! extension (`shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`), and samples per pixel.
+//! What a file's name tells: the number of a frame, which stands at its end, of any width, as Blender writes
+//! it before the extension (`shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`), and samples per
+//! pixel.
 
 use std::path::Path;
 

@@ -18,14 +18,18 @@
 //! # }
 //! ```
 //!
-//! The features `cli`, `report` and `train` (all on by default) add the program `demc`, reports over test sets, and training.
+//! The features `cli`, `report` and `train` (all on by default) add the program `demc`, reports over test
+//! sets, and training.
 //!
 //! Modules point downwards only:
-//! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits weights;
-//! [`denoise`] takes files through a method; [`models`] holds every denoising method behind one trait; [`augment`] changes a
-//! frame to another that is as good; [`features`] turns passes into network inputs; [`filters`] are classical building blocks;
-//! [`nn`] is differentiable image operations on dfdx's tape; [`shot`] is what methods are given, [`sources`] where it is found, and
-//! a [`companion`] a layer denoised along; [`lint`] finds in a frame what ruins a denoise; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
+//! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits
+//! weights; [`denoise`] takes files through a method; [`models`] holds every denoising method behind one
+//! trait; [`augment`] changes a frame to another that is as good; [`features`] turns passes into network
+//! inputs; [`filters`] are classical building blocks; [`nn`] is differentiable image operations on dfdx's
+//! tape; [`shot`] is what methods are given, [`sources`] where it is found, and a [`companion`] a layer
+//! denoised along; [`lint`] finds in a frame what ruins a denoise; [`passes`] says what a channel means;
+//! [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic,
+//! and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 

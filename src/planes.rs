@@ -39,7 +39,8 @@ impl Planes {
         Self { channels, width, height, data: plane_buffer(channels * width * height) }
     }
 
-    /// What `fill(channel, row's number, row)` writes, all of it, into each row; rows are filled on all threads.
+    /// What `fill(channel, row's number, row)` writes, all of it, into each row; rows are filled on all
+    /// threads.
     pub fn from_rows(
         channels: usize,
         (width, height): (usize, usize),
@@ -74,7 +75,8 @@ impl Planes {
         &mut self.data[c * n..][..n]
     }
 
-    /// Writes a rectangle of other planes, `size` columns and rows from column and row `from` on, to column and row `to` on.
+    /// Writes a rectangle of other planes, `size` columns and rows from column and row `from` on, to column
+    /// and row `to` on.
     ///
     /// # Panics
     /// If channels differ, or the rectangle leaves either.
@@ -139,8 +141,9 @@ impl Planes {
         })
     }
 
-    /// Grows the planes, to the right and below, by their mirror image, the last column and row the axes: repeated, those
-    /// would draw their noise out to streaks, which a network takes for something that is there.
+    /// Grows the planes, to the right and below, by their mirror image, the last column and row the axes:
+    /// repeated, those would draw their noise out to streaks, which a network takes for something that is
+    /// there.
     ///
     /// # Panics
     /// If they are empty, or larger.

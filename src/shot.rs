@@ -1,8 +1,8 @@
 //! What a denoiser is given: the passes of a frame, made fit, and what was rendered besides it.
 //!
-//! In: an EXR file, or passes that are in memory already. Out: a [`Shot`]. Here alone the render takes the place of what
-//! Blender made of it, values that are not finite are repaired, and files that belong to a frame are looked for: methods see
-//! what they are given and read no files.
+//! In: an EXR file, or passes that are in memory already. Out: a [`Shot`]. Here alone the render takes the
+//! place of what Blender made of it, values that are not finite are repaired, and files that belong to a
+//! frame are looked for: methods see what they are given and read no files.
 
 use std::{
     collections::BTreeMap,
@@ -40,7 +40,8 @@ pub struct Shot {
     unrepaired: Option<Planes>,
 }
 
-/// Reads a frame: the view layer named, or else the one with the most recognised passes. Stereo files give their first view.
+/// Reads a frame: the view layer named, or else the one with the most recognised passes. Stereo files give
+/// their first view.
 ///
 /// # Errors
 /// The file is unusable, or has no such view layer.
@@ -48,8 +49,8 @@ pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot>
     passes::load(path, view_layer).map(Shot::new)
 }
 
-/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has, and those that lie
-/// elsewhere.
+/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has, and
+/// those that lie elsewhere.
 ///
 /// # Errors
 /// Pixels cannot be decoded, or a pass is not where it is said to be.

@@ -1,4 +1,5 @@
-//! Where the passes of a frame are, where their names do not tell: under names of the user's own, or in other files.
+//! Where the passes of a frame are, where their names do not tell: under names of the user's own, or in other
+//! files.
 
 use std::path::{Path, PathBuf};
 
@@ -24,8 +25,8 @@ pub struct Sources {
 /// The guides that may lie in other files.
 const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 
-/// A frame's file by a pattern: a run of `#`, or `%04d`, stands for the frame's number, which is the digits at the end of
-/// its name. Without either the file is that of every frame.
+/// A frame's file by a pattern: a run of `#`, or `%04d`, stands for the frame's number, which is the digits
+/// at the end of its name. Without either the file is that of every frame.
 ///
 /// # Errors
 /// The pattern wants a number, and the frame has none.
@@ -60,8 +61,8 @@ fn placeholder(pattern: &str) -> Option<(&str, usize, &str)> {
 }
 
 impl Sources {
-    /// Adds the guides that lie in other files, and makes normals those of Cycles unless Blender wrote them. Returns what the
-    /// user should know.
+    /// Adds the guides that lie in other files, and makes normals those of Cycles unless Blender wrote them.
+    /// Returns what the user should know.
     ///
     /// # Errors
     /// A file is unusable, holds no such pass, or is of another size.

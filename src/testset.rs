@@ -138,7 +138,8 @@ pub fn read(spec: &str) -> Result<TestSet> {
     Ok(set)
 }
 
-/// Whether a file is other programs' own: unfinished work, or such as the `._room_0004spp.exr` that macOS leaves beside a file it copied.
+/// Whether a file is other programs' own: unfinished work, or such as the `._room_0004spp.exr` that macOS
+/// leaves beside a file it copied.
 pub fn is_hidden(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'))
 }
@@ -213,7 +214,8 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
 }
 
 impl TestSet {
-    /// Every noisy render, sorted as the pairs are: with those without their reference, which a table must not hide.
+    /// Every noisy render, sorted as the pairs are: with those without their reference, which a table must
+    /// not hide.
     pub fn all_noisy(&self) -> Vec<Pair> {
         let lacking = self.unmatched.iter().filter_map(|unmatched| match unmatched {
             Unmatched::Noisy(pair) => Some(pair),
@@ -258,8 +260,9 @@ struct ManifestRow {
 }
 
 /// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
-/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines of one
-/// meaning count once; two that say different things of the same files are an error, as reports know a pair by its files.
+/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines of
+/// one meaning count once; two that say different things of the same files are an error, as reports know a
+/// pair by its files.
 fn manifest(path: &Path) -> Result<TestSet> {
     let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
     let mut reader = csv::ReaderBuilder::new()

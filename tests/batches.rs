@@ -239,7 +239,8 @@ fn a_watch_takes_each_render_when_it_is_whole_and_ends_when_none_comes() {
     let mut watch = Watch::start("--watch 5 --recursive");
     fs::write(watch.path("shot.0001.exr"), &bytes).unwrap();
     assert!(watch.next().starts_with("[1] clean/shot.0001.exr"));
-    // A renderer that writes for a while: a placeholder, half a file, all of it. What came before is not done again.
+    // A renderer that writes for a while: a placeholder, half a file, all of it. What came before is not done
+    // again.
     let slow = watch.path("deep/shot.0002.exr");
     fs::write(&slow, "").unwrap();
     std::thread::sleep(Duration::from_millis(1500));

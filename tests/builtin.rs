@@ -129,7 +129,8 @@ fn edit(set: &mut PassSet, pass: Pass, change: impl FnOnce(&mut [f32])) {
     set.insert(pass, planes);
 }
 
-/// What is missing is said with its remedy; what is blank holds no more; either guide makes the result better.
+/// What is missing is said with its remedy; what is blank holds no more; either guide makes the result
+/// better.
 #[test]
 fn guides_may_be_missing() {
     let all = passes::load(example("house_0004spp.exr"), None).unwrap();
@@ -319,7 +320,8 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let twice = models::open("demc-l").unwrap();
     let mut once = find("demc-m").unwrap().learned().unwrap().with_precision("demc-m", None).unwrap();
     let (network, frame) = (once.network(), window(50, 37));
-    // In 51 columns, the first of the turned frame is the one that was added, and what shared a square is apart.
+    // In 51 columns, the first of the turned frame is the one that was added, and what shared a quad is
+    // apart.
     let grown = |passes: &PassSet, of: &[Pass]| upside_down(&passes.padded_rows(of, 0..37, (51, 37)));
     // Both looks have the clean guides of the first.
     let guides = network.clean_guides(&frame).unwrap().expect("it has a prefilter");

@@ -1,4 +1,5 @@
-//! Layers that go along with the beauty, on a render that Cycles makes here: what light passes add up to, and alpha.
+//! Layers that go along with the beauty, on a render that Cycles makes here: what light passes add up to, and
+//! alpha.
 
 mod common;
 
@@ -13,7 +14,8 @@ use demc::passes::{self, Pass, PassSet};
 use predicates::str::contains;
 use tempfile::TempDir;
 
-/// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4 and of 256 samples.
+/// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4 and of 256
+/// samples.
 static RENDERS: LazyLock<TempDir> = LazyLock::new(|| {
     let folder = tempfile::tempdir().unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data/light_passes.py");
@@ -55,7 +57,8 @@ fn layer(path: &Path, name: &str) -> Vec<f32> {
     ["R", "G", "B"].map(read).concat()
 }
 
-/// What Cycles makes Combined of, of layers by these names: an environment that a transparent film does not show is no part.
+/// What Cycles makes Combined of, of layers by these names: an environment that a transparent film does not
+/// show is no part.
 fn sum_of_passes(name: &str, read: impl Fn(&str) -> Vec<f32>) -> Vec<f32> {
     let mut sum = vec![0.0; read("Emission").len()];
     for kind in ["Diffuse", "Glossy", "Transmission"] {

@@ -15,7 +15,8 @@ fn compare(a: &Path, b: &Path) -> Command {
     command
 }
 
-/// A single-part file of layers, each of one value, whose data window begins at `first` of a display window of 100x100.
+/// A single-part file of layers, each of one value, whose data window begins at `first` of a display window
+/// of 100x100.
 fn write(path: &Path, first: (i32, i32), layers: &[(&str, f32)]) {
     let named = layers.iter().flat_map(|(layer, value)| {
         ["R", "G", "B"].map(|c| {

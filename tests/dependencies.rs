@@ -1,5 +1,5 @@
-//! What the program and the Python module are built of may be given away with them, and comes from crates.io: the
-//! `deny.toml` of each, of which `cargo deny` checks the rest, such as known flaws.
+//! What the program and the Python module are built of may be given away with them, and comes from crates.io:
+//! the `deny.toml` of each, of which `cargo deny` checks the rest, such as known flaws.
 
 use std::{collections::HashSet, path::Path, process::Command};
 

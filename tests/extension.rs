@@ -1,7 +1,8 @@
-//! The Blender extension: built, installed from its archive, and used by buttons and handlers, without a window and in one.
+//! The Blender extension: built, installed from its archive, and used by buttons and handlers, without a
+//! window and in one.
 //!
-//! On bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set; in a window of the Blender that
-//! `DEMC_BLENDER` names.
+//! On bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set; in a window of the
+//! Blender that `DEMC_BLENDER` names.
 
 mod common;
 
@@ -25,7 +26,8 @@ fn script(python: &Path, name: &str) -> Command {
 /// The archive, made in `folder`.
 fn archive(folder: &Path) -> PathBuf {
     let python = python::python();
-    // The wheel that is bundled for users is tried by python/build_wheel.sh; this one leads to the program under test.
+    // The wheel that is bundled for users is tried by python/build_wheel.sh; this one leads to the program
+    // under test.
     let mut thin = script(&python, "tests/thin_wheel.py");
     let wheel = python::run(thin.arg(env!("CARGO_BIN_EXE_demc")).arg(folder));
     let archive = folder.join("demc.zip");

@@ -1,5 +1,5 @@
-//! What a denoiser must leave alone: light that has no noise, frames that are nearly clean, what lies outside a rendered
-//! region, and results of its own.
+//! What a denoiser must leave alone: light that has no noise, frames that are nearly clean, what lies outside
+//! a rendered region, and results of its own.
 
 mod common;
 
@@ -25,7 +25,8 @@ fn example() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example/house_0004spp.exr")
 }
 
-/// The passes that the models read of a part of the example, (width, height) pixels from column 150 and row 60.
+/// The passes that the models read of a part of the example, (width, height) pixels from column 150 and row
+/// 60.
 fn part(width: usize, height: usize) -> PassSet {
     let whole = passes::load(example(), None).unwrap();
     let mut part = PassSet::new("part", "ViewLayer", width, height);
@@ -108,7 +109,8 @@ fn brightest(image: &Planes, reference: &Planes) -> f64 {
     sum(image) / sum(reference)
 }
 
-/// A render of 4 samples and its reference, and what `samples` would have made of it: noise falls with their root.
+/// A render of 4 samples and its reference, and what `samples` would have made of it: noise falls with their
+/// root.
 fn of_more_samples(samples: u32) -> (PassSet, Planes) {
     let mut frame = passes::load(data("s0010_outdoor_0004spp.exr"), None).unwrap();
     let reference = passes::load(data("s0010_outdoor_ref.exr"), None).unwrap();

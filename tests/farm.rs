@@ -1,5 +1,5 @@
-//! `blender_scripts/farm`: a real Slurm on this machine, a real runner of Open Job Description, and training data
-//! from several tasks. All frames are there at the end, with the bits that one machine makes.
+//! `blender_scripts/farm`: a real Slurm on this machine, a real runner of Open Job Description, and training
+//! data from several tasks. All frames are there at the end, with the bits that one machine makes.
 
 mod common;
 
@@ -129,7 +129,8 @@ impl Slurm {
         command
     }
 
-    /// Splits frames 1 to 12 by fours over `script`, which is given the task's frames; returns the job's number.
+    /// Splits frames 1 to 12 by fours over `script`, which is given the task's frames; returns the job's
+    /// number.
     fn submit(&self, folder: &Path, script: &str) -> String {
         fs::write(folder.join("task.sh"), script).unwrap();
         let mut submit = self.command(farm("slurm.sh"));
@@ -166,7 +167,8 @@ fn a_slurm_array_finishes_all_frames_though_a_task_is_killed_half_way() {
     let Some(slurm) = Slurm::start() else { return };
     let folder = sequence(12);
     let expected = alone(folder.path());
-    // A task denoises its frames one by one, the killed one dies after its second, as demc would of a `kill -9`.
+    // A task denoises its frames one by one, the killed one dies after its second, as demc would of a
+    // `kill -9`.
     let demc = cargo_bin("demc");
     let script = format!(
         "set -e\n\

@@ -233,7 +233,8 @@ fn trainable(name: &str) -> Config {
 
 #[test]
 fn the_kernel_predicting_network() {
-    // What denoises radiance ends in a refit, whose factors have no gradient: the same design as its prefilter has none.
+    // What denoises radiance ends in a refit, whose factors have no gradient: the same design as its
+    // prefilter has none.
     let config = Config { widths: vec![4, 6, 8, 8], ..trainable("prefilter") };
     let mut network = models::build(&config, 3);
     let mut rng = Rng::new(17, 0);

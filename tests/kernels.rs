@@ -82,14 +82,14 @@ fn assert_close(got: &[f32], want: &[f64], what: &str) {
 #[derive(Clone, Copy, Debug)]
 enum Arithmetic {
     F32(Tier),
-    /// As that, but 3x3 convolutions by squares of outputs.
-    Squares(Tier),
+    /// As that, but 3x3 convolutions by cells of outputs.
+    Winograd(Tier),
     Bf16(Engine),
 }
 
 impl Arithmetic {
     fn available() -> Vec<Self> {
-        let tiers = Tier::available().into_iter().flat_map(|tier| [Self::F32(tier), Self::Squares(tier)]);
+        let tiers = Tier::available().into_iter().flat_map(|tier| [Self::F32(tier), Self::Winograd(tier)]);
         tiers.chain(Engine::available().into_iter().map(Self::Bf16)).collect()
     }
 
@@ -108,14 +108,14 @@ impl Arithmetic {
             _ => geometry,
         };
         match self {
-            Self::F32(tier) | Self::Squares(tier) => {
+            Self::F32(tier) | Self::Winograd(tier) => {
                 let len = match direction {
                     Direction::Forward => packed_len(inputs, outputs, geometry),
                     Direction::Backward => packed_len(&[outputs], inputs[source], geometry),
                 };
                 let mut packed = vec![Block::default(); len];
                 pack(weights, inputs, outputs, geometry, direction, source, &mut packed);
-                if matches!(self, Self::Squares(_)) && used == Geometry::Same(3) {
+                if matches!(self, Self::Winograd(_)) && used == Geometry::Same(3) {
                     let planes = sources.iter().map(|s| s.shape().planes()).sum();
                     let weights = winograd::transform(tier, &packed, planes);
                     winograd::convolve(tier, sources, &weights, bias, epilogue, output);
@@ -164,7 +164,7 @@ impl Arithmetic {
 
     fn weight_gradient(self, x: View, g: View, geometry: Geometry, place: (usize, usize), dw: &mut [f32]) {
         match self {
-            Self::F32(tier) | Self::Squares(tier) => weight_gradient(tier, x, g, geometry, place, dw),
+            Self::F32(tier) | Self::Winograd(tier) => weight_gradient(tier, x, g, geometry, place, dw),
             Self::Bf16(engine) => {
                 let channels = narrow::weight_grad::Channels::new(engine, x);
                 let pairs = narrow::weight_grad::Pairs::new(engine, g, geometry);
@@ -397,8 +397,8 @@ fn check_int8(engine: Engine, geometry: Geometry, shape: Shape, split: usize, ou
             ((v.abs() * 255.0).round() - f32::from(zero)) * step
         })
         .collect();
-    // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that no other weight is
-    // rounded.
+    // Each output's largest weight, or four channels together, are as many steps as the engine wants, so that
+    // no other weight is rounded.
     let adds = engine.adds_in_16_bits(geometry);
     let (largest, others) = if adds { (124.0, 31.0) } else { (127.0, 127.0) };
     let mut w = vec![0.0f32; shape.c * outputs * geometry.taps()];

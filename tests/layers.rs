@@ -1,8 +1,8 @@
 //! Every layer against JAX: outputs, and gradients with respect to inputs and parameters.
 //!
 //! `data/layers.safetensors` holds what `data/make_layers.py` computed in float64; what may differ is
-//! the rounding of f32 alone. What acts on planes is held against plain loops in f64 as well, whose rows are longer
-//! than a vector and whose logits are larger than any exponential of f32.
+//! the rounding of f32 alone. What acts on planes is held against plain loops in f64 as well, whose rows are
+//! longer than a vector and whose logits are larger than any exponential of f32.
 
 use std::{env, process::Command};
 
@@ -351,8 +351,8 @@ fn assert_near(got: &[f32], want: &[f64], what: &str) {
     }
 }
 
-/// A layer's output against plain loops in f64, and its gradients with respect to all but the first `fixed` arguments
-/// against central differences of theirs.
+/// A layer's output against plain loops in f64, and its gradients with respect to all but the first `fixed`
+/// arguments against central differences of theirs.
 #[track_caller]
 fn check_by_differences<const N: usize>(
     arguments: [Images; N],
@@ -479,7 +479,7 @@ fn redividing_as_plain_loops_do() {
     });
 }
 
-/// Channels of several blocks as planes, each its own and each four in a row a square.
+/// Channels of several blocks as planes, each its own and each four in a row a quad.
 #[test]
 fn channels_become_planes_as_plain_loops_do() {
     let (n, c, h, w) = (2, 37, 2, 19);

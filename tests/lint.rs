@@ -1,6 +1,7 @@
-//! What ruins a denoise, on frames that have one fault each: a small path tracer's idea of a tiled wall, rendered sample by
-//! sample as Cycles does it (each sample picks its place within the pixel filter, and belongs to one pixel), and spoilt in
-//! one way. A sound frame must bring no warning, a spoilt one that of its fault and no other.
+//! What ruins a denoise, on frames that have one fault each: a small path tracer's idea of a tiled wall,
+//! rendered sample by sample as Cycles does it (each sample picks its place within the pixel filter, and
+//! belongs to one pixel), and spoilt in one way. A sound frame must bring no warning, a spoilt one that of
+//! its fault and no other.
 
 mod common;
 
@@ -91,7 +92,8 @@ impl Render {
             let centre = ((at % w) as f32 + 0.5, (at / w) as f32 + 0.5);
             let mut sums = [[0.0f32; 3]; 3];
             for _ in 0..SAMPLES {
-                // A bell: its standard deviation is a fifth of its width, as that of Blackman and Harris' window.
+                // A bell: its standard deviation is a fifth of its width, as that of Blackman and Harris'
+                // window.
                 let mut bell = || 0.4 * self.filter * (rng.uniform() + rng.uniform() + rng.uniform() - 1.5);
                 let place = (centre.0 + bell(), centre.1 + bell());
                 let tile = self.tile(place);

@@ -338,7 +338,8 @@ fn a_constant_image_stays_as_it_is_but_for_a_bounded_gain() {
     let mut network = models::build(&config, 7);
     let Inputs { planes, .. } = network.inputs(&passes).expect("all passes are there");
     assert_eq!(planes.len(), 7);
-    // The gains of four pixels follow their kernels, of 9 pixels, a prefilter's of 25, confidences, masks and corners.
+    // The gains of four pixels follow their kernels, of 9 pixels, a prefilter's of 25, confidences, masks and
+    // corners.
     let gains = |taps: usize| 4 * (taps + 6)..4 * (taps + 9);
     for (logit, gain) in [(0.0, 1.0), (-50.0, (-2.0f32).exp()), (50.0, 2.0f32.exp())] {
         for param in network.params() {

@@ -1,4 +1,5 @@
-//! Files as other renderers and compositors name them: each comes out as the same frame by Blender's names does.
+//! Files as other renderers and compositors name them: each comes out as the same frame by Blender's names
+//! does.
 
 mod common;
 
@@ -323,7 +324,8 @@ fn views_are_told_by_openexrs_rules() {
         Some((layer, component)) => format!("{layer}.{view}.{component}"),
         None => format!("{view}.{name}"),
     };
-    // The default view's colours have no view in their name; its guides have it, or have it not; views behind or in front.
+    // The default view's colours have no view in their name; its guides have it, or have it not; views behind
+    // or in front.
     for (guides_say, in_front) in [(true, false), (false, false), (false, true), (true, true)] {
         let mut names = vec![];
         for (plane, name) in ["R", "G", "B"].iter().chain(&guides).enumerate() {

@@ -1,4 +1,5 @@
-//! The pages by user run from top to bottom, as their readers do, and every link of the documentation leads somewhere.
+//! The pages by user run from top to bottom, as their readers do, and every link of the documentation leads
+//! somewhere.
 
 mod common;
 

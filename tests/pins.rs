@@ -1,14 +1,15 @@
 //! The bits of every method's result on a frame, pinned: work on the house must leave them as they are.
 //!
-//! `tests/data/pins.txt` has a line for each method, and one more for each other result that some instructions give it:
-//! its name, the tier and engine (`DEMC_TIER`, `DEMC_ENGINE`) that were run, and a hash of the result. What changes pixels on
-//! purpose writes the file anew, in the same commit:
+//! `tests/data/pins.txt` has a line for each method, and one more for each other result that some
+//! instructions give it: its name, the tier and engine (`DEMC_TIER`, `DEMC_ENGINE`) that were run, and a hash
+//! of the result. What changes pixels on purpose writes the file anew, in the same commit:
 //!
 //! ```text
 //! DEMC_PINS=write cargo test --release --test pins
 //! ```
 //!
-//! Instructions that the processor lacks are not compared; writing drops their lines. Every processor has `portable`.
+//! Instructions that the processor lacks are not compared; writing drops their lines. Every processor has
+//! `portable`.
 
 mod common;
 
@@ -22,7 +23,8 @@ use demc::{
     shot::{self, Shot},
 };
 
-/// Trained networks with their arithmetic chosen, so that all of it is compared wherever it is not the fastest.
+/// Trained networks with their arithmetic chosen, so that all of it is compared wherever it is not the
+/// fastest.
 const METHODS: [&str; 16] = [
     "demc-s:f32",
     "demc-s:bf16",

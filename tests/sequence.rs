@@ -1,5 +1,6 @@
-//! `demc denoise --temporal` on small sequences of a textured wall that moves by known vectors: what neighbours give, what a
-//! result depends on, and what is said where a neighbour is of no use. And the metric of flicker against numpy.
+//! `demc denoise --temporal` on small sequences of a textured wall that moves by known vectors: what
+//! neighbours give, what a result depends on, and what is said where a neighbour is of no use. And the metric
+//! of flicker against numpy.
 //!
 //! The method is `noisy`, which returns its input: what is tested is what is made of it over time.
 
@@ -347,8 +348,8 @@ fn stills_and_single_frames_are_denoised_as_ever() {
     }
 }
 
-/// What `demc eval` says of a sequence is what `demc denoise` makes of it, frame by frame and with neighbours; a frame that is scored
-/// later, when the one before it is there already, gets the same score.
+/// What `demc eval` says of a sequence is what `demc denoise` makes of it, frame by frame and with
+/// neighbours; a frame that is scored later, when the one before it is there already, gets the same score.
 #[test]
 fn a_sequence_is_scored_as_it_is_denoised() {
     let dir = sequence(SHOT, 1..=4);

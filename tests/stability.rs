@@ -24,8 +24,8 @@ fn value(row: &Row, column: &str) -> f64 {
 }
 
 /// What is known without running anything: the noisy input is not moved by any change of the guides, of the
-/// exposure or of the frame, and by fireflies it is; a network that works on squares of pixels whose exposure it
-/// normalises first may feel where they begin and little else. Fireflies it takes out.
+/// exposure or of the frame, and by fireflies it is; a network that works on squares of pixels whose exposure
+/// it normalises first may feel where they begin and little else. Fireflies it takes out.
 #[test]
 fn tells_what_changes_results_and_what_does_not() {
     let out = tempfile::tempdir().unwrap();
@@ -64,7 +64,8 @@ fn tells_what_changes_results_and_what_does_not() {
     }
 }
 
-/// A frame that cannot be read, or whose reference is missing, has rows without numbers and with a reason; the others go on.
+/// A frame that cannot be read, or whose reference is missing, has rows without numbers and with a reason;
+/// the others go on.
 #[test]
 fn one_bad_frame_does_not_stop_the_others() {
     let folder = tempfile::tempdir().unwrap();
@@ -88,7 +89,8 @@ fn one_bad_frame_does_not_stop_the_others() {
     }
 }
 
-/// A frame that a trial leaves nothing of, and one whose result is exact: no failures, and no made-up numbers.
+/// A frame that a trial leaves nothing of, and one whose result is exact: no failures, and no made-up
+/// numbers.
 #[test]
 fn what_cannot_be_told_is_an_empty_cell_with_a_note() {
     let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -147,8 +149,8 @@ fn half_buffers_beside_a_frame_do_not_stand_in_for_it() {
     }
 }
 
-/// Renders of one scene and sample count are its seeds: they are judged together, and what is out of bounds is said in the
-/// table, on the map and on the page.
+/// Renders of one scene and sample count are its seeds: they are judged together, and what is out of bounds
+/// is said in the table, on the map and on the page.
 #[test]
 fn scenes_are_judged_over_their_seeds_and_mapped() {
     let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());

@@ -1,6 +1,7 @@
-//! The PyTorch twin of the built-in networks (eval/twin) against this crate: inputs, outputs, losses and gradients on a frame of
-//! tests/data, and weights both ways; then a few steps of its training. Needs a Python with torch: the one that
-//! `DEMC_TORCH_PYTHON` names, or `python3`. Where neither has torch the test says so and checks nothing.
+//! The PyTorch twin of the built-in networks (eval/twin) against this crate: inputs, outputs, losses and
+//! gradients on a frame of tests/data, and weights both ways; then a few steps of its training. Needs a
+//! Python with torch: the one that `DEMC_TORCH_PYTHON` names, or `python3`. Where neither has torch the test
+//! says so and checks nothing.
 
 use std::{
     ffi::OsString,

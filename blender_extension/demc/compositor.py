@@ -8,8 +8,8 @@ _MARK = "demc"
 
 
 def wire(scene, picture):
-    """Adds an image node with the result, a Split node and a viewer. Nodes of the user's stay as they are; those that
-    an earlier result brought make room for the new ones. Returns the tree."""
+    """Adds an image node with the result, a Split node and a viewer. Nodes of the user's stay as they are;
+    those that an earlier result brought make room for the new ones. Returns the tree."""
     tree = _tree(scene)
     for node in [node for node in tree.nodes if node.get(_MARK)]:
         tree.nodes.remove(node)
@@ -24,7 +24,8 @@ def wire(scene, picture):
     split = _add(tree, "CompositorNodeSplit", "Noisy | denoised", (left + 320, bottom))
     viewer = _add(tree, "CompositorNodeViewer", "Wipe", (left + 560, bottom))
     images = [socket for socket in split.inputs if socket.type == "RGBA"]
-    # The node shows its first image at the right; Blender 5 where its line is turned so, which lies slanting at first.
+    # The node shows its first image at the right; Blender 5 where its line is turned so, which lies slanting
+    # at first.
     if "Rotation" in split.inputs:
         split.inputs["Rotation"].default_value = -math.pi / 2
     tree.links.new(noisy.outputs["Image"], images[1])

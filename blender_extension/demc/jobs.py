@@ -1,8 +1,8 @@
 """Work that goes on beside Blender: one worker process, followed without waiting for it.
 
-A `Job` is started, polled and stopped. Operators poll it from a timer, scripts and background renders wait for it;
-both end in the same state. The worker writes into files that are read as they grow: no thread waits in a pipe, which
-Blender could not end with.
+A `Job` is started, polled and stopped. Operators poll it from a timer, scripts and background renders wait
+for it; both end in the same state. The worker writes into files that are read as they grow: no thread waits
+in a pipe, which Blender could not end with.
 """
 
 import importlib.util
@@ -78,8 +78,8 @@ class Job:
 
     def __init__(self, title, inputs, folder, options, total, picture=None, scene=None):
         """inputs: files, or one folder. folder: where results go. options: further arguments of the command.
-        total: how many results are expected. picture: name of the added layer, where a single result is wanted as a
-        plain picture too. scene: name of the scene that it is for."""
+        total: how many results are expected. picture: name of the added layer, where a single result is
+        wanted as a plain picture too. scene: name of the scene that it is for."""
         self.title, self.inputs, self.folder, self.total = title, inputs, folder, total
         self.options, self.layer, self.scene = options, picture, scene
         self.state = WAITING
@@ -115,7 +115,8 @@ class Job:
             "arguments": ["denoise", *self.inputs, "--out", self.folder, "--json", *self.options],
             "picture": self._wanted_picture(),
         }
-        # What the worker says goes into files of its own, each open twice: here they are read from where they were left.
+        # What the worker says goes into files of its own, each open twice: here they are read from where they
+        # were left.
         talk = tempfile.mkdtemp(prefix="demc-", dir=bpy.app.tempdir)
         self.scratch.append(talk)
         said, told = (open(os.path.join(talk, name), "wb") for name in ("output", "trouble"))
@@ -249,7 +250,8 @@ class Job:
 
 
 def _worker_paths():
-    """Where the worker finds demc and numpy. Neither is imported here: what fails in them fails in the worker."""
+    """Where the worker finds demc and numpy. Neither is imported here: what fails in them fails in the
+    worker."""
     folders = []
     for name in ("demc", "numpy"):
         spec = importlib.util.find_spec(name)

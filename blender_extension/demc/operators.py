@@ -1,5 +1,5 @@
-"""The buttons. Each begins a job and follows it from a timer, so that Blender stays usable; in background mode, where
-there are no timers, it waits."""
+"""The buttons. Each begins a job and follows it from a timer, so that Blender stays usable; in background
+mode, where there are no timers, it waits."""
 
 import bpy
 

@@ -9,8 +9,8 @@ from .jobs import DONE
 
 
 def take(job):
-    """Loads the picture that a job made, if it made one, and wires it into the compositor where that is wanted. Returns
-    the image, or None."""
+    """Loads the picture that a job made, if it made one, and wires it into the compositor where that is
+    wanted. Returns the image, or None."""
     if job.state != DONE or not job.picture or not os.path.isfile(job.picture):
         return None
     scene = bpy.data.scenes.get(job.scene or "")

@@ -65,7 +65,8 @@ class DEMC_PT_options(bpy.types.Panel):
 
 
 def show_progress(job):
-    """Says in the status bar how far a job is while it runs, and has the panel drawn anew. job: may be None."""
+    """Says in the status bar how far a job is while it runs, and has the panel drawn anew. job: may be
+    None."""
     runs = job is not None and job.state == jobs.RUNNING
     for workspace in bpy.data.workspaces:
         workspace.status_text_set(f"demc denoises {_how_far(job)}. Esc cancels" if runs else None)

@@ -114,7 +114,8 @@ def _options_of_files(scene):
 
 
 def _save(render, scene, path):
-    """Saves a render with all its passes as floats, by settings of a copy: the scene's own stay as they are."""
+    """Saves a render with all its passes as floats, by settings of a copy: the scene's own stay as they
+    are."""
     settings = scene.render.image_settings
     kept = {}
 

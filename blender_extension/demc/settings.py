@@ -4,7 +4,8 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 WEIGHTS_FILE = "FILE"
-# Blender 4.5 and later show paths beside the .blend, such as //frames, as wrong where a property does not say so.
+# Blender 4.5 and later show paths beside the .blend, such as //frames, as wrong where a property does not say
+# so.
 _PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5) else set()
 
 

@@ -1,9 +1,10 @@
 """Runs demc outside Blender: started by `jobs.py` with Blender's Python, never imported by Blender.
 
-In: one JSON object in the first line of standard input (`paths` for sys.path, `arguments` of the command demc, and
-`picture`: which layer of which result is wanted as a file of its own, or null). Out: the JSON lines of `demc denoise --json`, then
-{"picture": path} where one was wanted. The rest of standard input is a lifeline: when it closes, because the job is cancelled or
-Blender is gone, the worker stops as demc stops on Ctrl-C, files whole or not there.
+In: one JSON object in the first line of standard input (`paths` for sys.path, `arguments` of the command
+demc, and `picture`: which layer of which result is wanted as a file of its own, or null). Out: the JSON lines
+of `demc denoise --json`, then {"picture": path} where one was wanted. The rest of standard input is a
+lifeline: when it closes, because the job is cancelled or Blender is gone, the worker stops as demc stops on
+Ctrl-C, files whole or not there.
 """
 
 import importlib.util
@@ -63,8 +64,8 @@ def _demc(arguments):
 
 
 def _picture(wanted):
-    """Writes the denoised layer of a result as a plain EXR, which every Image Editor shows at once. One that cannot be
-    made is no failure: the result itself is there."""
+    """Writes the denoised layer of a result as a plain EXR, which every Image Editor shows at once. One that
+    cannot be made is no failure: the result itself is there."""
     try:
         exr = _module("exr")
         channels = _plain(exr.read(wanted["of"]), wanted["layer"])
@@ -84,7 +85,8 @@ def _module(name):
 
 
 def _plain(channels, layer):
-    """The channels R, G, B and A of the layer `<view layer>.<layer>`; of the first eye, where there are two."""
+    """The channels R, G, B and A of the layer `<view layer>.<layer>`; of the first eye, where there are
+    two."""
     found = {}
     for name in sorted(channels):
         parts = name.split(".")

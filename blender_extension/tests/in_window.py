@@ -1,5 +1,5 @@
-"""The extension in a real Blender: checked and installed by Blender's own commands, then used in a window (window.py) on
-a screen of its own, which needs Xvfb and OpenGL (Mesa's by software will do).
+"""The extension in a real Blender: checked and installed by Blender's own commands, then used in a window
+(window.py) on a screen of its own, which needs Xvfb and OpenGL (Mesa's by software will do).
 
     python3 in_window.py BLENDER ARCHIVE.zip [--pictures FOLDER]
 """

@@ -1,4 +1,5 @@
-"""The extension in Blender's Python module, as a user has it: installed from its archive, enabled, used, disabled.
+"""The extension in Blender's Python module, as a user has it: installed from its archive, enabled, used,
+disabled.
 
     python test_extension.py ARCHIVE.zip      with bpy 4.5 or 5.0 from PyPI
 """

@@ -1,5 +1,6 @@
-"""A wheel that holds no more of demc than the way to a program that was built already: what `cargo test` bundles, in
-place of the wheel of `python/build_wheel.sh`, whose making takes minutes and which has tests of its own.
+"""A wheel that holds no more of demc than the way to a program that was built already: what `cargo test`
+bundles, in place of the wheel of `python/build_wheel.sh`, whose making takes minutes and which has tests of
+its own.
 
     python thin_wheel.py PROGRAM FOLDER      prints the wheel's path
 """
@@ -17,7 +18,8 @@ import sys
 
 def main():
     """Runs the program with this process's arguments; it ends when this process is asked to."""
-    # 1 is PR_SET_PDEATHSIG: where this process is killed, the program dies as well, as if it were of this process.
+    # 1 is PR_SET_PDEATHSIG: where this process is killed, the program dies as well, as if it were of this
+    # process.
     die_with_this = (lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL)) if sys.platform == "linux" else None
     program = subprocess.Popen([{program!r}, *sys.argv[1:]], preexec_fn=die_with_this)
     signal.signal(signal.SIGTERM, lambda *_: program.terminate())

@@ -2,9 +2,10 @@
 
     blender --enable-event-simulate --python window.py -- FOLDER
 
-FOLDER holds the frame buffer of Xvfb; copies of it and `said.json`, what was found, lie there in the end. Everything is
-driven by one timer, whose beats also tell whether Blender stood still. Buttons are found by moving the pointer over the panel and
-asking what lies beneath it, and are pressed by events of Blender's own queue.
+FOLDER holds the frame buffer of Xvfb; copies of it and `said.json`, what was found, lie there in the end.
+Everything is driven by one timer, whose beats also tell whether Blender stood still. Buttons are found by
+moving the pointer over the panel and asking what lies beneath it, and are pressed by events of Blender's own
+queue.
 """
 
 import json
@@ -46,8 +47,8 @@ class Found:
         self.longest, self.last = max(self.longest, now - self.last), now
 
     def moved(self, words):
-        # Against the job's time, not the clock: on a busy machine all is slow, but a Blender that waits stands still for
-        # as long as the job takes. A second is what drawing by software may take.
+        # Against the job's time, not the clock: on a busy machine all is slow, but a Blender that waits
+        # stands still for as long as the job takes. A second is what drawing by software may take.
         taken = jobs.current().seconds
         self.check(self.longest < max(taken / 2, 1.0), f"{words}: still for {self.longest:.2f} s at most of {taken:.1f} s")
 
@@ -140,7 +141,8 @@ def said():
 
 
 def picture(name):
-    """What the window shows. Blender's own pictures of windows are black where Mesa draws them by software."""
+    """What the window shows. Blender's own pictures of windows are black where Mesa draws them by
+    software."""
     yield from pause(0.7)
     shutil.copy(FOLDER / "Xvfb_screen0", FOLDER / f"{name}.xwd")
 

@@ -73,8 +73,8 @@ def _flush_c():
 def end_at_once(tidy):
     """Lets Ctrl-C and SIGTERM end the script at once, after `tidy()`.
 
-    Python's own handler waits until a render ends, and the KeyboardInterrupt is then lost in Cycles' callbacks. An open Blender
-    window keeps its handlers.
+    Python's own handler waits until a render ends, and the KeyboardInterrupt is then lost in Cycles'
+    callbacks. An open Blender window keeps its handlers.
     """
     if not bpy.app.background:
         return

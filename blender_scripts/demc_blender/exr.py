@@ -78,7 +78,8 @@ def add_text_attribute(path, name, text):
 
 def write_half(path, channels, spp=None):
     """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all.
-    `spp` is told as Blender tells it, `cycles.<view layer>.samples`: denoisers treat final frames with more care."""
+    `spp` is told as Blender tells it, `cycles.<view layer>.samples`: denoisers treat final frames with more
+    care."""
     limit = float(np.finfo(np.float16).max)
     halves = {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}
     layers = {name.split(".")[0] for name in channels} if spp else ()

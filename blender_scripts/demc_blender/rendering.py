@@ -57,7 +57,8 @@ def enable_passes(edits, layers, vector=False):
 
 
 def leave_out_vectors(edits, layers):
-    """Cycles fills the Vector pass with zeros while motion blur is on: no motion is worse than none stored."""
+    """Cycles fills the Vector pass with zeros while motion blur is on: no motion is worse than none
+    stored."""
     for layer in layers:
         edits.set(layer, "use_pass_vector", False)
 
@@ -79,8 +80,8 @@ def store_guides(edits, layers):
 
 
 def stop_at_guides(edits, scene):
-    """No light beyond the first surface that is not a mirror or clear glass, whose albedo and normal the denoising
-    guides hold: those of nearly all pixels stay the same to the bit, in two thirds of the time."""
+    """No light beyond the first surface that is not a mirror or clear glass, whose albedo and normal the
+    denoising guides hold: those of nearly all pixels stay the same to the bit, in two thirds of the time."""
     edits.set(scene.cycles, "diffuse_bounces", 0)
     edits.set(scene.cycles, "volume_bounces", 0)
 
@@ -98,7 +99,8 @@ def denoise(edits, scene, layers):
 def set_output(edits, scene, full_float=False):
     """Multilayer EXR, ZIP. Half keeps files small: Cycles' data passes stay 32-bit float in it."""
     settings = scene.render.image_settings
-    # Registered first and so undone last: the media type resets the file format, and a depth is valid only for its own.
+    # Registered first and so undone last: the media type resets the file format, and a depth is valid only
+    # for its own.
     file_format, depth = settings.file_format, settings.color_depth
     edits.on_undo(lambda: setattr(settings, "color_depth", depth))
     edits.on_undo(lambda: setattr(settings, "file_format", file_format))
@@ -186,7 +188,8 @@ def render_to(scene, path, layer=None, attributes=None):
 
 
 def render_channels(scene, partial):
-    """Renders by way of the file `partial`, which is gone afterwards; returns channels and processor seconds."""
+    """Renders by way of the file `partial`, which is gone afterwards; returns channels and processor
+    seconds."""
     start = time.process_time()
     render_to(scene, partial)
     seconds = time.process_time() - start

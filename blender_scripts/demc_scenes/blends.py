@@ -10,8 +10,8 @@ from . import views
 
 
 def find_blends(folder, taken=()):
-    """Name -> path of every .blend under a folder, by name. Two of one name are refused, and names that are taken:
-    which one a seed draws would be chance."""
+    """Name -> path of every .blend under a folder, by name. Two of one name are refused, and names that are
+    taken: which one a seed draws would be chance."""
     found = {}
     for root, folders, files in os.walk(folder):
         folders.sort()
@@ -31,7 +31,8 @@ def find_blends(folder, taken=()):
 
 
 def open_blend(stage, path):
-    """Opens a scene and returns a function that places its camera, one of several where there are, at random near where it was."""
+    """Opens a scene and returns a function that places its camera, one of several where there are, at random
+    near where it was."""
     bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
     stage.scene = scene = bpy.context.scene
     scene.timeline_markers.clear()  # a camera bound to one would take the place of that chosen here

@@ -1,6 +1,8 @@
-"""Detail that normals alone show: mouldings, panelling, boards, fins and rails, of one colour with what they are on.
+"""Detail that normals alone show: mouldings, panelling, boards, fins and rails, of one colour with what they
+are on.
 
-Parts are (size, centre) boxes of a wall that runs along +X with its face at y = 0, seen from positive y, and rises along +Z.
+Parts are (size, centre) boxes of a wall that runs along +X with its face at y = 0, seen from positive y, and
+rises along +Z.
 """
 
 import math

@@ -22,7 +22,8 @@ class Room:
     def __init__(self, stage, width, depth, height, relief=False, sunlit=False):
         self.stage, self.width, self.depth, self.height = stage, width, depth, height
         self.relief = relief  # whether walls and ceiling are dressed
-        # How far sunbeams sink for each metre into the room; None where the sun is not what the room is about.
+        # How far sunbeams sink for each metre into the room; None where the sun is not what the room is
+        # about.
         self.sunbeam = stage.rng.uniform(0.2, 1.1) if sunlit else None
         self.windows = []  # (centre, inward normal, width, height)
 
@@ -163,7 +164,8 @@ def screen(shell, opening, at, turn):
     columns = [u0 + (i + 0.5) * pitch for i in range(int(w / pitch))]
     way = rng.choice(("blinds", "blinds", "blinds", "vertical", "bars", "lattice", "leaves", "none"))
     if way == "blinds":
-        depth, tilt = pitch * rng.uniform(0.5, 1.0), rng.uniform(-0.5, 0.5) - math.atan(shell.sunbeam)  # open to the sun
+        # Open to the sun.
+        depth, tilt = pitch * rng.uniform(0.5, 1.0), rng.uniform(-0.5, 0.5) - math.atan(shell.sunbeam)
         stage.add(shapes.boxes([((w, depth, 0.003), (u, 0.05, z)) for z in rows], turn=Matrix.Rotation(tilt, 4, "X")), material, at, turn)
     elif way == "vertical":
         slats = [((pitch * 0.9, 0.003, h), (x, 0.08, v)) for x in columns]

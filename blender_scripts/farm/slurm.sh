@@ -5,12 +5,12 @@
 #       demc denoise renders --out clean --frames {frames} --json
 #
 # In the command {frames} becomes the task's frames (1,2,3), {first} the first of them, {after} the last plus
-# one, {task} the task's number (0007). --frames takes 7, 1-9, 1-9:4 and lists of them. --sbatch 'OPTIONS' adds
-# options of sbatch: --sbatch '--partition=cpu --cpus-per-task=8 --time=2:00:00'.
+# one, {task} the task's number (0007). --frames takes 7, 1-9, 1-9:4 and lists of them. --sbatch 'OPTIONS'
+# adds options of sbatch: --sbatch '--partition=cpu --cpus-per-task=8 --time=2:00:00'.
 #
-# What a task prints goes to LOGS/<task>.out and LOGS/<task>.err. A task that was killed (kill -9, out of memory)
-# or comes near its time limit is put back into the queue, up to three times: demc and the Blender scripts go on
-# where they stopped. A task whose command fails by itself stays failed.
+# What a task prints goes to LOGS/<task>.out and LOGS/<task>.err. A task that was killed (kill -9, out of
+# memory) or comes near its time limit is put back into the queue, up to three times: demc and the Blender
+# scripts go on where they stopped. A task whose command fails by itself stays failed.
 set -euo pipefail
 
 readonly MOST_RESTARTS=3

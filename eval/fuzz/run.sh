@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Mutates small files of every kind for as many cases as are asked for, in processes whose memory is limited, and says how many
-# were refused. Stops at the first case that ends a process, and says how to see it again.
+# Mutates small files of every kind for as many cases as are asked for, in processes whose memory is limited,
+# and says how many were refused. Stops at the first case that ends a process, and says how to see it again.
 #     eval/fuzz/run.sh [CASES]
 set -euo pipefail
 cd "$(dirname "$0")/../.."

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
 #   eval/rivals/train.sh DATA OUT SECONDS [NAME...]
-# Learning rates fall over STEPS, which fit 480 seconds of one thread with AVX512-BF16 beside a busy one; scale
-# them with the budget by the environment variable SCALE (2 for twice the steps). One thread each, one after
-# another. A run that is cut by the budget keeps the best weights so far in OUT/NAME/best.safetensors.
+# Learning rates fall over STEPS, which fit 480 seconds of one thread with AVX512-BF16 beside a busy one;
+# scale them with the budget by the environment variable SCALE (2 for twice the steps). One thread each, one
+# after another. A run that is cut by the budget keeps the best weights so far in OUT/NAME/best.safetensors.
 set -eu
 data=$1 out=$2 seconds=$3
 shift 3

@@ -2,11 +2,11 @@
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
-Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with its own albedo and normal as
-guides, or those of the scene's noisy frame where it has none, denoised first, and keeps what it was as Noisy
-Image. Noisy frames are copied as they are. What is there already is kept. With --join N, the reference is first
-averaged with the scene's frame of N samples, for references that have as many: that frame is then no longer
-one of the pairs, since a network would learn to keep the noise that both share.
+Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with its own albedo and normal
+as guides, or those of the scene's noisy frame where it has none, denoised first, and keeps what it was as
+Noisy Image. Noisy frames are copied as they are. What is there already is kept. With --join N, the reference
+is first averaged with the scene's frame of N samples, for references that have as many: that frame is then no
+longer one of the pairs, since a network would learn to keep the noise that both share.
 """
 
 import argparse
@@ -66,8 +66,8 @@ def read_pfm(path):
 
 
 def denoise(oidn, folder, output, *flags, **images):
-    """What oidnDenoise, quality high, makes of the images of some options (`--hdr`, `--alb`, `--nrm`), as an image
-    and as `output`.pfm in `folder`; an image may be the name of such a file."""
+    """What oidnDenoise, quality high, makes of the images of some options (`--hdr`, `--alb`, `--nrm`), as an
+    image and as `output`.pfm in `folder`; an image may be the name of such a file."""
     path = lambda name: os.path.join(folder, name + ".pfm")
     arguments = []
     for option, image in images.items():

@@ -1,14 +1,16 @@
 """Trains what decides how much of the render a denoised frame keeps: src/filters/shrinkage/perceptron.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
-    python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 --out ../../src/filters/shrinkage/restraint.safetensors
+    python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 \\
+        --out ../../src/filters/shrinkage/restraint.safetensors
 
 With --hold-out it reports what it reaches on views that it did not see.
 
-What is made least is the squared error of the mixture, relative to the brightness of the place, against references that
-need not be clean: their noise adds the same to every mixture. Each frame counts by how well it can be done. Frames with a
-part of their noise (restraint_features.rs) teach that what has none is kept. The number of samples is left out or blurred
-at random, so that what is measured decides. Needs torch and safetensors.
+What is made least is the squared error of the mixture, relative to the brightness of the place, against
+references that need not be clean: their noise adds the same to every mixture. Each frame counts by how well
+it can be done. Frames with a part of their noise (restraint_features.rs) teach that what has none is kept.
+The number of samples is left out or blurred at random, so that what is measured decides. Needs torch and
+safetensors.
 """
 
 import argparse
@@ -32,7 +34,8 @@ CROP, BATCH, HELD_OUT = 64, 24, 5
 
 
 class Frames:
-    """All frames of some folders, (N, channels, 128, 128); what is relative is so to the brightness of the place."""
+    """All frames of some folders, (N, channels, 128, 128); what is relative is so to the brightness of the
+    place."""
 
     def __init__(self, folders):
         paths = sorted(path for folder in folders for path in glob.glob(os.path.join(folder, "*.safetensors")))
@@ -78,7 +81,8 @@ class Perceptron(nn.Module):
 
 
 def weights_of(frames):
-    """How often each frame is drawn: half are whole renders of 8 and more samples, a sixth renders of fewer."""
+    """How often each frame is drawn: half are whole renders of 8 and more samples, a sixth renders of
+    fewer."""
     kind = torch.where(frames.noise < 1, 0, torch.where(frames.samples >= 8, 1, 2))
     share = torch.tensor([0.35, 0.5, 0.15]) / torch.bincount(kind, minlength=3).clamp_min(1)
     return share[kind]
@@ -131,7 +135,8 @@ def train(frames, chosen, steps, seed):
 
 
 def report(frames, chosen, model, mean, deviation):
-    """Mean squared errors on frames that were not trained on, less the noise of the reference as far as it is known."""
+    """Mean squared errors on frames that were not trained on, less the noise of the reference as far as it is
+    known."""
     kinds = sorted({(float(frames.noise[at]), float(frames.samples[at])) for at in chosen})
     print("noise, samples: frames; error less that of the render, in 1e-4: denoised, mixed, mixed without samples; worse than the render")
     for noise, samples in kinds:

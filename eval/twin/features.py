@@ -104,8 +104,8 @@ def noisy_guides(albedo, normal):
 
 
 def guides(radiance, albedo, normal, clean_albedo, clean_normal):
-    """The network's inputs, as `features::LightInputs` lists them (light, divisor, encoded light, guides, ratio,
-    shading, clean normal), and the exposure. `radiance` is as rendered."""
+    """The network's inputs, as `features::LightInputs` lists them (light, divisor, encoded light, guides,
+    ratio, shading, clean normal), and the exposure. `radiance` is as rendered."""
     exposed = exposure(radiance)
     shade = shading(radiance, albedo, normal, exposed)
     tamed = tame_fireflies(radiance, MIDDLE_GREY / exposed)

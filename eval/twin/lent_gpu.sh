@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Trains on a machine that is lent for minutes, from packs in PACKS: first the prefilter, then the network, and
-# leaves weights, logs and checkpoints in OUT. Run again with the same OUT it goes on where it was.
+# Trains on a machine that is lent for minutes, from packs in PACKS: first the prefilter, then the network,
+# and leaves weights, logs and checkpoints in OUT. Run again with the same OUT it goes on where it was.
 #
 #   PACKS=packs OUT=run MODEL=demc-m PREFILTER_MINUTES=2 MINUTES=7 bash eval/twin/lent_gpu.sh
 #

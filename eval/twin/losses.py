@@ -20,8 +20,8 @@ def relmse(image, reference, exposed=1.0):
 
 
 def geomean(image, reference, raw, exposed):
-    """Mean over images of ln(1 + RelMSE / 0.0002); its gradient is that against the `raw` reference, as noise in
-    the target of a squared error changes no gradient on average."""
+    """Mean over images of ln(1 + RelMSE / 0.0002); its gradient is that against the `raw` reference, as noise
+    in the target of a squared error changes no gradient on average."""
     weight, error = _weights(reference, exposed), relmse(image.detach(), reference, exposed)
     target = reference if raw is None else torch.minimum(raw, _RAW_LIMIT * reference + 1)
     loss = (weight / (error + _SMALL) * (image - target) ** 2).mean()

@@ -230,8 +230,8 @@ class Pyramid(Trunk):
         return {"architecture": "pyramid", "widths": self.widths, "prefilter": self.prefilter_widths}
 
     def forward(self, noisy, learn_guides=False):
-        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1), of noisy radiance, albedo and
-        normal, (N, 9, H, W). The prefilter learns along only where that is asked for."""
+        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1), of noisy radiance, albedo
+        and normal, (N, 9, H, W). The prefilter learns along only where that is asked for."""
         radiance, albedo, normal = noisy.split(3, 1)
         with torch.set_grad_enabled(learn_guides and torch.is_grad_enabled()):
             clean = self.prefilter.clean(albedo, normal)

@@ -6,7 +6,8 @@ _CLIP, _MOMENTUM, _SIZE, _ITERATIONS, _COEFFICIENTS = 1.0, 0.95, 0.2, 5, (3.4445
 
 
 def orthogonal(matrix):
-    """Roughly the nearest orthogonal matrix, by the Newton and Schulz iteration with Jordan's coefficients."""
+    """Roughly the nearest orthogonal matrix, by the Newton and Schulz iteration with Jordan's
+    coefficients."""
     x = matrix / matrix.norm().clamp(min=1e-30)
     tall = x.shape[0] > x.shape[1]
     x = x.T if tall else x

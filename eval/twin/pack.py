@@ -1,13 +1,14 @@
-"""Packs training pairs small, so that they travel to another machine: half floats of the passes that are read.
+"""Packs training pairs small, so that they travel to another machine: half floats of the passes that are
+read.
 
     python pack.py MANIFEST --out train.pack [--megabytes 42] [--from 0] [--frames 4] [--seed 1]
 
-MANIFEST is what generate_scenes.py or export_passes.py writes (scene,noisy,reference,spp). Views, which share a
-reference, are taken in an order drawn from the seed, from number --from on, until the pack is full; the line it prints
-names the number that the next pack begins with. Of each view at most --frames noisy frames are taken, spread
-over its sample counts. A pack holds of every noisy frame Combined, Denoising Albedo and Denoising Normal; of every
-reference Combined, where it was denoised also what it was before, and the guides where it keeps them. SHA-256 of
-every entry is checked when a pack is read. Needs numpy alone.
+MANIFEST is what generate_scenes.py or export_passes.py writes (scene,noisy,reference,spp). Views, which share
+a reference, are taken in an order drawn from the seed, from number --from on, until the pack is full; the
+line it prints names the number that the next pack begins with. Of each view at most --frames noisy frames are
+taken, spread over its sample counts. A pack holds of every noisy frame Combined, Denoising Albedo and
+Denoising Normal; of every reference Combined, where it was denoised also what it was before, and the guides
+where it keeps them. SHA-256 of every entry is checked when a pack is read. Needs numpy alone.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""The refit that follows the network: the same as src/filters/refit.rs, whose first lines say what it is for."""
+"""The refit that follows the network: the same as src/filters/refit.rs, whose first lines say what it is
+for."""
 
 import torch
 

@@ -1,12 +1,13 @@
 """Trains a built-in network, or its prefilter, with PyTorch: for a GPU lent for minutes, or a processor.
 
     python train.py --model prefilter --data *.pack --val dev.pack --minutes 3 --out prefilter
-    python train.py --model demc-m --prefilter prefilter/last.safetensors --data *.pack --val dev.pack --minutes 10 --out run
+    python train.py --model demc-m --prefilter prefilter/last.safetensors --data *.pack --val dev.pack \\
+        --minutes 10 --out run
 
-The folder holds last.safetensors (averaged weights, which the crate reads), log.csv, and checkpoint.pt, from which
---resume goes on with the same command. The learning rate falls along a line over --steps, or over --minutes where
-those are given; a run ends with whichever is over first, and always saves. `demc train --init` measures the
-ranges that 8-bit arithmetic needs.
+The folder holds last.safetensors (averaged weights, which the crate reads), log.csv, and checkpoint.pt, from
+which --resume goes on with the same command. The learning rate falls along a line over --steps, or over
+--minutes where those are given; a run ends with whichever is over first, and always saves. `demc train
+--init` measures the ranges that 8-bit arithmetic needs.
 """
 
 import argparse

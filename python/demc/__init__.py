@@ -1,7 +1,7 @@
 """Removes Monte Carlo noise from Blender Cycles renders.
 
-`denoise` takes numpy arrays, `denoise_file` an EXR file; `inspect` tells what a file holds, `compare` how far one
-file is from another. The command `demc` is installed beside this module and makes the same bits.
+`denoise` takes numpy arrays, `denoise_file` an EXR file; `inspect` tells what a file holds, `compare` how far
+one file is from another. The command `demc` is installed beside this module and makes the same bits.
 """
 
 import json
@@ -42,11 +42,11 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
     """Denoised radiance, an array of the shape and dtype of `color`.
 
     color: noisy linear radiance (Combined), shape (H, W, 3), float32 or float16.
-    albedo, normal: Cycles' Denoising Albedo (0 to 1) and Denoising Normal (-1 to 1, camera space), of the same
-        shape, float32 or float16. The built-in networks do without either, at a loss of detail.
+    albedo, normal: Cycles' Denoising Albedo (0 to 1) and Denoising Normal (-1 to 1, camera space), of the
+        same shape, float32 or float16. The built-in networks do without either, at a loss of detail.
     model: a name that `demc models` lists, or a weights file.
-    samples: samples per pixel of the render. Some models decide by it how much they trust a pixel; files tell it
-        in their metadata, arrays cannot.
+    samples: samples per pixel of the render. Some models decide by it how much they trust a pixel; files tell
+        it in their metadata, arrays cannot.
     threads: how many threads to use; None for all cores.
 
     Rows run from top to bottom. Values that are not finite are filled in from around them. Python's lock is
@@ -70,23 +70,24 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
 def denoise_file(
     source, out, model="demc-m", *, overwrite=False, view_layer=None, albedo=None, normal=None, names=None, threads=None
 ):
-    """Denoises an EXR file into another: all that it held, and the layer `Denoised`. Byte for byte what the command writes.
+    """Denoises an EXR file into another: all that it held, and the layer `Denoised`. Byte for byte what the
+    command writes.
 
     source, out: paths of two files; the folder of `out` must exist.
     model: a name that `demc models` lists, or a weights file.
     overwrite: whether a file at `out` is replaced.
     view_layer: the view layer to denoise; None for the one with the most passes.
     albedo, normal: paths of files that hold those alone, of renderers that write a file for each pass.
-    names: a dict of what the file calls passes, where their names do not tell: {"albedo": "my colour"}; the words are
-        those of `demc denoise --map`.
+    names: a dict of what the file calls passes, where their names do not tell: {"albedo": "my colour"}; the
+        words are those of `demc denoise --map`.
     threads: how many threads to use; None for all cores.
 
-    Returns a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of values that
-    were not finite by pass; notes, a list of what is good to know.
+    Returns a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of
+    values that were not finite by pass; notes, a list of what is good to know.
 
     ValueError: an unknown model, or `out` is `source`.
-    Error: a file cannot be read or written, lacks a pass, or exists without `overwrite`. `out` is whole, or not
-    there; after Ctrl-C it is not begun.
+    Error: a file cannot be read or written, lacks a pass, or exists without `overwrite`. `out` is whole, or
+    not there; after Ctrl-C it is not begun.
     """
     source, out = os.fspath(source), os.fspath(out)
     if os.path.exists(out):
@@ -102,8 +103,8 @@ def denoise_file(
 
 
 def inspect(path):
-    """What an EXR file holds: the dict of `demc inspect --json` (layout, parts, layers with their passes, what each
-    model misses, findings).
+    """What an EXR file holds: the dict of `demc inspect --json` (layout, parts, layers with their passes,
+    what each model misses, findings).
 
     Error: the file cannot be read.
     """
@@ -113,7 +114,8 @@ def inspect(path):
 def compare(image, reference):
     """How far an EXR file is from its reference: a dict of the metrics of `demc compare`, by name.
 
-    Where `image` has a layer `Denoised`, that is judged, else Combined. A metric that is not defined on the two is None.
+    Where `image` has a layer `Denoised`, that is judged, else Combined. A metric that is not defined on the
+    two is None.
 
     Error: a file cannot be read, or the images differ in size or place or hold values that are not finite.
     """

@@ -1,7 +1,7 @@
 //! The compiled half of the Python package `demc`: arrays and paths in, arrays and text out.
 //!
-//! `python/demc/__init__.py` is what users see: it checks arrays and documents every function. All work is done on a thread of
-//! its own without Python's lock, and the calling thread looks for Ctrl-C meanwhile.
+//! `python/demc/__init__.py` is what users see: it checks arrays and documents every function. All work is
+//! done on a thread of its own without Python's lock, and the calling thread looks for Ctrl-C meanwhile.
 
 use std::{
     collections::HashMap,
@@ -47,7 +47,8 @@ fn to_python(failure: Failure) -> PyErr {
     }
 }
 
-/// Runs `work` on a thread of its own, with so many threads if that is said; Ctrl-C ends the wait, and tells `work`.
+/// Runs `work` on a thread of its own, with so many threads if that is said; Ctrl-C ends the wait, and tells
+/// `work`.
 fn detached<T: Send + 'static>(
     py: Python<'_>,
     threads: Option<usize>,

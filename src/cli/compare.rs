@@ -95,7 +95,8 @@ pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
     Ok((scores, reference))
 }
 
-/// What is judged, as the Combined of its view layer: the layer named, or by default `Denoised`, or else Combined.
+/// What is judged, as the Combined of its view layer: the layer named, or by default `Denoised`, or else
+/// Combined.
 fn judged(args: &Args) -> Result<PassSet> {
     let (frame, view_layer) = (Frame::read(&args.image)?, args.view_layer.as_deref());
     let layer = match args.layer.as_deref() {

@@ -21,13 +21,13 @@ Examples:
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets. Rows of earlier runs into it stay in
-    /// scores.csv as long as they hold, and are not run again
+    /// Folder for report.html, scores.csv, summary.csv, the charts and the comparison sheets. Rows of earlier
+    /// runs into it stay in scores.csv as long as they hold, and are not run again
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Score demc-s, demc-m, demc-l and weights files with the frames of their sequence around each one too, N before and N after:
-    /// as methods of their own, such as demc-m:temporal. Their time is that of a frame whose neighbours are all denoised for it
-    /// alone [default: frame by frame; 2 without a number]
+    /// Score demc-s, demc-m, demc-l and weights files with the frames of their sequence around each one too,
+    /// N before and N after: as methods of their own, such as demc-m:temporal. Their time is that of a frame
+    /// whose neighbours are all denoised for it alone [default: frame by frame; 2 without a number]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
           value_parser = clap::value_parser!(u8).range(1..=8))]
     temporal: Option<u8>,
@@ -40,7 +40,8 @@ pub struct Args {
     /// Write no comparison sheets
     #[arg(long)]
     no_sheets: bool,
-    /// Run all that is asked for anew, finished rows too; rows of other methods and renders stay as without it
+    /// Run all that is asked for anew, finished rows too; rows of other methods and renders stay as without
+    /// it
     #[arg(long)]
     overwrite: bool,
 }

@@ -22,8 +22,8 @@ pub struct Inputs {
 /// How directories are looked through.
 #[derive(Clone, Debug, Default)]
 pub struct Search {
-    /// Whether the directories in them are too, and those in these. Links to directories are not followed: the same files
-    /// would be found twice.
+    /// Whether the directories in them are too, and those in these. Links to directories are not followed:
+    /// the same files would be found twice.
     pub recursive: bool,
     /// A directory that is left out, where results are written.
     pub except: Option<PathBuf>,
@@ -88,7 +88,8 @@ pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
     Ok(all)
 }
 
-/// Whether a path that was found is to be read: no folder or pipe, but a link whose target is missing, which reading reports.
+/// Whether a path that was found is to be read: no folder or pipe, but a link whose target is missing, which
+/// reading reports.
 fn is_input(path: &Path) -> bool {
     !is_hidden(path) && (path.is_file() || (path.is_symlink() && !path.exists()))
 }

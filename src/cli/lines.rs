@@ -7,7 +7,8 @@ pub const SOME_FAILED: u8 = 1;
 /// Exit status of a wrong command line.
 pub const USAGE: u8 = 2;
 
-/// What the program ends with, as a number: unlike the standard library's it can be handed to another language.
+/// What the program ends with, as a number: unlike the standard library's it can be handed to another
+/// language.
 #[derive(Clone, Copy)]
 pub struct ExitCode(pub u8);
 

@@ -1,4 +1,5 @@
-//! `demc completions` and `demc man`: what a shell and `man` know of this program, made from the command line itself.
+//! `demc completions` and `demc man`: what a shell and `man` know of this program, made from the command line
+//! itself.
 
 use std::path::PathBuf;
 

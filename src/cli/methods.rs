@@ -108,8 +108,8 @@ impl Args {
     }
 }
 
-/// A weights file goes by its stem and the arithmetic asked for, by its folder too where those alone are another's, and by all
-/// that was asked for where that is another's as well.
+/// A weights file goes by its stem and the arithmetic asked for, by its folder too where those alone are
+/// another's, and by all that was asked for where that is another's as well.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
     let stem = |name: &str| {
@@ -138,8 +138,8 @@ fn weights_file(name: &str) -> Option<&Path> {
     Some(Path::new(models::split_precision(name).0)).filter(|path| path.is_file())
 }
 
-/// The noisy renders of a test set. References that go with none are named on stderr; renders without their reference have
-/// rows that say so.
+/// The noisy renders of a test set. References that go with none are named on stderr; renders without their
+/// reference have rows that say so.
 ///
 /// # Errors
 /// As [`testset::read`].

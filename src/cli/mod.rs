@@ -81,8 +81,8 @@ pub fn main() -> process::ExitCode {
     main_with(Cli::parse()).0.into()
 }
 
-/// As [`main`], with these arguments, the program's own path first: for a program that is not a process' own executable, as the
-/// command of a Python package is not.
+/// As [`main`], with these arguments, the program's own path first: for a program that is not a process' own
+/// executable, as the command of a Python package is not.
 pub fn main_as(arguments: Vec<OsString>) -> u8 {
     if let Some(program) = arguments.first() {
         let _ = PROGRAM.set(program.into());

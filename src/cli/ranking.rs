@@ -3,8 +3,8 @@
 use super::lines::print_line;
 use crate::{Error, Result};
 
-/// The RelMSE of a result falls with the samples of its render by this power of their number: what the built-in models reach
-/// on 41 generated views of 1 to 256 samples, in the median.
+/// The RelMSE of a result falls with the samples of its render by this power of their number: what the
+/// built-in models reach on 41 generated views of 1 to 256 samples, in the median.
 const POWER: f64 = 0.5;
 
 /// Expected errors of frames.

@@ -1,6 +1,7 @@
 //! `demc report`: what the JSON lines of many `demc denoise --json` come to, on a farm one file a task.
 //!
-//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit status.
+//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit
+//! status.
 
 use std::{
     collections::BTreeMap,
@@ -28,12 +29,13 @@ pub struct Args {
     #[arg(required = true, value_name = "LOG")]
     logs: Vec<PathBuf>,
 
-    /// Also name those of these inputs (files, directories, quoted globs) that no task tells of, as one that was
-    /// killed does not
+    /// Also name those of these inputs (files, directories, quoted globs) that no task tells of, as one that
+    /// was killed does not
     #[arg(long, value_name = "INPUT", num_args = 1..)]
     of: Vec<PathBuf>,
 
-    /// Also list the frames by their expected RelMSE, the worst first; with a number, also how many samples those above it want
+    /// Also list the frames by their expected RelMSE, the worst first; with a number, also how many samples
+    /// those above it want
     #[arg(long, value_name = "RELMSE", num_args = 0..=1, value_parser = parse_wish)]
     #[allow(clippy::option_option, reason = "not at all, the list, what is wanted besides")]
     by_error: Option<Option<f64>>,

@@ -13,7 +13,8 @@ use crate::{
 /// What passes are called.
 #[derive(Clone, Debug, Default, ClapArgs)]
 pub struct Names {
-    /// The layer that is a pass, where its name does not tell: albedo=NAME, normal=NAME, beauty=NAME, depth=NAME ...
+    /// The layer that is a pass, where its name does not tell: albedo=NAME, normal=NAME, beauty=NAME,
+    /// depth=NAME ...
     #[arg(long, value_name = "PASS=NAME")]
     map: Vec<String>,
 

@@ -18,7 +18,8 @@ use crate::{
 pub struct Args {
     #[command(flatten)]
     asked: methods::Args,
-    /// Folder for stability.html, its maps and tables, of which stability.csv grows row by row; those of an earlier run are replaced
+    /// Folder for stability.html, its maps and tables, of which stability.csv grows row by row; those of an
+    /// earlier run are replaced
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Changes to try, as listed below [default: all]

@@ -51,21 +51,23 @@ pub struct Args {
     /// Crops a step; more where they are smaller than --patch says, so that they have as many pixels
     #[arg(long, default_value_t = 8)]
     batch: usize,
-    /// Rows and columns of a crop, a multiple of 32; of a step's crops fewer, if the frame drawn first has not as many
+    /// Rows and columns of a crop, a multiple of 32; of a step's crops fewer, if the frame drawn first has
+    /// not as many
     #[arg(long, default_value_t = 128)]
     patch: usize,
     /// Largest learning rate, and that of the last step, to which it falls along a line
     #[arg(long, default_value = "1e-4:5e-6", value_parser = parse_rates)]
     lr: (f64, f64),
-    /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, geomean, the
-    /// logarithm of each crop's relmse, or ssim, which adds ten times 1 - SSIM to that
+    /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, geomean,
+    /// the logarithm of each crop's relmse, or ssim, which adds ten times 1 - SSIM to that
     #[arg(long, default_value = "relmse", value_parser = parse_loss)]
     loss: Loss,
-    /// Take squared errors, not their denominators, against what references were before Blender denoised them,
-    /// where they hold that (generate_scenes.py --denoise-references)
+    /// Take squared errors, not their denominators, against what references were before Blender denoised
+    /// them, where they hold that (generate_scenes.py --denoise-references)
     #[arg(long)]
     raw_references: bool,
-    /// Share of the crops that lack guides: the albedo, the normal, or both, so that a network learns to do without
+    /// Share of the crops that lack guides: the albedo, the normal, or both, so that a network learns to do
+    /// without
     #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
     guide_dropout: f64,
     /// How gradients become updates: adam, or muon, which needs fewer steps
@@ -92,16 +94,17 @@ pub struct Args {
     /// Weights file to begin with, of the same design and at most the same widths
     #[arg(long)]
     init: Option<PathBuf>,
-    /// Train parameters of these names alone and keep the others as --init has them, which then forget nothing; * is any
-    /// part of a name: 'head.*' are the last layers before what is predicted, which takes the least time, '*.bias' all biases
+    /// Train parameters of these names alone and keep the others as --init has them, which then forget
+    /// nothing; * is any part of a name: 'head.*' are the last layers before what is predicted, which takes
+    /// the least time, '*.bias' all biases
     #[arg(long, requires = "init", value_delimiter = ',', value_name = "NAME,...")]
     only: Vec<String>,
-    /// Weights that denoise albedo and normal first: a file of `demc train --model prefilter`, or of a network that has a
-    /// prefilter; without it those of --init, or the built-in ones
+    /// Weights that denoise albedo and normal first: a file of `demc train --model prefilter`, or of a
+    /// network that has a prefilter; without it those of --init, or the built-in ones
     #[arg(long)]
     prefilter: Option<PathBuf>,
-    /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for more steps, edit
-    /// them there
+    /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for
+    /// more steps, edit them there
     #[arg(long, conflicts_with_all = [
         "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "optimizer",
         "weight_decay", "precision", "average", "val", "every", "seed", "init", "only", "prefilter",
@@ -166,8 +169,8 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a pair is held out: decided by its reference's file name without the numbers of frame and crop, so that every
-/// sample count, seed, frame and crop of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+/// Whether a pair is held out: decided by its reference's file name without the numbers of frame and crop, so
+/// that every sample count, seed, frame and crop of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
 fn held_out(pair: &Pair) -> bool {
     let mut name = pair.reference.file_name().unwrap_or_default().to_string_lossy().into_owned();
     if let Some(frame) = &pair.frame

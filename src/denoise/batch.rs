@@ -1,6 +1,6 @@
 //! The batch: reading the next frame, denoising this one and writing the last overlap, so that a batch
-//! takes about as long as the model does. At most three frames are in memory, and of a sequence its window besides; where
-//! several frames are denoised at once, as many times that. See [`Lane`].
+//! takes about as long as the model does. At most three frames are in memory, and of a sequence its window
+//! besides; where several frames are denoised at once, as many times that. See [`Lane`].
 //!
 //! The threads report to the caller's thread, which alone talks to the user.
 
@@ -64,7 +64,8 @@ pub(super) struct Shared {
     source: Source,
     pub model: Arc<dyn Denoiser>,
     pub options: Options,
-    /// Held for reading while a file is being written, and for writing, for good, once the user has asked to stop.
+    /// Held for reading while a file is being written, and for writing, for good, once the user has asked to
+    /// stop.
     pub writing: RwLock<()>,
     is_stopped: AtomicBool,
 }
@@ -133,8 +134,8 @@ impl Batch {
         Self { shared, lanes: 1, messages, to_batch }
     }
 
-    /// Denoises up to `frames` frames at once, to the same bits: the threads are split between them, and each frame has its
-    /// own memory. More frames than threads are never denoised at once.
+    /// Denoises up to `frames` frames at once, to the same bits: the threads are split between them, and each
+    /// frame has its own memory. More frames than threads are never denoised at once.
     #[must_use]
     pub fn at_once(self, frames: usize) -> Self {
         Self { lanes: frames.clamp(1, rayon::current_num_threads()), ..self }
@@ -148,8 +149,8 @@ impl Batch {
     /// Runs all jobs; `report` is called once for each as it ends, on this thread.
     ///
     /// # Panics
-    /// If the system has no room for three threads for each of the frames that are denoised at once, and those they compute
-    /// with.
+    /// If the system has no room for three threads for each of the frames that are denoised at once, and
+    /// those they compute with.
     pub fn run(self, mut report: impl FnMut(&Job, &Outcome)) -> End {
         let Self { shared, lanes, messages, to_batch } = self;
         for lane in 0..lanes {

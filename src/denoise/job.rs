@@ -47,13 +47,15 @@ pub struct Options {
     pub preview: Option<WritePicture>,
     /// Whether a [`super::Batch`] denoises again what is finished.
     pub overwrite: bool,
-    /// Frames before and after one that a [`super::Batch`] makes it better and steadier with; none for frame by frame.
+    /// Frames before and after one that a [`super::Batch`] makes it better and steadier with; none for frame
+    /// by frame.
     pub temporal: Option<usize>,
     /// What becomes of alpha.
     pub alpha: Alpha,
     /// Where passes are, where their names do not tell.
     pub sources: Sources,
-    /// Whether light passes and light groups are denoised as well, so that they add up to the denoised beauty.
+    /// Whether light passes and light groups are denoised as well, so that they add up to the denoised
+    /// beauty.
     pub passes: bool,
     /// Whether the left and the right edge of a frame meet.
     pub wrap: Wrap,
@@ -131,8 +133,8 @@ pub struct Views<T> {
 
 /// Reads a frame and decodes the passes the model needs.
 ///
-/// # Errors
-/// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is not demc's.
+/// # Errors The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name
+/// that is not demc's.
 pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
     take_apart(Frame::read(input)?, model, options)
@@ -256,7 +258,8 @@ pub struct Denoised {
 /// # Errors
 /// The model cannot denoise the frame.
 pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
-    // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up first.
+    // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up
+    // first.
     rayon::scope(|_| denoise_here(loaded, model, options))
 }
 
@@ -273,7 +276,8 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     })
 }
 
-/// Denoises passes that are in memory, by the steps by which a file is denoised: radiance that is finite, (3, H, W).
+/// Denoises passes that are in memory, by the steps by which a file is denoised: radiance that is finite, (3,
+/// H, W).
 ///
 /// # Errors
 /// A pass is missing, or the model cannot denoise the frame.
@@ -471,7 +475,8 @@ fn put(
     frame.replace(at.part, &layer_name(&layer.name, pass), &channels)
 }
 
-/// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse Direct.Denoised`.
+/// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse
+/// Direct.Denoised`.
 fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
     match pass {
         COMBINED => layer_name(&layer.name, added),
@@ -500,7 +505,8 @@ fn preview_path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
     }
 }
 
-/// A name of any kind as a part of a file's: what file systems take for more than a letter is written by its number, as in an URL.
+/// A name of any kind as a part of a file's: what file systems take for more than a letter is written by its
+/// number, as in an URL.
 fn file_name(name: &str) -> String {
     let safe = |c: char| c.is_alphanumeric() || "-_ +".contains(c);
     let write = |c: char| if safe(c) { c.into() } else { format!("%{:02X}", u32::from(c)) };

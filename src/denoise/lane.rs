@@ -1,5 +1,5 @@
-//! A lane of a batch: one frame is denoised in it at a time, while the next is read and the last is written. A batch has one
-//! lane for each frame that it denoises at once, with threads of its own to compute with.
+//! A lane of a batch: one frame is denoised in it at a time, while the next is read and the last is written.
+//! A batch has one lane for each frame that it denoises at once, with threads of its own to compute with.
 
 use std::{
     path::Path,
@@ -123,8 +123,8 @@ impl Lane {
         attempt(input, || self.on_own_threads(|| job::take_apart(frame, &**model, options)))
     }
 
-    /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when there is no next
-    /// stage.
+    /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when
+    /// there is no next stage.
     fn load_stretch(&self, stretch: Stretch, next: &SyncSender<Loaded>) -> Option<()> {
         let load = |file: &Path| self.take_apart(file, attempt(file, || Frame::read(file)));
         let Stretch { files, jobs, is_numbered } = stretch;

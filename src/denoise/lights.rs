@@ -1,8 +1,9 @@
 //! The layers of a frame that go along with its beauty: alpha, and the light passes of which Cycles makes it.
 //!
-//! Cycles adds up Combined as `(direct + indirect) * colour` of diffuse, glossy and transmissive surfaces, plus volumes, emission
-//! and environment; or as the sum of the light groups. A light pass that is stored without its colour is denoised with it and
-//! divided by the denoised colour afterwards, so that the same sum over the results is the denoised Combined.
+//! Cycles adds up Combined as `(direct + indirect) * colour` of diffuse, glossy and transmissive surfaces,
+//! plus volumes, emission and environment; or as the sum of the light groups. A light pass that is stored
+//! without its colour is denoised with it and divided by the denoised colour afterwards, so that the same sum
+//! over the results is the denoised Combined.
 
 use half::f16;
 
@@ -38,8 +39,8 @@ const LIT: [([Pass; 2], Pass); 3] = [
 /// Light that is stored as it is added.
 const ADDED: [Pass; 4] = [Pass::VolumeDirect, Pass::VolumeIndirect, Pass::Emission, Pass::Environment];
 
-/// A denoised colour is at least this where there is light to be divided by it: enough for half floats to hold it exactly
-/// enough, and too little to be seen.
+/// A denoised colour is at least this where there is light to be divided by it: enough for half floats to
+/// hold it exactly enough, and too little to be seen.
 const LEAST_COLOUR: f32 = 1e-3;
 
 /// Every pass that may go along, but for alpha.
@@ -141,7 +142,8 @@ impl Along {
         }
     }
 
-    /// The layers as they are to be stored, once the model has denoised them: alpha, (1, H, W), and all others, (3, H, W).
+    /// The layers as they are to be stored, once the model has denoised them: alpha, (1, H, W), and all
+    /// others, (3, H, W).
     pub fn finish(self, frame: &Frame, layer: &Layer) -> (Option<Planes>, Vec<(Source, Planes)>) {
         let denoised = self.companions.into_iter().map(|companion| companion.planes);
         let mut done: Vec<(Source, Planes)> = self.sources.into_iter().zip(denoised).collect();

@@ -1,5 +1,5 @@
-//! Where the result of each input is written: under the input's own name, and below `--out` as the input lies below the
-//! folder that was named.
+//! Where the result of each input is written: under the input's own name, and below `--out` as the input lies
+//! below the folder that was named.
 //!
 //! In: inputs. Out: jobs of which no two write one file, and none its own input.
 
@@ -79,7 +79,8 @@ impl Plan {
     }
 }
 
-/// Whether two paths lead to one file: folders may be mounted twice, so that where they are on the disk decides.
+/// Whether two paths lead to one file: folders may be mounted twice, so that where they are on the disk
+/// decides.
 fn is_same_file(a: &Path, b: &Path) -> bool {
     #[cfg(unix)]
     {

@@ -1,8 +1,9 @@
 //! Which files are frames of one sequence, by name and number, and the frames around one.
 //!
-//! In: paths. A frame's number is the digits at the end of its name, of any width, as Blender writes it before the
-//! extension: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`. Neighbours are looked for beside a frame whether
-//! they were named or not: what becomes of it depends on what lies there, not on what else is done by the same command.
+//! In: paths. A frame's number is the digits at the end of its name, of any width, as Blender writes it
+//! before the extension: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`. Neighbours are looked for
+//! beside a frame whether they were named or not: what becomes of it depends on what lies there, not on what
+//! else is done by the same command.
 
 use std::{
     collections::BTreeMap,
@@ -38,7 +39,8 @@ impl Place {
         Some(Self { key: Key { folder: file.parent()?.to_owned(), before, after }, number })
     }
 
-    /// All frames of the sequence that lie on disk, by number; of those that share a number, the first by name.
+    /// All frames of the sequence that lie on disk, by number; of those that share a number, the first by
+    /// name.
     fn siblings(&self) -> BTreeMap<i64, PathBuf> {
         let own = &self.key.folder;
         let folder = if own.as_os_str().is_empty() { Path::new(".") } else { own };
@@ -62,7 +64,8 @@ pub fn follows(file: &Path, before: &Path) -> bool {
     place.key == before.key && place.number - before.number == 1
 }
 
-/// The files of a frame's sequence that lie beside it, up to so many frames before and after, by how many frames later they are.
+/// The files of a frame's sequence that lie beside it, up to so many frames before and after, by how many
+/// frames later they are.
 pub fn neighbours(file: &Path, reach: usize) -> BTreeMap<i32, PathBuf> {
     let Some(place) = Place::of(file).filter(|_| reach > 0) else { return BTreeMap::new() };
     let offset = |number: i64| i32::try_from(number - place.number).ok();
@@ -105,7 +108,8 @@ pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
     for job in jobs {
         let place = Place::of(&job.input);
         let number = place.as_ref().map_or(0, |place| place.number);
-        // Two files of one number, such as 7 and 0007, are frames of two sequences: neither may hide the other.
+        // Two files of one number, such as 7 and 0007, are frames of two sequences: neither may hide the
+        // other.
         let at = place.as_ref().and_then(|place| known.get(&place.key)).copied();
         let at = at.filter(|at| sequences[*at].jobs.iter().all(|(_, other)| *other != number));
         let at = at.unwrap_or_else(|| {

@@ -1,6 +1,7 @@
 //! A model with the frames before and after one, as a method among others: what a sequence is scored by.
 //!
-//! In: a [`Shot`] with its neighbours. Out: what [`super::Batch`] makes of the frame with [`super::Options::temporal`].
+//! In: a [`Shot`] with its neighbours. Out: what [`super::Batch`] makes of the frame with
+//! [`super::Options::temporal`].
 
 use super::{
     Options, Report,

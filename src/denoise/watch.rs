@@ -1,9 +1,10 @@
 //! Files that a renderer is still writing: each is taken when it is whole.
 //!
-//! A file is whole when its size and its time of change stayed the same from one look to the next, and it then reads as a
-//! complete EXR: its offset table is filled in, which OpenEXR does last, and every block of pixels that the table tells of
-//! ends within the file. A file that does not read so far waits for its next change. Folders are looked through again and
-//! again, since no message of a change comes from a disk of another machine.
+//! A file is whole when its size and its time of change stayed the same from one look to the next, and it
+//! then reads as a complete EXR: its offset table is filled in, which OpenEXR does last, and every block of
+//! pixels that the table tells of ends within the file. A file that does not read so far waits for its next
+//! change. Folders are looked through again and again, since no message of a change comes from a disk of
+//! another machine.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -23,8 +24,8 @@ const INTERVAL: Duration = Duration::from_secs(1);
 /// Looking takes at most this share of the time: a large folder on a slow disk is looked through less often.
 const LOOKING: u32 = 10;
 
-/// A file that did not read as a whole one is tried again after this time even if it shows no change: on some disks the time
-/// of change counts in steps of two seconds, which hide the last write.
+/// A file that did not read as a whole one is tried again after this time even if it shows no change: on some
+/// disks the time of change counts in steps of two seconds, which hide the last write.
 const RETRY: Duration = Duration::from_secs(10);
 
 /// What lies there at one look.
@@ -90,8 +91,8 @@ pub(super) enum Next {
 }
 
 impl Watch {
-    /// Looks with `look` for files, and ends when none was new for the time `idle`; without that, never. A file that was
-    /// taken is taken `again` when it has changed, as one that was rendered again.
+    /// Looks with `look` for files, and ends when none was new for the time `idle`; without that, never. A
+    /// file that was taken is taken `again` when it has changed, as one that was rendered again.
     pub fn new(look: impl FnMut() -> Look + Send + 'static, idle: Option<Duration>, again: bool) -> Self {
         let (files, ready, told, failures) = Default::default();
         let state = Mutex::new(State { files, ready, told, failures, changed: Instant::now() });

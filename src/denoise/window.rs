@@ -4,9 +4,9 @@
 //! - its render and guides are averaged with those of the frames next to it, and the model denoises that;
 //! - so are frames up to N - 1 away, and these results are averaged with its own.
 //!
-//! No result is made of an earlier one, so any frame can be done anywhere, in any order, to the same bits; in a stream, each
-//! is read and denoised once. Both averages follow the Vector pass, and leave out what does not agree: see
-//! [`agreement`](crate::filters::agreement).
+//! No result is made of an earlier one, so any frame can be done anywhere, in any order, to the same bits; in
+//! a stream, each is read and denoised once. Both averages follow the Vector pass, and leave out what does
+//! not agree: see [`agreement`](crate::filters::agreement).
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -38,14 +38,15 @@ pub const PASSES: [Pass; 6] = [
     Pass::Depth,
 ];
 
-/// How many frames away the renders are, at most, that are averaged: of those further away, what no comparison finds costs
-/// more than they bring (docs/decisions.md).
+/// How many frames away the renders are, at most, that are averaged: of those further away, what no
+/// comparison finds costs more than they bring (docs/decisions.md).
 const RENDERS: usize = 1;
 
 /// Two frames of which less than this share agrees, of all that both show, are of two shots.
 const CUT: f32 = 0.05;
 
-/// Where vectors are zero everywhere and less than this share agrees, things move, and the vectors are missing.
+/// Where vectors are zero everywhere and less than this share agrees, things move, and the vectors are
+/// missing.
 const STILL: f32 = 0.5;
 
 /// Name of a view layer, and the stereo view.
@@ -219,7 +220,8 @@ impl Window {
                 Some((&other.shot.passes, self.link(number, view, offset)?))
             })
             .collect();
-        // Half buffers are the frame's own: a model that holds them against each other reads no average beside them.
+        // Half buffers are the frame's own: a model that holds them against each other reads no average
+        // beside them.
         let image = if others.is_empty() || model.reads_halves() {
             run(&own.shot, &mut [], model, options, report)?.0
         } else {

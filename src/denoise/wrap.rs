@@ -1,5 +1,5 @@
-//! Frames whose left and right edges meet, as those of an all-round panorama do: each edge is denoised with what lies beyond
-//! the other, so that no seam shows where a viewer joins them.
+//! Frames whose left and right edges meet, as those of an all-round panorama do: each edge is denoised with
+//! what lies beyond the other, so that no seam shows where a viewer joins them.
 
 use crate::{
     Result, companion::Companion, frame::Frame, models::ExpectedError, passes::PassSet, planes::Planes,
@@ -29,11 +29,12 @@ impl Wrap {
     }
 }
 
-/// Columns of the other edge that an edge is denoised with: as many as the built-in networks see to either side of a
-/// pixel, and a multiple of what they halve a frame by, so that their squares lie where they did.
+/// Columns of the other edge that an edge is denoised with: as many as the built-in networks see to either
+/// side of a pixel, and a multiple of what they halve a frame by, so that their quads lie where they did.
 const MARGIN: usize = 256;
 
-/// What `run` makes of a shot, and of what goes along with it, that has more columns at either edge, which are taken off again.
+/// What `run` makes of a shot, and of what goes along with it, that has more columns at either edge, which
+/// are taken off again.
 ///
 /// # Errors
 /// As `run`.

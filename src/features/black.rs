@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::square;
+use super::neighbours;
 use crate::planes::Planes;
 
 /// Sets a colour channel of a pixel of `image` to zero where both `radiance` and `albedo` are zero in that
@@ -24,7 +24,7 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
                 return;
             }
             for (x, value) in row.iter_mut().enumerate() {
-                if is_black(x, y) && square((x, y), (w, h)).all(|(x, y)| is_black(x, y)) {
+                if is_black(x, y) && neighbours((x, y), (w, h)).all(|(x, y)| is_black(x, y)) {
                     *value = 0.0;
                 }
             }

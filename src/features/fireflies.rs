@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::square;
+use super::neighbours;
 use crate::planes::{Planes, mirror_beyond, mirrored};
 
 /// Pixels of a row that are tested together.
@@ -54,8 +54,8 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
             for x in run {
                 let own = row[x];
                 let others = || {
-                    let square = square((x, y), (w, radiance.height));
-                    square.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
+                    let near = neighbours((x, y), (w, radiance.height));
+                    near.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
                 };
                 if own <= floor || others().any(|other| own <= FIREFLY * other) {
                     continue;

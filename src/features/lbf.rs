@@ -43,8 +43,8 @@ const MAX_DEVIATIONS: f32 = 3.0;
 /// 0. exposed radiance, (3, H, W);
 /// 1. its variance, summed over channels, (1, H, W);
 /// 2. the features that the filter compares, (12, H, W);
-/// 3. factors of the filter's six precisions, (6, H, W): 1 for pixel position and for colour, the inverse noise
-///    variance for each of the four feature groups;
+/// 3. factors of the filter's six precisions, (6, H, W): 1 for pixel position and for colour, the inverse
+///    noise variance for each of the four feature groups;
 /// 4. the secondary features, (35, H, W).
 ///
 /// # Errors

@@ -8,8 +8,8 @@ use crate::{
     planes::Planes,
 };
 
-/// The albedo of a surface of which nothing is known. Radiance is divided by the albedo before a network reads it, so a
-/// value that most surfaces are near keeps that quotient where the network saw it in training.
+/// The albedo of a surface of which nothing is known. Radiance is divided by the albedo before a network
+/// reads it, so a value that most surfaces are near keeps that quotient where the network saw it in training.
 const ALBEDO: f32 = 0.5;
 
 /// Of the guides, those that a frame lacks: they are missing, or hold nothing but zeros.
@@ -18,8 +18,8 @@ fn lacking(passes: &PassSet) -> Vec<Pass> {
     PREFILTERED_PASSES.into_iter().filter(|pass| passes.get(*pass).is_none_or(is_blank)).collect()
 }
 
-/// The guide of a frame that has none, (3, H, W): grey albedo, or the zero that Cycles writes for a normal where nothing
-/// is hit.
+/// The guide of a frame that has none, (3, H, W): grey albedo, or the zero that Cycles writes for a normal
+/// where nothing is hit.
 pub fn stand_in(pass: Pass, (width, height): (usize, usize)) -> Planes {
     let value = if pass == Pass::DenoisingAlbedo { ALBEDO } else { 0.0 };
     Planes::from_vec(3, width, height, vec![value; 3 * width * height])

@@ -1,27 +1,29 @@
-//! Where the content of a frame is the same as that of another of its sequence: weights by which the two may be averaged.
+//! Where the content of a frame is the same as that of another of its sequence: weights by which the two may
+//! be averaged.
 //!
-//! Vectors lead to where a surface was, and know nothing of what covers it, of shadows, mirrors, glass and lamps. So what
-//! is found there is held against what is here: albedo, normal and depth, and the light itself, whose means around a
-//! place must not differ by more than its noise explains. All are taken of 2x2 squares of pixels, and of the 3x3 squares
-//! around one: single pixels of few samples say little.
+//! Vectors lead to where a surface was, and know nothing of what covers it, of shadows, mirrors, glass and
+//! lamps. So what is found there is held against what is here: albedo, normal and depth, and the light
+//! itself, whose means around a place must not differ by more than its noise explains. All are taken of 2x2
+//! squares of pixels, and of the 3x3 squares around one: single pixels of few samples say little.
 //!
-//! In: passes of two frames and the [`Flow`] between them. Out: a weight for every pixel, 0 where nothing agrees.
+//! In: passes of two frames and the [`Flow`] between them. Out: a weight for every pixel, 0 where nothing
+//! agrees.
 
 use rayon::prelude::*;
 
 use super::motion::{Flow, bilinear};
 use crate::planes::Planes;
 
-/// How different two places may be, as hand-fitted on rendered sequences (docs/decisions.md): what a learned comparison
-/// would replace.
+/// How different two places may be, as hand-fitted on rendered sequences (docs/decisions.md): what a learned
+/// comparison would replace.
 #[derive(Clone, Copy, Debug)]
 pub struct Tolerances {
     /// How far the variance of a mean of the light falls below that of one pixel.
     pub pixels: f32,
     /// Squared relative difference of the light, beyond noise, that nobody sees.
     pub light: f32,
-    /// The squared difference of means, in units of the variance of that difference, up to which two places agree, and how
-    /// much more makes the weight smaller by e.
+    /// The squared difference of means, in units of the variance of that difference, up to which two places
+    /// agree, and how much more makes the weight smaller by e.
     pub noise: (f32, f32),
     /// The squared difference of normals that makes the weight smaller by e.
     pub normal: f32,
@@ -69,8 +71,8 @@ pub struct Evidence<'a> {
     pub depth: Option<&'a Planes>,
 }
 
-/// What a frame looks like to the comparison: means over squares of light (its fourth root, over the albedo), the
-/// variance of that, albedo, normal and depth.
+/// What a frame looks like to the comparison: means over squares of light (its fourth root, over the albedo),
+/// the variance of that, albedo, normal and depth.
 #[derive(Clone, Debug)]
 pub struct Look {
     size: (usize, usize),
@@ -154,7 +156,8 @@ impl Look {
         Self { size: (width, height), squares }
     }
 
-    /// How far each pixel may be averaged with that of `other` to which the flow leads: from 0 to 1, (1, H, W).
+    /// How far each pixel may be averaged with that of `other` to which the flow leads: from 0 to 1, (1, H,
+    /// W).
     ///
     /// # Panics
     /// If sizes differ.

@@ -1,9 +1,10 @@
 //! Where the content of a frame lies in other frames of its sequence, and planes sampled there.
 //!
-//! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with rows counted
-//! downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y + W) one frame later. Steps
-//! chain: each goes on with the vectors of the frame that the one before it ended in. Vectors are those of the surface that
-//! the camera sees first; what mirrors and glass show, and shadows, move otherwise.
+//! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with
+//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y
+//! + W) one frame later. Steps chain: each goes on with the vectors of the frame that the one before it ended
+//! in. Vectors are those of the surface that the camera sees first; what mirrors and glass show, and shadows,
+//! move otherwise.
 
 use rayon::prelude::*;
 
@@ -78,8 +79,8 @@ impl Flow {
         (&columns[y * self.width..][..self.width], &rows[y * self.width..][..self.width])
     }
 
-    /// Planes of the other frame, between pixels bilinearly, at the place of each pixel of this one; NaN where that is
-    /// outside.
+    /// Planes of the other frame, between pixels bilinearly, at the place of each pixel of this one; NaN
+    /// where that is outside.
     ///
     /// # Panics
     /// If the planes are of another size.
@@ -126,8 +127,8 @@ fn between(v: f32, n: usize) -> (usize, usize, f32) {
     (first, (first + 1).min(n - 1), v - first as f32)
 }
 
-/// As [`bilinear`], of three planes and as sharp as they are: by the cubic spline of Catmull and Rom, kept between the
-/// least and the greatest of the four pixels around so that edges don't ring.
+/// As [`bilinear`], of three planes and as sharp as they are: by the cubic spline of Catmull and Rom, kept
+/// between the least and the greatest of the four pixels around so that edges don't ring.
 pub fn sharp(planes: &Planes, (x, y): (f32, f32)) -> [f32; 3] {
     let (width, height) = (planes.width, planes.height);
     let (columns, across) = spline(x, width);

@@ -158,8 +158,8 @@ pub struct Refit {
 }
 
 impl Refit {
-    /// How far, in pixels, a factor depends on what is to either side: it is interpolated between two squares, whose windows
-    /// reach further.
+    /// How far, in pixels, a factor depends on what is to either side: it is interpolated between two
+    /// squares, whose windows reach further.
     pub const REACH: usize = (WINDOW.len() / 2 + 1) * SQUARE;
 
     /// A refit of a frame of `width` columns and `height` rows.
@@ -173,9 +173,9 @@ impl Refit {
         self.done
     }
 
-    /// Calls `change` with each value of the exposed denoised `image`, which holds the rows of the guides, (3, R, W), and
-    /// the factor to multiply it by. The first `rows` rows of the frame have been denoised so far; rows whose windows they
-    /// complete are changed, and each row once. `samples` is the noisy frame.
+    /// Calls `change` with each value of the exposed denoised `image`, which holds the rows of the guides,
+    /// (3, R, W), and the factor to multiply it by. The first `rows` rows of the frame have been denoised so
+    /// far; rows whose windows they complete are changed, and each row once. `samples` is the noisy frame.
     pub fn advance(
         &mut self,
         guides: Guides,

@@ -1,8 +1,8 @@
-//! Averages over frames of a sequence, along motion and weighted by [agreement](super::agreement): before a denoiser, of
-//! what was rendered, and after it, of what was denoised.
+//! Averages over frames of a sequence, along motion and weighted by [agreement](super::agreement): before a
+//! denoiser, of what was rendered, and after it, of what was denoised.
 //!
-//! In: planes of a frame and of its neighbours. Out: the frame's, less noisy and steadier. Sums run in the order of the
-//! neighbours: the same window gives the same bits.
+//! In: planes of a frame and of its neighbours. Out: the frame's, less noisy and steadier. Sums run in the
+//! order of the neighbours: the same window gives the same bits.
 
 use super::motion::{Flow, nearest, sharp};
 use crate::planes::Planes;
@@ -22,23 +22,25 @@ const TRUST: f32 = 0.7;
 /// Exposed radiance that is added to what is denoised before differences are divided by it.
 const FLOOR: f32 = 0.02;
 
-/// Two results agree where the square of their relative difference, averaged over 3x3 pixels before it is squared, is
-/// below this, or below this share of the noise: the mean squared relative difference of render and result over 7x7.
+/// Two results agree where the square of their relative difference, averaged over 3x3 pixels before it is
+/// squared, is below this, or below this share of the noise: the mean squared relative difference of render
+/// and result over 7x7.
 const SAME: f32 = 0.002;
 const NOISE_SHARE: f32 = 0.08;
 
 /// In units of the above, how much larger a difference makes the weight smaller by e.
 const DIFFERENT: f32 = 2.0;
 
-/// Squared relative differences of render and result count no more than this: one firefly is not the noise around it.
+/// Squared relative differences of render and result count no more than this: one firefly is not the noise
+/// around it.
 const LARGEST: f32 = 4.0;
 
 /// Pixels on each side over which differences, and noise, are averaged.
 const REACH_OF_DIFFERENCE: usize = 1;
 const REACH_OF_NOISE: usize = 3;
 
-/// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the nearest one:
-/// noise stays the noise of single pixels, as denoisers know it, and is not smeared.
+/// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the
+/// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
 ///
 /// # Panics
 /// If sizes differ.
@@ -81,8 +83,9 @@ pub fn gain(links: &[&Link]) -> f32 {
     1.0 + TRUST * links.iter().map(mean).sum::<f64>() as f32
 }
 
-/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, where these agree within what
-/// denoising leaves of the noise. `radiance` is the frame as rendered, `exposure` what brings it to middle grey.
+/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, where these agree
+/// within what denoising leaves of the noise. `radiance` is the frame as rendered, `exposure` what brings it
+/// to middle grey.
 ///
 /// # Panics
 /// If sizes differ.
@@ -145,7 +148,8 @@ pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&P
     })
 }
 
-/// The neighbour's image at the places where the content of the frame lies in it; the frame's own where nothing agrees.
+/// The neighbour's image at the places where the content of the frame lies in it; the frame's own where
+/// nothing agrees.
 fn fetch(own: &Planes, other: &Planes, link: &Link) -> Planes {
     let (width, height) = link.flow.size();
     // Rows of all three channels at once, (H, C, W): their places are the same.

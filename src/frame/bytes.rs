@@ -1,5 +1,5 @@
-//! The bytes of compressed blocks: in memory where they are new, or else still in the file that was opened. A frame of many
-//! passes whose pixels do not compress is larger than all that denoising it takes.
+//! The bytes of compressed blocks: in memory where they are new, or else still in the file that was opened. A
+//! frame of many passes whose pixels do not compress is larger than all that denoising it takes.
 
 use std::{
     borrow::Cow,

@@ -15,8 +15,8 @@ use super::decode::read_values;
 /// The distance of chroma's samples in columns and rows.
 pub const DISTANCE: usize = 2;
 
-/// What the samples at distances 1, 3, 5 ... to each side weigh in a value between them: a windowed sinc, the filter of OpenEXR's
-/// `RgbaYca`.
+/// What the samples at distances 1, 3, 5 ... to each side weigh in a value between them: a windowed sinc, the
+/// filter of OpenEXR's `RgbaYca`.
 const WEIGHTS: [f32; 7] = [0.627_123, -0.186_077, 0.087_929, -0.043_159, 0.019_597, -0.007_540, 0.002_128];
 
 /// Whether some channels are stored at less than full resolution.
@@ -24,8 +24,9 @@ pub fn is_subsampled(header: &Header) -> bool {
     header.channels.list.iter().any(|channel| channel.sampling != Vec2(1, 1))
 }
 
-/// Whether what is subsampled has half the resolution in rows and columns that there is an even number of, and is compressed as
-/// the `exr` crate decodes it: of version 1.74, B44 takes chroma for larger than it is, and DWA makes other values than OpenEXR.
+/// Whether what is subsampled has half the resolution in rows and columns that there is an even number of,
+/// and is compressed as the `exr` crate decodes it: of version 1.74, B44 takes chroma for larger than it is,
+/// and DWA makes other values than OpenEXR.
 pub fn is_readable(header: &Header) -> bool {
     let halves = |c: &ChannelDescription| c.sampling == Vec2(DISTANCE, DISTANCE);
     let (origin, size) = (header.own_attributes.layer_position, header.layer_size);
@@ -38,8 +39,8 @@ pub fn is_readable(header: &Header) -> bool {
         && header.channels.list.iter().all(|c| c.sampling == Vec2(1, 1) || halves(c))
 }
 
-/// What red, green and blue weigh in luminance, by the places of them and of white in the CIE 1931 diagram: as much as makes white
-/// of equal parts.
+/// What red, green and blue weigh in luminance, by the places of them and of white in the CIE 1931 diagram:
+/// as much as makes white of equal parts.
 pub fn weights([xr, yr, xg, yg, xb, yb, xw, yw]: [f32; 8]) -> Option<[f32; 3]> {
     let of = |x: f32, y: f32| [x / y, 1.0, (1.0 - x - y) / y].map(f64::from);
     let (red, green, blue, white) = (of(xr, yr), of(xg, yg), of(xb, yb), of(xw, yw));
@@ -112,8 +113,8 @@ fn middle(i: usize, count: usize, sample: impl Fn(usize) -> f32) -> f32 {
     weighted.sum()
 }
 
-/// Luminance and chroma, (3, N), to red, green and blue: chroma is `(R - Y) / Y` and `(B - Y) / Y`, luminance the sum of the
-/// colours by `weights`.
+/// Luminance and chroma, (3, N), to red, green and blue: chroma is `(R - Y) / Y` and `(B - Y) / Y`, luminance
+/// the sum of the colours by `weights`.
 pub fn to_rgb(planes: &mut [f32], weights: [f32; 3]) {
     let (luminance, chroma) = planes.split_at_mut(planes.len() / 3);
     let (red, blue) = chroma.split_at_mut(luminance.len());

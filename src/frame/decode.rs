@@ -16,7 +16,8 @@ const BLOCKS_PER_THREAD: usize = 8;
 
 impl Frame {
     /// Images of a part, each of the values of some of its channels in the order asked, (C, H, W) of its data
-    /// window. Unsigned integers are rounded to the nearest f32; chroma of half the resolution is interpolated.
+    /// window. Unsigned integers are rounded to the nearest f32; chroma of half the resolution is
+    /// interpolated.
     ///
     /// # Errors
     /// A block cannot be decompressed (see [`super::Part::undecodable`]), or a channel does not exist.

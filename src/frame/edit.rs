@@ -35,7 +35,8 @@ pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 /// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is
 /// replaced.
 const MARK: &str = "demc";
-/// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its view layer.
+/// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
+/// view layer.
 const EXPECTED_ERROR: &str = "demcExpectedError";
 /// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
 const OWN: [&str; 6] = [MARK, EXPECTED_ERROR, "name", "preview", "chunkCount", "idManifest"];
@@ -132,8 +133,8 @@ impl Frame {
         Ok(recoded)
     }
 
-    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one), whose beauty is
-    /// in a part.
+    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one),
+    /// whose beauty is in a part.
     pub fn set_expected_error(&mut self, part: usize, view_layer: &str, error: f64) {
         let attributes = &mut self.stored[part].attributes;
         let mut errors = expected_errors(attributes);

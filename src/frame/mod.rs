@@ -52,7 +52,8 @@ mod flags {
     pub const ALL: u32 = TILED | LONG_NAMES | DEEP | MULTI_PART;
 }
 
-/// An EXR file as it was stored. What is compressed stays in the file, which is kept open, until it is wanted.
+/// An EXR file as it was stored. What is compressed stays in the file, which is kept open, until it is
+/// wanted.
 pub struct Frame {
     path: PathBuf,
     opened: Opened,
@@ -170,12 +171,14 @@ impl Frame {
         self.stored.iter().find_map(|stored| stored.attributes.matrix(name))
     }
 
-    /// Whether the file says that it is an environment by latitude and longitude, whose left and right edges meet.
+    /// Whether the file says that it is an environment by latitude and longitude, whose left and right edges
+    /// meet.
     pub fn is_latitude_longitude(&self) -> bool {
         self.stored.iter().any(|stored| stored.attributes.value("envmap", "envmap") == Some(&[0]))
     }
 
-    /// What red, green and blue weigh in the luminance of a part: of its primaries, or of Rec. 709's where it names none.
+    /// What red, green and blue weigh in the luminance of a part: of its primaries, or of Rec. 709's where it
+    /// names none.
     pub fn luminance_weights(&self, part: usize) -> [f32; 3] {
         let primaries = self.stored[part].attributes.chromaticities();
         primaries.and_then(chroma::weights).unwrap_or(LUMINANCE.map(|weight| weight as f32))

@@ -1,10 +1,11 @@
 //! Blending the levels of a filtered pyramid, planar f32, one image at a time.
 //!
-//! `(1 - alpha) * fine + alpha * up(coarse)` with `alpha` the logistic of what the network predicts for each pixel: where
-//! the level below, already filtered, says all there is, nothing of the fine level's noise is left to filter. (Vogels et
-//! al. 2018, Section 4.3, keep the fine level's detail, and its noise with it.) `up` weighs the four nearest coarse
-//! pixels: bilinearly, times the exponential of what the network predicts for each, so that light does not leak over an
-//! edge (Balint et al. 2023 predict the whole upsampling kernel).
+//! `(1 - alpha) * fine + alpha * up(coarse)` with `alpha` the logistic of what the network predicts for each
+//! pixel: where the level below, already filtered, says all there is, nothing of the fine level's noise is
+//! left to filter. (Vogels et al. 2018, Section 4.3, keep the fine level's detail, and its noise with it.)
+//! `up` weighs the four nearest coarse pixels: bilinearly, times the exponential of what the network predicts
+//! for each, so that light does not leak over an edge (Balint et al. 2023 predict the whole upsampling
+//! kernel).
 
 use rayon::prelude::*;
 

@@ -102,7 +102,8 @@ impl Geometry {
     }
 }
 
-/// One tap of one output phase: the input pixel's offset from the output's place, and its place in the unpacked kernel.
+/// One tap of one output phase: the input pixel's offset from the output's place, and its place in the
+/// unpacked kernel.
 #[derive(Clone, Copy)]
 pub(super) struct Tap {
     pub dy: isize,
@@ -272,7 +273,8 @@ struct Band<'a> {
     rows: (usize, usize),
 }
 
-/// A tap of the current phase: where the input pixel lies, in blocks from the output pixel's, and its slab of weights.
+/// A tap of the current phase: where the input pixel lies, in blocks from the output pixel's, and its slab of
+/// weights.
 #[derive(Clone, Copy)]
 struct Offset {
     input: isize,
@@ -289,8 +291,8 @@ struct Plane {
 impl Kernel for Band<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        // SAFETY: views are as long as their shapes say, and `convolve` checked all else, and that the inputs'
-        // borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
+        // SAFETY: views are as long as their shapes say, and `convolve` checked all else, and that the
+        // inputs' borders cover the taps' reach; tasks own disjoint rows of disjoint planes.
         unsafe {
             // Every geometry goes through one of two loops: each further call site would compile all
             // tile widths again.

@@ -64,8 +64,8 @@ fn columns(w: usize, dx: isize) -> (usize, usize) {
     ((-dx).max(0) as usize, (w as isize - dx.max(0)) as usize)
 }
 
-/// Runs `work(row, its red, green and blue in each output, its sums)` on every row of `w` pixels of `outputs`, each (3, H, W), and
-/// `total` (1, H, W).
+/// Runs `work(row, its red, green and blue in each output, its sums)` on every row of `w` pixels of
+/// `outputs`, each (3, H, W), and `total` (1, H, W).
 pub(super) fn each_row<const N: usize>(
     w: usize,
     outputs: [&mut [f32]; N],
@@ -101,8 +101,8 @@ impl<'a> Filter<'a> {
         (self.rows.1 - self.rows.0) * self.size.w
     }
 
-    /// Every tap of row `y` of those filtered whose row lies inside the image: its place in the kernel, the row,
-    /// and how far to the right it reads. A list, since closures may be compiled without the tier's
+    /// Every tap of row `y` of those filtered whose row lies inside the image: its place in the kernel, the
+    /// row, and how far to the right it reads. A list, since closures may be compiled without the tier's
     /// instructions.
     fn taps(&self, y: usize) -> Vec<(usize, usize, isize)> {
         let (k, r) = (self.k, (self.k / 2) as isize);
@@ -116,7 +116,8 @@ impl<'a> Filter<'a> {
             .collect()
     }
 
-    /// Calls `put(pixel, exponent)` on the pixels of row `y` of those filtered that have a neighbour at this tap.
+    /// Calls `put(pixel, exponent)` on the pixels of row `y` of those filtered that have a neighbour at this
+    /// tap.
     #[inline(always)]
     fn exponents(
         &self,
@@ -164,8 +165,8 @@ impl<'a> Filter<'a> {
         (x0, x1)
     }
 
-    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights, the largest of
-    /// which is 1.
+    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights, the largest
+    /// of which is 1.
     ///
     /// # Panics
     /// If lengths do not fit the size.
@@ -380,8 +381,8 @@ impl Kernel for Backward<'_, '_> {
     }
 }
 
-/// Halves (3, H, W): each 2x2 square weighted by `exp(confidence)`, where confidence beyond +-40 counts as that and
-/// has no gradient. `total` (1, H/2, W/2) gets the sums of weights.
+/// Halves (3, H, W): each quad weighted by `exp(confidence)`, where confidence beyond +-40 counts as
+/// that and has no gradient. `total` (1, H/2, W/2) gets the sums of weights.
 ///
 /// # Panics
 /// If lengths do not fit, or rows or columns are odd.
@@ -394,12 +395,12 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
     assert_eq!((output.len(), total.len()), (3 * h * w, h * w));
     let rows = [image, confidence];
     each_row(w, [output], total, |y, [output], total| {
-        vectorised::run(Squares { size, y, rows, output, total })
+        vectorised::run(Quads { size, y, rows, output, total })
     });
 }
 
 /// One row of what [`reduce`] makes.
-struct Squares<'a> {
+struct Quads<'a> {
     size: Size,
     y: usize,
     /// The image and the confidence.
@@ -408,7 +409,7 @@ struct Squares<'a> {
     total: &'a mut [f32],
 }
 
-impl Vectorised for Squares<'_> {
+impl Vectorised for Quads<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { size: Size { w, .. }, y, rows: [image, confidence], output, total } = self;

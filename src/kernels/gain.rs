@@ -1,7 +1,8 @@
 //! A gain for every value, planar f32.
 //!
-//! `value * exp(LARGEST * tanh(logit / LARGEST))`: a network draws with it what no average of noisy neighbours holds,
-//! such as the edge of a shadow, and cannot blow a value up. A logit of 0 leaves a value as it is.
+//! `value * exp(LARGEST * tanh(logit / LARGEST))`: a network draws with it what no average of noisy
+//! neighbours holds, such as the edge of a shadow, and cannot blow a value up. A logit of 0 leaves a value as
+//! it is.
 
 use rayon::prelude::*;
 

@@ -1,8 +1,8 @@
 //! Between planar images and blocked activations, sixteen pixels at a time.
 //!
 //! For a factor of 1 a channel is a plane. For a factor of 2 four consecutive channels are the pixels of
-//! a 2x2 square of one plane (space to depth), which is how a half-resolution network reads and writes a
-//! full-resolution image.
+//! a quad (2x2 pixels) of one plane (space to depth), which is how a half-resolution network reads and writes
+//! a full-resolution image.
 
 use rayon::prelude::*;
 
@@ -24,12 +24,12 @@ impl Map {
     /// # Panics
     /// If `len` values are not whole planes, or more than the activation's channels.
     fn new(shape: Shape, first: usize, factor: usize, len: usize) -> Self {
-        assert!(factor == 1 || factor == 2, "squares have 1 or 2 pixels a side");
+        assert!(factor == 1 || factor == 2, "quads have 1 or 2 pixels a side");
         let channels = len / (shape.n * shape.h * shape.w).max(1);
         let area = factor * factor;
         assert_eq!(len, shape.n * (channels / area) * area * shape.h * shape.w, "planes must be whole");
         assert!(first + channels <= shape.c, "more planes than channels");
-        assert!(first.is_multiple_of(area), "squares must be whole");
+        assert!(first.is_multiple_of(area), "quads must be whole");
         Self { shape, first, channels, factor }
     }
 
@@ -57,7 +57,8 @@ impl Map {
     }
 }
 
-/// From planes of `factor` times its size to all channels of an activation. The lanes beyond them become zero.
+/// From planes of `factor` times its size to all channels of an activation. The lanes beyond them become
+/// zero.
 ///
 /// # Panics
 /// If `input` does not hold the output's shape.
@@ -86,7 +87,8 @@ pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &
     each_band(to.map, |n, plane, rows| Tier::detect().run(Unpack { to, input, n, plane, rows }));
 }
 
-/// Adds planes to the channels that [`from_blocked_shuffled`] makes planes of; every other channel stays as it is.
+/// Adds planes to the channels that [`from_blocked_shuffled`] makes planes of; every other channel stays as
+/// it is.
 ///
 /// # Panics
 /// As [`from_blocked_shuffled`].
@@ -136,8 +138,8 @@ impl Unpacked {
         Self { map: Map::new(shape, first, factor, output.len()), values: output.as_mut_ptr() }
     }
 
-    /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose channels of blocked
-    /// plane `plane` are what `finish` makes of `blocks`.
+    /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose
+    /// channels of blocked plane `plane` are what `finish` makes of `blocks`.
     ///
     /// # Safety
     /// The pixels lie inside the row and nobody else writes them; the planes
@@ -160,7 +162,8 @@ impl Unpacked {
         }
     }
 
-    /// [`Unpacked::put`], where each of the `N` groups of channels of a blocked plane is a run of values in its row.
+    /// [`Unpacked::put`], where each of the `N` groups of channels of a blocked plane is a run of values in
+    /// its row.
     ///
     /// # Safety
     /// As that.
@@ -196,7 +199,8 @@ trait Groups<S: Simd, const N: usize> {
     fn transpose(simd: S, vectors: [S::V; N]) -> [S::V; N];
 }
 
-/// The channels of a blocked plane: each for itself where it is a plane, two by two where those are neighbours in a row.
+/// The channels of a blocked plane: each for itself where it is a plane, two by two where those are
+/// neighbours in a row.
 struct Channels;
 
 impl<S: Simd> Groups<S, LANES> for Channels {
@@ -282,9 +286,9 @@ impl Kernel for Pack<'_> {
 }
 
 impl Map {
-    /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the planes hold of its
-    /// channels, other lanes with zeros; or does `add` it to what the blocks hold. Each of the `N` groups of channels of a
-    /// blocked plane is a run of values in its row.
+    /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the
+    /// planes hold of its channels, other lanes with zeros; or does `add` it to what the blocks hold. Each of
+    /// the `N` groups of channels of a blocked plane is a run of values in its row.
     #[inline(always)]
     fn gather<S: Simd, const N: usize>(
         self,
@@ -317,9 +321,9 @@ impl Map {
     }
 }
 
-/// Row `y` of image `n` of an activation whose channels are the pixels of 2x2 squares of planes, as [`to_blocked`] makes
-/// it: 16 pixels at a time, each as up to two blocked planes from `plane` on. `put` takes the pixels' first column and their
-/// blocks; there is no second plane where it has no channels.
+/// Row `y` of image `n` of an activation whose channels are the pixels of quads of planes, as
+/// [`to_blocked`] makes it: 16 pixels at a time, each as up to two blocked planes from `plane` on. `put`
+/// takes the pixels' first column and their blocks; there is no second plane where it has no channels.
 pub(super) struct HalvedRow<'a, F> {
     pub shape: Shape,
     pub values: &'a [f32],

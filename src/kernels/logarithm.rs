@@ -1,7 +1,8 @@
-//! The logarithms in which networks read radiance and the ratio of albedos: plain arithmetic, which the compiler vectorises
-//! where it is inlined.
+//! The logarithms in which networks read radiance and the ratio of albedos: plain arithmetic, which the
+//! compiler vectorises where it is inlined.
 
-/// `ln(1 + steepness * v) / ln(1 + steepness)` of a value `v`: 0 of 0, 1 of 1, nearly linear below `1 / steepness`.
+/// `ln(1 + steepness * v) / ln(1 + steepness)` of a value `v`: 0 of 0, 1 of 1, nearly linear below
+/// `1 / steepness`.
 #[derive(Clone, Copy)]
 pub struct LogTransfer {
     steepness: f32,
@@ -21,8 +22,9 @@ impl LogTransfer {
     }
 }
 
-/// The polynomial `p` for `ln(1 + r) = r - r^2 / 2 + r^3 p(r)` between the roots of 1/2 and 2, highest power first, which keeps the
-/// largest relative error of the logarithm least: 6e-9 (by least squares, weighted anew until no point errs more than others).
+/// The polynomial `p` for `ln(1 + r) = r - r^2 / 2 + r^3 p(r)` between the roots of 1/2 and 2, highest power
+/// first, which keeps the largest relative error of the logarithm least: 6e-9 (by least squares, weighted
+/// anew until no point errs more than others).
 const LN: [f32; 8] = [
     -0.076_344_93,
     0.127_615_75,
@@ -34,8 +36,8 @@ const LN: [f32; 8] = [
     0.333_333_3,
 ];
 
-/// Natural logarithm of a normal positive number, to 2e-7 absolute and relative: `x = 2^n m` with m between the roots of
-/// 1/2 and 2, and a polynomial for `ln m`, since a division would take as long as all the rest.
+/// Natural logarithm of a normal positive number, to 2e-7 absolute and relative: `x = 2^n m` with m between
+/// the roots of 1/2 and 2, and a polynomial for `ln m`, since a division would take as long as all the rest.
 #[inline(always)]
 pub fn ln(x: f32) -> f32 {
     const ROOT_OF_HALF: u32 = 0x3f35_04f3;

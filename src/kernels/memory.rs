@@ -20,7 +20,8 @@ impl<T: Clone> Pool<T> {
     }
 
     /// The smallest free memory for `len` values, unless more than half of it would lie idle; else new
-    /// memory, filled with `value`. What is too small goes back to the system then: frames that grow leave nothing behind.
+    /// memory, filled with `value`. What is too small goes back to the system then: frames that grow leave
+    /// nothing behind.
     pub fn take(&'static self, len: usize, value: T) -> Pooled<T> {
         let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |(_, data): &(usize, &Vec<T>)| (len..=2 * len).contains(&data.len());

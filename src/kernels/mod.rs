@@ -1,9 +1,9 @@
 //! The arithmetic of networks and image filters: slices in, slices out, no type of the project.
 //!
-//! Activations of networks are stored channel-blocked and padded (NCHW16c): a [`Block`] is 16 consecutive channels
-//! of one pixel, a plane is `(h + 2 pad) x (w + 2 pad)` blocks whose border is zero, and an image is
-//! `ceil(c / 16)` planes. Lanes beyond `c` are zero in every activation. Images that are filtered are planar. Values are
-//! f32; those of [`narrow`] convolutions have 16 or 8 bits.
+//! Activations of networks are stored channel-blocked and padded (NCHW16c): a [`Block`] is 16 consecutive
+//! channels of one pixel, a plane is `(h + 2 pad) x (w + 2 pad)` blocks whose border is zero, and an image is
+//! `ceil(c / 16)` planes. Lanes beyond `c` are zero in every activation. Images that are filtered are planar.
+//! Values are f32; those of [`narrow`] convolutions have 16 or 8 bits.
 //!
 //! Each kernel is written once, generic over [`simd::Simd`]; the portable instance is the oracle of
 //! the AVX2 and AVX-512 ones, and [`simd::Tier`] chooses among them once at run time.
@@ -73,11 +73,12 @@ impl Shape {
         Self { h, w, ..self }
     }
 
-    /// The extent of an activation whose channels are the pixels of this one's 2x2 squares (space to depth).
+    /// The extent of an activation whose channels are the pixels of this one's quads, 2x2 pixels each (space
+    /// to depth).
     ///
     /// # Panics
     /// If rows or columns are odd.
-    pub fn squares(self) -> Self {
+    pub fn quads(self) -> Self {
         assert!(self.h.is_multiple_of(2) && self.w.is_multiple_of(2), "only even sizes halve");
         self.with_channels(4 * self.c).with_size(self.h / 2, self.w / 2)
     }

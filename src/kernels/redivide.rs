@@ -1,7 +1,7 @@
 //! Radiance that was divided by one albedo, divided by another as far as a network says, planar f32.
 //!
-//! `value * exp(ratio * logistic(logit))` with `ratio` the logarithm of the first albedo over the second: a logit far
-//! below 0 leaves a value as it is, one far above 0 makes it what the second albedo would have.
+//! `value * exp(ratio * logistic(logit))` with `ratio` the logarithm of the first albedo over the second: a
+//! logit far below 0 leaves a value as it is, one far above 0 makes it what the second albedo would have.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,8 @@ use super::{
     vectorised::{self, Vectorised},
 };
 
-/// Writes each value, (3, H, W), divided anew by the `ratio` of the albedos, (3, H, W); `logits` are (1, H, W).
+/// Writes each value, (3, H, W), divided anew by the `ratio` of the albedos, (3, H, W); `logits` are (1, H,
+/// W).
 ///
 /// # Panics
 /// If lengths differ.
@@ -43,8 +44,8 @@ impl Vectorised for Redivide<'_> {
     }
 }
 
-/// Adds what the gradient of [`redivide`]'s `output` sends back to its logits. The values and the albedos are a
-/// network's inputs, whose gradient nobody asks for.
+/// Adds what the gradient of [`redivide`]'s `output` sends back to its logits. The values and the albedos are
+/// a network's inputs, whose gradient nobody asks for.
 ///
 /// # Panics
 /// If lengths differ.

@@ -80,9 +80,9 @@ pub fn weight_gradient(
     });
 }
 
-/// Adds `sum(part, output plane, input of the source, tap)`, over all parts, to the weights that they are sums
-/// for: a block holds those of 16 outputs, which are spread over as many kernels. The source's `channels` are
-/// the inputs from `first` on of `inputs` in all.
+/// Adds `sum(part, output plane, input of the source, tap)`, over all parts, to the weights that they are
+/// sums for: a block holds those of 16 outputs, which are spread over as many kernels. The source's
+/// `channels` are the inputs from `first` on of `inputs` in all.
 pub(super) fn add_sums<'a>(
     weights: &mut [f32],
     geometry: Geometry,
@@ -222,7 +222,8 @@ impl Pair<'_> {
         } else {
             (0, (ky - 1) * g.row_stride() as isize + kx - 1)
         };
-        // SAFETY: borders cover the taps' reach, as `weight_gradient` checked; views are as long as their shapes say.
+        // SAFETY: borders cover the taps' reach, as `weight_gradient` checked; views are as long as their
+        // shapes say.
         unsafe {
             let mut acc: [[S::V; CHUNK]; OUT] =
                 std::array::from_fn(|o| std::array::from_fn(|c| simd.load(slabs[o].add(c))));

@@ -1,12 +1,14 @@
-//! 3x3 convolutions by squares of 4x4 outputs, with a quarter of the multiplications.
+//! 3x3 convolutions by cells of 4x4 outputs, with a quarter of the multiplications.
 //!
-//! A square `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a kernel `g`, where `*`
-//! multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin and Gray 2016, F(4x4, 3x3); the
-//! points are 0, 1, -1, 2, -2 and infinity). Rows of `G` are taken times 24, 6, 6, 24, 24, 6 here, which leaves whole numbers, and
-//! what `A` then makes of sums is 9 x 2^k times the output.
+//! A cell `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a
+//! kernel `g`, where `*` multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin
+//! and Gray 2016, F(4x4, 3x3); the points are 0, 1, -1, 2, -2 and infinity). Rows of `G` are taken times 24,
+//! 6, 6, 24, 24, 6 here, which leaves whole numbers, and what `A` then makes of sums is 9 x 2^k times the
+//! output.
 //!
-//! [`convolve`] does so in f32. Rounding then depends on where a square begins, so it serves training, not inference, whose
-//! results are the same to the bit however a frame is cut. In 8 bits nothing is rounded ([`super::narrow`]).
+//! [`convolve`] does so in f32. Rounding then depends on where a cell begins, so it serves training, not
+//! inference, whose results are the same to the bit however a frame is cut. In 8 bits nothing is rounded
+//! ([`super::narrow`]).
 
 use std::num::Wrapping;
 
@@ -19,7 +21,7 @@ use super::{
     simd::{Kernel, Simd, Tier},
 };
 
-/// Outputs along a side of a square.
+/// Outputs along a side of a cell.
 pub const SIDE: usize = 4;
 
 /// Inputs along a side of its patch.
@@ -93,7 +95,7 @@ pub fn evaluate<R: Ring>(d: [R; PATCH]) -> [R; PATCH] {
     ]
 }
 
-/// `A m`: a line of a square, times 3 x 2^[`POWERS`].
+/// `A m`: a line of a cell, times 3 x 2^[`POWERS`].
 #[inline(always)]
 pub fn interpolate<R: Ring>(m: [R; PATCH]) -> [R; SIDE] {
     let [near_even, near_odd] = [m[1].plus(m[2]), m[1].minus(m[2])];
@@ -131,10 +133,10 @@ pub fn evaluate_kernel<R: Ring>(kernel: [R; 9]) -> [R; POINTS] {
     points
 }
 
-/// Squares side by side that are transformed, multiplied and transformed back together.
-const SQUARES: usize = 12;
+/// Cells side by side that are transformed, multiplied and transformed back together.
+const CELLS: usize = 12;
 
-/// Squares, and output planes, whose products stay in registers at most.
+/// Cells, and output planes, whose products stay in registers at most.
 const STRIP: usize = 6;
 const OUTPUTS: usize = 2;
 
@@ -146,7 +148,8 @@ pub fn clear() {
     POINTS_FREE.clear();
 }
 
-/// Whether squares make a convolution of frames of so many columns faster: where there are few, weights are read for too few of them.
+/// Whether cells make a convolution of frames of so many columns faster: where there are few, weights are
+/// read for too few of them.
 pub fn serves(width: usize) -> bool {
     width >= 32
 }
@@ -216,7 +219,7 @@ pub fn convolve(
     });
 }
 
-/// The work of one task: a row of squares of all output planes of one image.
+/// The work of one task: a row of cells of all output planes of one image.
 struct Rows<'a> {
     sources: &'a [View<'a>],
     weights: &'a [Block],
@@ -229,7 +232,8 @@ struct Rows<'a> {
     y: usize,
 }
 
-/// An input plane: where the rows of the patches begin, those beyond the border nowhere, and how many of its lanes are in use.
+/// An input plane: where the rows of the patches begin, those beyond the border nowhere, and how many of its
+/// lanes are in use.
 struct Plane {
     rows: [Option<*const Block>; PATCH],
     lanes: usize,
@@ -250,30 +254,24 @@ impl Kernel for Rows<'_> {
                 planes.push(Plane { rows: std::array::from_fn(row), lanes: s.lanes(plane) });
             }
         }
-        // Points lie one value further apart than they need to, so that not all are in the same few sets of a cache.
-        let (point, product) = (planes.len() * SQUARES + 1, OUTPUTS * SQUARES + 1);
+        // Points lie one value further apart than they need to, so that not all are in the same few sets of a
+        // cache.
+        let (point, product) = (planes.len() * CELLS + 1, OUTPUTS * CELLS + 1);
         let mut points = POINTS_FREE.take(POINTS * point, Block::default());
         let mut products = POINTS_FREE.take(POINTS * product, Block::default());
-        for x in (0..self.out.w).step_by(SIDE * SQUARES) {
-            let squares = (self.out.w - x).div_ceil(SIDE).min(SQUARES);
+        for x in (0..self.out.w).step_by(SIDE * CELLS) {
+            let cells = (self.out.w - x).div_ceil(SIDE).min(CELLS);
             for (i, plane) in planes.iter().enumerate() {
                 // SAFETY: `convolve` checked lengths and borders; patches end at the border.
-                unsafe { self.evaluate(simd, plane, x, squares, &mut points[i * SQUARES..], point) }
+                unsafe { self.evaluate(simd, plane, x, cells, &mut points[i * CELLS..], point) }
             }
             for plane in (0..self.out.planes()).step_by(S::TILE.0) {
                 // SAFETY: `convolve` checked lengths; tasks own disjoint rows.
                 unsafe {
                     if S::TILE.0 == OUTPUTS && plane + 1 < self.out.planes() {
-                        self.outputs::<S, OUTPUTS>(
-                            simd,
-                            &planes,
-                            plane,
-                            (x, squares),
-                            &points,
-                            &mut products,
-                        );
+                        self.outputs::<S, OUTPUTS>(simd, &planes, plane, (x, cells), &points, &mut products);
                     } else {
-                        self.outputs::<S, 1>(simd, &planes, plane, (x, squares), &points, &mut products);
+                        self.outputs::<S, 1>(simd, &planes, plane, (x, cells), &points, &mut products);
                     }
                 }
             }
@@ -282,14 +280,14 @@ impl Kernel for Rows<'_> {
 }
 
 impl Rows<'_> {
-    /// The patches of `squares` squares from column `x` on, at all points, which lie `stride` blocks apart.
+    /// The patches of `cells` cells from column `x` on, at all points, which lie `stride` blocks apart.
     #[inline(always)]
     unsafe fn evaluate<S: Simd>(
         &self,
         simd: S,
         plane: &Plane,
         x: usize,
-        squares: usize,
+        cells: usize,
         points: &mut [Block],
         stride: usize,
     ) {
@@ -298,9 +296,9 @@ impl Rows<'_> {
             let nothing = Real(simd, simd.splat(0.0));
             // Columns of a patch at the points, the last two of which are the next patch's first.
             let mut columns = [[nothing; PATCH]; PATCH];
-            for square in 0..squares {
-                for i in if square == 0 { 0 } else { PATCH - SIDE }..PATCH {
-                    let at = x + SIDE * square + i;
+            for cell in 0..cells {
+                for i in if cell == 0 { 0 } else { PATCH - SIDE }..PATCH {
+                    let at = x + SIDE * cell + i;
                     let mut column = [nothing; PATCH];
                     for y in 0..PATCH {
                         if let Some(row) = plane.rows[y].filter(|_| at <= self.out.w + 1) {
@@ -315,7 +313,7 @@ impl Rows<'_> {
                         row[i] = columns[i][y];
                     }
                     for (i, value) in evaluate(row).into_iter().enumerate() {
-                        simd.set(&mut points[(PATCH * y + i) * stride + square], value.1);
+                        simd.set(&mut points[(PATCH * y + i) * stride + cell], value.1);
                     }
                 }
                 columns.copy_within(SIDE.., 0);
@@ -323,20 +321,20 @@ impl Rows<'_> {
         }
     }
 
-    /// `OUT` output planes from `first` on, of some squares.
+    /// `OUT` output planes from `first` on, of some cells.
     #[inline(always)]
     unsafe fn outputs<S: Simd, const OUT: usize>(
         &self,
         simd: S,
         planes: &[Plane],
         first: usize,
-        (x, squares): (usize, usize),
+        (x, cells): (usize, usize),
         points: &[Block],
         products: &mut [Block],
     ) {
-        let (point, product) = (planes.len() * SQUARES + 1, OUTPUTS * SQUARES + 1);
+        let (point, product) = (planes.len() * CELLS + 1, OUTPUTS * CELLS + 1);
         let weights = &self.weights[first * planes.len() * POINTS * LANES..];
-        let strips = squares.div_ceil(STRIP);
+        let strips = cells.div_ceil(STRIP);
         // SAFETY: the caller's promise.
         unsafe {
             for i in 0..POINTS {
@@ -345,7 +343,7 @@ impl Rows<'_> {
                 let products = products[i * product..].as_mut_ptr();
                 let mut at = 0;
                 for strip in 0..strips {
-                    let count = (squares - at).div_ceil(strips - strip);
+                    let count = (cells - at).div_ceil(strips - strip);
                     let place = (points.add(at), weights, products.add(at));
                     match count {
                         1 => multiply::<S, OUT, 1>(simd, planes, place),
@@ -358,14 +356,15 @@ impl Rows<'_> {
                     at += count;
                 }
             }
-            for (o, square) in (0..OUT).flat_map(|o| (0..squares).map(move |square| (o, square))) {
-                let products = products[o * SQUARES + square..].as_ptr();
-                self.interpolate(simd, products, product, first + o, x + SIDE * square);
+            for (o, cell) in (0..OUT).flat_map(|o| (0..cells).map(move |cell| (o, cell))) {
+                let products = products[o * CELLS + cell..].as_ptr();
+                self.interpolate(simd, products, product, first + o, x + SIDE * cell);
             }
         }
     }
 
-    /// Makes outputs of a square's products, which lie `stride` blocks apart, and stores those that are pixels.
+    /// Makes outputs of a cell's products, which lie `stride` blocks apart, and stores those that are
+    /// pixels.
     #[inline(always)]
     unsafe fn interpolate<S: Simd>(
         &self,
@@ -406,7 +405,8 @@ impl Rows<'_> {
     }
 }
 
-/// The products of `COUNT` squares at a point for `OUT` output planes, where points, weights and products begin.
+/// The products of `COUNT` cells at a point for `OUT` output planes, where points, weights and products
+/// begin.
 ///
 /// # Safety
 /// All of them can be read and written.
@@ -421,7 +421,7 @@ unsafe fn multiply<S: Simd, const OUT: usize, const COUNT: usize>(
     unsafe {
         let mut sums = [[simd.splat(0.0); COUNT]; OUT];
         for (i, plane) in planes.iter().enumerate() {
-            let points = points.add(i * SQUARES).cast::<f32>();
+            let points = points.add(i * CELLS).cast::<f32>();
             for lane in 0..plane.lanes {
                 let mut w = [simd.splat(0.0); OUT];
                 for o in 0..OUT {
@@ -437,7 +437,7 @@ unsafe fn multiply<S: Simd, const OUT: usize, const COUNT: usize>(
         }
         for o in 0..OUT {
             for s in 0..COUNT {
-                simd.store(products.add(o * SQUARES + s), sums[o][s]);
+                simd.store(products.add(o * CELLS + s), sums[o][s]);
             }
         }
     }

@@ -1,5 +1,5 @@
-//! What edges of the guides tell: how wide the pixel filter is, whether the beauty is blurred where they are sharp, and whether
-//! its steps are as large as those of the albedo.
+//! What edges of the guides tell: how wide the pixel filter is, whether the beauty is blurred where they are
+//! sharp, and whether its steps are as large as those of the albedo.
 
 use std::collections::BTreeMap;
 
@@ -18,8 +18,8 @@ use crate::{
 /// Edges that are needed to judge by.
 const EDGES: usize = 100;
 
-/// Pixels on a side of the squares that edges are judged in: one long edge must not decide alone, as it lies on the grid of
-/// pixels in one way, and has one light.
+/// Pixels on a side of the squares that edges are judged in: one long edge must not decide alone, as it lies
+/// on the grid of pixels in one way, and has one light.
 const SQUARE: usize = 16;
 
 /// Edges that a square needs.
@@ -34,7 +34,8 @@ fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Ve
     squares.into_values().filter(|square| square.len() >= EDGES_OF_SQUARE).collect()
 }
 
-/// Judges edges, and where the guides lie as the render does also against its `light`, the sums of its channels.
+/// Judges edges, and where the guides lie as the render does also against its `light`, the sums of its
+/// channels.
 pub fn check(set: &PassSet, render: &Planes, light: Option<&Vec<f32>>, findings: &mut Vec<Finding>) {
     let (Some(albedo), Some(normal)) = (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal))
     else {
@@ -86,14 +87,15 @@ const STEP: f32 = 0.15;
 /// Squares that are needed to judge softness by.
 const SOFT_SQUARES: usize = 12;
 
-/// The sharpest quarter of the steps between plain sides has more than this share between two pixels, since a pixel edge cuts
-/// most of a filter in two: 0.62 to 1 in sound renders, 0.73 with a filter of 3 pixels, 0.50 to 0.53 of 6. In most of the
-/// squares the middle one must be below as well (0.5 of 6 pixels).
+/// The sharpest quarter of the steps between plain sides has more than this share between two pixels, since a
+/// pixel edge cuts most of a filter in two: 0.62 to 1 in sound renders, 0.73 with a filter of 3 pixels, 0.50
+/// to 0.53 of 6. In most of the squares the middle one must be below as well (0.5 of 6 pixels).
 const SHARP: f32 = 0.56;
 
 /// Soft guides: a filter that is wide, though its noise is independent, as that of Cycles is.
 fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
-    // Differences of pixels on each side of the largest that belong to the step, and of those beyond, which are plain.
+    // Differences of pixels on each side of the largest that belong to the step, and of those beyond, which
+    // are plain.
     const REACH: isize = 3;
     let mut shares = Vec::new();
     for planes in guides {
@@ -148,15 +150,16 @@ fn is_edge((albedo, normal): (&Planes, &Planes), way: Way, place: usize) -> bool
         })
 }
 
-/// Of the light's step across edges, the share that is there within 3 pixels on both sides: of all edges together 0.67 to 1.1
-/// in sound renders of 320x180 pixels and more, after a blur of 9 pixels across the edges 0.34 to 0.58, of 13 below 0.42.
+/// Of the light's step across edges, the share that is there within 3 pixels on both sides: of all edges
+/// together 0.67 to 1.1 in sound renders of 320x180 pixels and more, after a blur of 9 pixels across the
+/// edges 0.34 to 0.58, of 13 below 0.42.
 const NEAR: f64 = 0.6;
 
 /// Squares that are needed to judge a blur by.
 const BLURRED_SQUARES: usize = 8;
 
-/// The same share in three of four squares: 0.86 and more in sound renders, after the blur of 9 pixels 0.5 to 0.77, of 13 0.35
-/// to 0.58.
+/// The same share in three of four squares: 0.86 and more in sound renders, after the blur of 9 pixels 0.5 to
+/// 0.77, of 13 0.35 to 0.58.
 const NEAR_IN_SQUARES: f32 = 0.65;
 
 /// A root mean square of the step, as a logarithm, below which light hides the edges.
@@ -165,7 +168,8 @@ const LIGHT_STEP: f64 = 0.3;
 /// Motion from which on edges are also judged by themselves, in pixels a frame.
 const MOTION: f32 = 4.0;
 
-/// Steps of the light across an edge of the guides, as logarithms: near it, at two distances from it; and whether it moves.
+/// Steps of the light across an edge of the guides, as logarithms: near it, at two distances from it; and
+/// whether it moves.
 type Step = (f64, f64, f64, bool);
 
 /// A beauty that is blurred where the guides are sharp.
@@ -224,8 +228,8 @@ fn blurred(set: &PassSet, guides: (&Planes, &Planes), logs: &[f32], findings: &m
 /// Steps of the albedo, as logarithms, that are looked at.
 const ALBEDO_STEP: f32 = 0.5;
 
-/// How large the light's steps are beside those of the albedo: 0.76 to 1.3 in linear renders, 0.38 to 0.61 in the same ones with
-/// the curve of sRGB.
+/// How large the light's steps are beside those of the albedo: 0.76 to 1.3 in linear renders, 0.38 to 0.61 in
+/// the same ones with the curve of sRGB.
 const ENCODED: std::ops::Range<f32> = 0.3..0.66;
 
 /// Pixels with the curve of a display: none is above one, and light does not follow the albedo in proportion.

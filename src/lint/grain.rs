@@ -1,13 +1,14 @@
-//! Whether frames of a sequence share one pattern of noise. Blender draws every frame with the same random numbers unless
-//! the seed is animated: the noise then sticks to the screen while things move beneath it, and no frame can clean another.
+//! Whether frames of a sequence share one pattern of noise. Blender draws every frame with the same random
+//! numbers unless the seed is animated: the noise then sticks to the screen while things move beneath it, and
+//! no frame can clean another.
 //!
 //! In: passes of consecutive frames. Out: a warning that names the setting.
 
 use super::{Finding, GUIDES, render};
 use crate::{passes::PassSet, planes::Planes};
 
-/// The noise of a frame, as far as it shows: by how much the light of each pixel differs from the mean of those around it,
-/// relative; NaN where that may be texture or an edge.
+/// The noise of a frame, as far as it shows: by how much the light of each pixel differs from the mean of
+/// those around it, relative; NaN where that may be texture or an edge.
 pub struct Grain {
     width: usize,
     values: Vec<f32>,
@@ -25,7 +26,8 @@ const LEAST: f64 = 0.03;
 /// Fewer pixels tell nothing.
 const PIXELS: usize = 500;
 
-/// Noise of which more than this is the same in two frames is shared; of frames of their own seeds some thousandths are.
+/// Noise of which more than this is the same in two frames is shared; of frames of their own seeds some
+/// thousandths are.
 const SHARED: f64 = 0.2;
 
 impl Grain {
@@ -61,7 +63,8 @@ impl Grain {
         Some(Self { width, values })
     }
 
-    /// How much of the noise is that of `other`, at the same places of the screen: 1 is all. None where too little shows.
+    /// How much of the noise is that of `other`, at the same places of the screen: 1 is all. None where too
+    /// little shows.
     fn shared(&self, other: &Self) -> Option<f64> {
         if (self.width, self.values.len()) != (other.width, other.values.len()) {
             return None;

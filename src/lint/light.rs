@@ -43,8 +43,8 @@ pub fn quantile(values: &mut [f32], share: f32) -> Option<f32> {
     Some(*values.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
-/// Where the guides show a plain surface that is lit: no edge or texture within a pixel, something is hit, and the albedo is
-/// not itself the light, as that of lamps is in Cycles. None without a normal.
+/// Where the guides show a plain surface that is lit: no edge or texture within a pixel, something is hit,
+/// and the albedo is not itself the light, as that of lamps is in Cycles. None without a normal.
 pub fn lit_surfaces(set: &PassSet, render: &Planes) -> Option<Vec<bool>> {
     let normal = set.get(Pass::DenoisingNormal).or_else(|| set.get(Pass::Normal))?;
     let albedo = set.get(Pass::DenoisingAlbedo);

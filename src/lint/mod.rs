@@ -1,9 +1,10 @@
 //! What ruins a denoise, found in a frame's passes before any work is done.
 //!
-//! In: the passes of a frame as they are stored, and what the file says of them; of a shot, frames one after another. Out:
-//! [`Finding`]s, each with a code, a sentence, and the setting that mends it. Pure functions: nothing is read, repaired or
-//! printed here. A rule speaks up only where its measure lies well beyond what sound renders show: thresholds stand beside
-//! what was measured on 27 noisy and 24 clean frames of 13 scenes.
+//! In: the passes of a frame as they are stored, and what the file says of them; of a shot, frames one after
+//! another. Out: [`Finding`]s, each with a code, a sentence, and the setting that mends it. Pure functions:
+//! nothing is read, repaired or printed here. A rule speaks up only where its measure lies well beyond what
+//! sound renders show: thresholds stand beside what was measured on 27 noisy and 24 clean frames of 13
+//! scenes.
 
 mod edges;
 mod grain;
@@ -77,8 +78,8 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     findings
 }
 
-/// Frames that are smaller in a direction are not judged as pictures: they show too few edges and too little noise. Of 252
-/// sound crops of 128x128 pixels, some 30 would be warned of.
+/// Frames that are smaller in a direction are not judged as pictures: they show too few edges and too little
+/// noise. Of 252 sound crops of 128x128 pixels, some 30 would be warned of.
 const LEAST_SIZE: usize = 160;
 
 /// The render, before Blender denoised it itself.

@@ -1,9 +1,9 @@
 //! What the noise of a render tells: whether it was removed already, or smeared, or cut off.
 //!
-//! Samples of a path tracer that picks its filter by importance, as Cycles does, belong to one pixel each: their noise is
-//! independent from pixel to pixel. On a plain surface, a pixel then differs from the four next to it as much as from the
-//! four two pixels away. After a denoiser, a filter that spreads samples over pixels, or a resize, it differs less from
-//! nearer ones.
+//! Samples of a path tracer that picks its filter by importance, as Cycles does, belong to one pixel each:
+//! their noise is independent from pixel to pixel. On a plain surface, a pixel then differs from the four
+//! next to it as much as from the four two pixels away. After a denoiser, a filter that spreads samples over
+//! pixels, or a resize, it differs less from nearer ones.
 
 use rayon::prelude::*;
 
@@ -22,16 +22,17 @@ const PIXELS: usize = 100;
 /// Squares that a frame needs.
 const SQUARES: usize = 12;
 
-/// The share of the squares whose differences of neighbours are as small as told, so that noise that is independent anywhere
-/// clears a frame.
+/// The share of the squares whose differences of neighbours are as small as told, so that noise that is
+/// independent anywhere clears a frame.
 const MOST: f32 = 0.75;
 
-/// Of renders with independent noise, 1 in theory, MOST of the squares have ratios below 0.96 to 1.14 (24 frames, 4 to 4096
-/// samples); denoised by Blender 0.70, spread over pixels by a Gaussian of half a pixel 0.66 to 0.88.
+/// Of renders with independent noise, 1 in theory, MOST of the squares have ratios below 0.96 to 1.14 (24
+/// frames, 4 to 4096 samples); denoised by Blender 0.70, spread over pixels by a Gaussian of half a pixel
+/// 0.66 to 0.88.
 const ALIKE: f32 = 0.88;
 
-/// Relative differences of neighbours below which noise was removed, and not spread: 0.001 after denoising; noise of 4 to
-/// 64 samples that is spread by half a pixel has 0.01 to 0.5.
+/// Relative differences of neighbours below which noise was removed, and not spread: 0.001 after denoising;
+/// noise of 4 to 64 samples that is spread by half a pixel has 0.01 to 0.5.
 const REMOVED: f32 = 0.015;
 
 /// `light` is [`sums`](super::light::sums) of the render.
@@ -61,8 +62,8 @@ pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<F
     }
 }
 
-/// By how much less neighbours differ than pixels two apart, in most squares, and the median of their differences; none where
-/// too little shows.
+/// By how much less neighbours differ than pixels two apart, in most squares, and the median of their
+/// differences; none where too little shows.
 fn likeness(set: &PassSet, render: &Planes, light: &[f32]) -> Option<(f32, f32)> {
     let surfaces = lit_surfaces(set, render)?;
     let (w, h) = (set.width, set.height);
@@ -113,8 +114,9 @@ const ALONE: f32 = 2.0;
 /// Pixels that a class needs.
 const CLAMPED_PIXELS: f32 = 30.0;
 
-/// Cycles scales a sample whose channels add up to more than three times the clamp down to that. In a pixel of N samples one
-/// such sample adds three times the clamp, divided by N: many pixels stand out from those around them by just that.
+/// Cycles scales a sample whose channels add up to more than three times the clamp down to that. In a pixel
+/// of N samples one such sample adds three times the clamp, divided by N: many pixels stand out from those
+/// around them by just that.
 ///
 /// To be asked last: what is cut off at 1 was encoded for a display, which is another fault.
 pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
@@ -193,7 +195,8 @@ impl Counts {
         Self(counts)
     }
 
-    /// Pixels in classes before (negative) or after one that begins at a logarithm, from the first to the second.
+    /// Pixels in classes before (negative) or after one that begins at a logarithm, from the first to the
+    /// second.
     fn classes(&self, logarithm: f32, from: i32, to: i32) -> f32 {
         let at = |class: i32| {
             let step = Self::step(logarithm) + class * Self::STEPS - Self::FIRST - 1;

@@ -1,7 +1,8 @@
-//! Guides that lie elsewhere than the beauty: of a frame with another camera or crop, or one that was moved in compositing.
+//! Guides that lie elsewhere than the beauty: of a frame with another camera or crop, or one that was moved
+//! in compositing.
 //!
-//! Edges of the guides are held against edges of the beauty, at shifts up to some pixels: of a frame's own guides, none fits
-//! better than that of no shift.
+//! Edges of the guides are held against edges of the beauty, at shifts up to some pixels: of a frame's own
+//! guides, none fits better than that of no shift.
 
 use rayon::prelude::*;
 
@@ -17,8 +18,8 @@ const NONE: isize = 1;
 /// A correlation of edges below this is none: 0.2 or more of a frame's own guides in 15 of 17 scenes.
 const FITS: f64 = 0.2;
 
-/// By how many times better a shift must fit than no shift: it never does in sound frames of 320x180 pixels and more; guides
-/// moved by 8 pixels fit there 1.25 times as well or better.
+/// By how many times better a shift must fit than no shift: it never does in sound frames of 320x180 pixels
+/// and more; guides moved by 8 pixels fit there 1.25 times as well or better.
 const BETTER: f64 = 1.2;
 
 /// Rows that are held against each other: those of larger frames are picked evenly.
@@ -89,7 +90,8 @@ fn edges(planes: &[&[f32]], w: usize, h: usize, most: f32) -> Planes {
     })
 }
 
-/// Where a guide would have to be moved to fit best, in pixels to the right and down; none where it fits as it lies, or nowhere.
+/// Where a guide would have to be moved to fit best, in pixels to the right and down; none where it fits as
+/// it lies, or nowhere.
 fn shift(beauty: &Planes, guide: &Planes) -> Option<(isize, isize)> {
     let (w, h) = (beauty.width, beauty.height);
     let inner = REACH..h - REACH;

@@ -1,5 +1,5 @@
-//! What frames of a shot tell together: noise that is the same in all, guides that stand still while things move, and motion
-//! that is missing.
+//! What frames of a shot tell together: noise that is the same in all, guides that stand still while things
+//! move, and motion that is missing.
 
 use super::{Finding, GUIDES, grain::Grain};
 use crate::passes::{BLENDER, Pass, PassSet};

@@ -7,8 +7,8 @@ use crate::{
     planes::Planes,
 };
 
-/// Passes that no frame with anything in it has zero everywhere; others rightly are where a scene has no glass, no volume, no
-/// lamp in view.
+/// Passes that no frame with anything in it has zero everywhere; others rightly are where a scene has no
+/// glass, no volume, no lamp in view.
 const NEVER_ZERO: [Pass; 6] = [
     Pass::Combined,
     Pass::Normal,
@@ -21,8 +21,9 @@ const NEVER_ZERO: [Pass; 6] = [
 /// A guide whose values differ by no more than this is one value: half floats near 1 are 0.0005 apart.
 const CONSTANT: f32 = 0.001;
 
-/// Albedo above this is more than rounding. Cycles adds to the albedo of lamps and screens the light that they send, of which
-/// the render has at least as much: what the albedo has more than the render is the surface's own.
+/// Albedo above this is more than rounding. Cycles adds to the albedo of lamps and screens the light that
+/// they send, of which the render has at least as much: what the albedo has more than the render is the
+/// surface's own.
 const ABOVE_ONE: f32 = 1.02;
 
 /// Albedo above this is taken for a lamp's, which fog may hide.

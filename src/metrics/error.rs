@@ -1,10 +1,10 @@
 //! Pixel-wise errors on linear radiance.
 //!
 //! RelMSE: Rousselle, Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error
-//! Minimization" (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels; also trimmed of its
-//! worst 0.1% of pixels, so that a handful of fireflies in image or reference does not decide (this project's own).
-//! RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al., "Denoising
-//! with Kernel Prediction and Asymmetric Loss Functions" (2018), section 4.
+//! Minimization" (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels; also trimmed of
+//! its worst 0.1% of pixels, so that a handful of fireflies in image or reference does not decide (this
+//! project's own). RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al.,
+//! "Denoising with Kernel Prediction and Asymmetric Loss Functions" (2018), section 4.
 
 use rayon::prelude::*;
 
@@ -50,7 +50,8 @@ pub fn smape(image: &Planes, reference: &Planes) -> f64 {
     mean(image, reference, |x, r| (x - r).abs() / (x.abs() + r.abs() + SMAPE_EPSILON))
 }
 
-/// The sum of all values over the reference's: what becomes of the light. None where the reference's is not positive.
+/// The sum of all values over the reference's: what becomes of the light. None where the reference's is not
+/// positive.
 pub fn energy(image: &Planes, reference: &Planes) -> Option<f64> {
     let sum = |planes: &Planes| planes.data.iter().map(|v| f64::from(*v)).sum::<f64>();
     let whole = sum(reference);

@@ -1,8 +1,10 @@
-//! How much the error of a sequence changes from frame to frame where the picture does not: what an eye sees as boiling.
+//! How much the error of a sequence changes from frame to frame where the picture does not: what an eye sees
+//! as boiling.
 //!
-//! With e(t) the error of frame t and W the bilinear warp along the Vector pass from frame t - 1, it is the mean over pixels and
-//! channels of `(e(t) - W e(t-1))^2 / (r(t)^2 + 0.001)`, of pixels alone whose 3x3 mean of the reference changes along their
-//! motion by less than a tenth of it plus 0.003, in every channel: elsewhere light moves, or surfaces come and go.
+//! With e(t) the error of frame t and W the bilinear warp along the Vector pass from frame t - 1, it is the
+//! mean over pixels and channels of `(e(t) - W e(t-1))^2 / (r(t)^2 + 0.001)`, of pixels alone whose 3x3 mean
+//! of the reference changes along their motion by less than a tenth of it plus 0.003, in every channel:
+//! elsewhere light moves, or surfaces come and go.
 
 use super::error::RELMSE_EPSILON;
 use crate::{

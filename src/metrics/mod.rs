@@ -1,10 +1,10 @@
 //! How far an image is from its reference: pure functions on linear radiance, (3, H, W).
 //!
 //! One file a family, each with its formula, constants and source: [`error`] (RelMSE, RMSE, maximum
-//! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices; and [`pairing`], which
-//! tells whether the two belong together.
-//! [`score`] computes all of these. [`flicker`] is of a sequence: two frames and the motion between them.
-//! Sums run in f64 row by row in a fixed order: the number of threads does not change a digit.
+//! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices; and
+//! [`pairing`], which tells whether the two belong together. [`score`] computes all of these. [`flicker`] is
+//! of a sequence: two frames and the motion between them. Sums run in f64 row by row in a fixed order: the
+//! number of threads does not change a digit.
 
 use std::fmt;
 

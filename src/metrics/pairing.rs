@@ -1,10 +1,11 @@
-//! Whether a render and its reference show the same scene: textures that Blender gave to other materials, or an object
-//! that moved between the two, are charged to every method, and teach a network to blur.
+//! Whether a render and its reference show the same scene: textures that Blender gave to other materials, or
+//! an object that moved between the two, are charged to every method, and teach a network to blur.
 //!
-//! In squares of 16x16 pixels the mean luminance of a render differs from its reference's by noise alone. Noise with few
-//! bright samples leaves some squares too dark and hardly one too bright; another texture or place makes some brighter
-//! and others darker, another exposure nearly all of them. So the smaller share of the two tells, or the larger where it is
-//! most of the picture (this project's own test; on 300 pairs that belong together they are at most 0.5% and 17%).
+//! In squares of 16x16 pixels the mean luminance of a render differs from its reference's by noise alone.
+//! Noise with few bright samples leaves some squares too dark and hardly one too bright; another texture or
+//! place makes some brighter and others darker, another exposure nearly all of them. So the smaller share of
+//! the two tells, or the larger where it is most of the picture (this project's own test; on 300 pairs that
+//! belong together they are at most 0.5% and 17%).
 
 use std::fmt::Display;
 
@@ -14,19 +15,19 @@ use crate::planes::Planes;
 /// Rows and columns of a square.
 const SQUARE: usize = 16;
 
-/// A square differs when its mean is off by more than as many standard errors, and by more than this share of the
-/// reference's, with an offset that keeps black squares out.
+/// A square differs when its mean is off by more than as many standard errors, and by more than this share of
+/// the reference's, with an offset that keeps black squares out.
 const STANDARD_ERRORS: f64 = 6.0;
 const LEAST_CHANGE: f64 = 0.04;
 const OFFSET: f64 = 1e-4;
 
-/// Beyond these shares of the squares, too bright and too dark alike or all of one kind, a render and its reference are
-/// said to differ.
+/// Beyond these shares of the squares, too bright and too dark alike or all of one kind, a render and its
+/// reference are said to differ.
 const BOTH_WAYS: f64 = 0.02;
 const ONE_WAY: f64 = 0.5;
 
-/// The share of the squares of an image that differ from those of `reference` by more than noise explains, where that is so
-/// large that the two do not show the same scene. Both are radiance, (3, H, W).
+/// The share of the squares of an image that differ from those of `reference` by more than noise explains,
+/// where that is so large that the two do not show the same scene. Both are radiance, (3, H, W).
 ///
 /// # Panics
 /// If sizes differ, or are not those of RGB.
@@ -60,7 +61,8 @@ fn mismatch(image: &Planes, reference: &Planes) -> Option<f64> {
     differs.then(|| share(brighter + darker))
 }
 
-/// What the user should know of the pair `name` if its two renders, radiance, (3, H, W), do not show the same scene.
+/// What the user should know of the pair `name` if its two renders, radiance, (3, H, W), do not show the same
+/// scene.
 ///
 /// # Panics
 /// If sizes differ, or are not those of RGB.

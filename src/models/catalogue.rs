@@ -128,8 +128,8 @@ impl Method {
         }
     }
 
-    /// Its weights file, where it has one and that can be found: in the folder that `DEMC_WEIGHTS` names, or in
-    /// `eval/rivals/weights` of the current folder.
+    /// Its weights file, where it has one and that can be found: in the folder that `DEMC_WEIGHTS` names, or
+    /// in `eval/rivals/weights` of the current folder.
     pub fn weights_file(&self) -> Option<PathBuf> {
         if !matches!(self.kind, Kind::Learned { weights: Weights::File, .. }) {
             return None;

@@ -10,7 +10,7 @@ use dfdx::{
     tensor_ops::{abs, exp, ln, powf, relu},
 };
 
-use super::network::{Architecture, Batch, Config, Design, Network, Taped, duplicate, squares};
+use super::network::{Architecture, Batch, Config, Design, Network, Taped, convolution_weights, duplicate};
 use crate::{
     Result,
     features::{GAMMA, Inputs, PAPER_FEATURES, PAPER_PASSES, paper_colour, paper_features},
@@ -98,12 +98,13 @@ pub static DESIGN: Design = Design {
     inputs: "paper/gamma/1",
     levels: PAPER_WIDTHS.len(),
     prefilter_levels: 0,
-    least_parameters: |config| squares(4, &config.widths),
+    least_parameters: |config| convolution_weights(4, &config.widths),
     build: |config, seed| Box::new(Demc::new(config.architecture, &config.widths, seed)),
 };
 
 /// SEMC.
-pub static SINGLE: Design = Design { least_parameters: |config| squares(2, &config.widths), ..DESIGN };
+pub static SINGLE: Design =
+    Design { least_parameters: |config| convolution_weights(2, &config.widths), ..DESIGN };
 
 /// DEMC, DEMC without fusion, or SEMC.
 #[derive(Clone)]

@@ -75,8 +75,8 @@ pub trait Denoiser: Send + Sync {
         false
     }
 
-    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along with the beauty,
-    /// in its place.
+    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along
+    /// with the beauty, in its place.
     ///
     /// # Errors
     /// As [`Denoiser::denoise`], or there are companions and the method takes none.
@@ -90,7 +90,8 @@ pub trait Denoiser: Send + Sync {
         self.denoise_tiled(shot, tile)
     }
 
-    /// As [`Denoiser::denoise_along`], and how far off the result is expected to be, where the method can tell.
+    /// As [`Denoiser::denoise_along`], and how far off the result is expected to be, where the method can
+    /// tell.
     ///
     /// # Errors
     /// As [`Denoiser::denoise_along`].
@@ -119,8 +120,8 @@ pub trait Denoiser: Send + Sync {
         Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
     }
 
-    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by itself, or takes
-    /// seconds.
+    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by
+    /// itself, or takes seconds.
     fn is_warm(&self) -> bool {
         false
     }

@@ -5,15 +5,16 @@ use crate::{
     planes::Planes,
 };
 
-/// The squared error to be expected of each pixel of a denoised frame, relative to the squared light there: what RelMSE
-/// ([`crate::metrics::error::relmse`]) is the mean of.
+/// The squared error to be expected of each pixel of a denoised frame, relative to the squared light there:
+/// what RelMSE ([`crate::metrics::error::relmse`]) is the mean of.
 #[derive(Clone, Debug)]
 pub struct ExpectedError {
     /// Of each 4x4 square of pixels, (1, H / 4, W / 4) rounded up.
     squares: Planes,
     /// Columns and rows of pixels.
     size: (usize, usize),
-    /// What they are a part of, by width and height, and where they begin in it; elsewhere no error is expected.
+    /// What they are a part of, by width and height, and where they begin in it; elsewhere no error is
+    /// expected.
     whole: (usize, usize),
     place: (usize, usize),
 }

@@ -2,8 +2,8 @@
 //! TOG 34:4).
 //!
 //! In: `features::lbf`. Out: radiance, filtered by a cross-bilateral filter whose parameters a small
-//! perceptron chooses for each pixel from the secondary features (Sections 3.3 and 4.1). Both are trained end to
-//! end: the loss is that of the filtered image, and its gradient passes through the filter.
+//! perceptron chooses for each pixel from the secondary features (Sections 3.3 and 4.1). Both are trained end
+//! to end: the loss is that of the filtered image, and its gradient passes through the filter.
 //!
 //! Departures: (1) the window is 21x21, not 55x55, which takes a seventh of the time; (2) deviations
 //! come from neighbouring pixels, since Cycles writes none of its samples, and there is no visibility

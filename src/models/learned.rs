@@ -22,9 +22,10 @@ use crate::{
     shot::Shot,
 };
 
-/// The built-in model that looks at a frame twice, the second time upside down and with its 2x2 squares one pixel further
-/// on, and answers with the mean: what a network gets wrong depends on how its squares and levels happen to lie on the
-/// picture, and half of that averages out (Lim et al. 2017 call it a geometric self-ensemble). It has the weights of `demc-m`.
+/// The built-in model that looks at a frame twice, the second time upside down and with its 2x2 squares one
+/// pixel further on, and answers with the mean: what a network gets wrong depends on how its squares and
+/// levels happen to lie on the picture, and half of that averages out (Lim et al. 2017 call it a geometric
+/// self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
 
 /// What [`TURNED`] does to a frame of odd width and height.
@@ -62,7 +63,8 @@ impl Learned {
         Ok(Self { name: path.display().to_string(), network, turned: false, metadata })
     }
 
-    /// The model under another name, with its weights packed for an arithmetic: that asked for, or the fastest.
+    /// The model under another name, with its weights packed for an arithmetic: that asked for, or the
+    /// fastest.
     ///
     /// # Errors
     /// 8 bits are asked for, and the model cannot compute in them.
@@ -83,15 +85,16 @@ impl Learned {
         Ok(self)
     }
 
-    /// The network. What changes its layers or their parameters, or may, thaws them, and those of 8 bits compute only
-    /// while they are frozen: [`Network::freeze`] follows.
+    /// The network. What changes its layers or their parameters, or may, thaws them, and those of 8 bits
+    /// compute only while they are frozen: [`Network::freeze`] follows.
     pub fn network(&mut self) -> &mut dyn Network {
         &mut *self.network
     }
 
-    /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a square as before, so
-    /// a column or row is added at what becomes the beginning; fireflies are tamed before it mirrors them, since two would be
-    /// company for each other. The clean guides are those of the first look.
+    /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a
+    /// square as before, so a column or row is added at what becomes the beginning; fireflies are tamed
+    /// before it mirrors them, since two would be company for each other. The clean guides are those of the
+    /// first look.
     fn second_look(
         &self,
         passes: &PassSet,
@@ -201,7 +204,8 @@ impl Denoiser for Learned {
 }
 
 impl Learned {
-    /// The part of a frame that was rendered, denoised in its place; with the error to be expected if it `expects` one.
+    /// The part of a frame that was rendered, denoised in its place; with the error to be expected if it
+    /// `expects` one.
     fn denoise_rendered(
         &self,
         shot: &Shot,
@@ -296,9 +300,10 @@ fn average(first: &mut Planes, second: &Planes) {
 /// Of the pixels around a region that was rendered of a frame, the share that holds something.
 const FILLED: f64 = 0.9;
 
-/// Column and row, width and height of the part of a frame that was rendered. Where that was a region, all else is zero in
-/// every pass, which is no black wall: what lies beyond a region is unknown. Things before a transparent background fill a
-/// part of the frame as well, but not to its edges; such a frame is taken whole.
+/// Column and row, width and height of the part of a frame that was rendered. Where that was a region, all
+/// else is zero in every pass, which is no black wall: what lies beyond a region is unknown. Things before a
+/// transparent background fill a part of the frame as well, but not to its edges; such a frame is taken
+/// whole.
 fn rendered(passes: &PassSet) -> ((usize, usize), (usize, usize)) {
     let (width, height) = (passes.width, passes.height);
     let whole = ((0, 0), (width, height));

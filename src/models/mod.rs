@@ -107,8 +107,8 @@ pub fn check(config: &Config) -> Result<(), String> {
     Ok(())
 }
 
-/// Fewer parameters than the network of a configuration has, but not by far: a file that holds fewer is not asked for memory to
-/// build it in.
+/// Fewer parameters than the network of a configuration has, but not by far: a file that holds fewer is not
+/// asked for memory to build it in.
 ///
 /// # Panics
 /// If [`check`] finds the configuration wrong.

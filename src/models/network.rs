@@ -25,7 +25,8 @@ pub struct Config {
     pub architecture: Architecture,
     /// Channels at each level, finest first.
     pub widths: Vec<usize>,
-    /// Those of a built-in network's prefilter, which denoises albedo and normal first; other networks have none.
+    /// Those of a built-in network's prefilter, which denoises albedo and normal first; other networks have
+    /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub prefilter: Vec<usize>,
 }
@@ -72,9 +73,10 @@ pub enum Architecture {
 
 /// What sets a design apart, as its own file says it.
 pub struct Design {
-    /// Feature set and transfer of radiance, as weights files record them. The number goes up whenever a value that the network
-    /// reads or writes comes to mean something else, as by another constant in `features`: weights from before are then
-    /// refused, where they would be run on what they were not trained on.
+    /// Feature set and transfer of radiance, as weights files record them. The number goes up whenever a
+    /// value that the network reads or writes comes to mean something else, as by another constant in
+    /// `features`: weights from before are then refused, where they would be run on what they were not
+    /// trained on.
     pub inputs: &'static str,
     /// How many widths it takes.
     pub levels: usize,
@@ -107,7 +109,7 @@ impl Architecture {
 }
 
 /// Parameters of as many 3x3 convolutions between as many channels as each level has.
-pub fn squares(convolutions: usize, widths: &[usize]) -> usize {
+pub fn convolution_weights(convolutions: usize, widths: &[usize]) -> usize {
     convolutions * 9 * widths.iter().map(|width| width * width).sum::<usize>()
 }
 
@@ -201,7 +203,8 @@ pub trait Network: Send + Sync {
         self.convolutions().into_iter().for_each(|conv| conv.freeze(&[]));
     }
 
-    /// Whether it can compute in 8 bits: its design has a way to, and the ranges of its activations are known.
+    /// Whether it can compute in 8 bits: its design has a way to, and the ranges of its activations are
+    /// known.
     fn is_quantizable(&mut self) -> bool {
         false
     }
@@ -224,7 +227,7 @@ pub trait Network: Send + Sync {
     fn reach(&self) -> usize;
 
     /// Denoised radiance of a frame, (3, H, W), worked on in parts of `tile` rows (and columns, where the
-    /// network wants squares), whatever their size to the same bits.
+    /// network is cut both ways), whatever their size to the same bits.
     ///
     /// # Errors
     /// A pass is missing.
@@ -259,7 +262,8 @@ pub trait Network: Send + Sync {
         false
     }
 
-    /// [`Network::infer`], and each of the companions denoised along with it, where [`Network::takes_companions`].
+    /// [`Network::infer`], and each of the companions denoised along with it, where
+    /// [`Network::takes_companions`].
     ///
     /// # Errors
     /// As [`Network::infer`].

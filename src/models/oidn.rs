@@ -40,7 +40,8 @@ impl Oidn {
         let name = NAMES.into_iter().find(|n| *n == name)?;
         let program: PathBuf =
             program.or_else(|| std::env::var_os(VARIABLE).map(Into::into)).unwrap_or_else(|| PROGRAM.into());
-        // It runs in another folder, to which a path must not refer; a bare name is looked for on the search path.
+        // It runs in another folder, to which a path must not refer; a bare name is looked for on the search
+        // path.
         let is_bare = program.components().count() == 1;
         let absolute = (!is_bare).then(|| std::path::absolute(&program).ok()).flatten();
         Some(Self { name, program: absolute.unwrap_or(program) })
@@ -141,7 +142,8 @@ impl Denoiser for Oidn {
         let temporary = tempfile::tempdir().map_err(Error::io("create", std::env::temp_dir()))?;
         let folder = temporary.path();
         write_pfm(&folder.join("color.pfm"), passes.require(Pass::Combined, self.name)?)?;
-        // A guide that the frame lacks is not given, nor a normal without an albedo, which the program does not take.
+        // A guide that the frame lacks is not given, nor a normal without an albedo, which the program does
+        // not take.
         let mut runs = Vec::new();
         let mut inputs = vec!["--hdr", "color.pfm"];
         for (option, pass, noisy, clean) in GUIDES {

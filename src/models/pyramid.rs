@@ -1,24 +1,27 @@
 //! The built-in network: a dual encoder at half resolution that predicts kernels instead of colours.
 //!
 //! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
-//! follows what measurement favoured: the trunk works on 2x2 squares (space to depth), and each level
+//! follows what measurement favoured: the trunk works on quads, 2x2 pixels (space to depth), and each level
 //! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
 //! al. 2018), after it was blended with what filtering made of the level below: a level's own kernels
 //! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
-//! by it last, so texture is never blurred with the noise. A confidence for every pixel and level lets a firefly
-//! take itself out of all kernels at once.
+//! by it last, so texture is never blurred with the noise. A confidence for every pixel and level lets a
+//! firefly take itself out of all kernels at once.
 //!
-//! Kernels cannot invent a colour, and scale with their input exactly; nor can they draw an edge finer than the noise
-//! that they average. So each colour of each pixel gets a bounded gain last, which scales with the input as well.
+//! Kernels cannot invent a colour, and scale with their input exactly; nor can they draw an edge finer than
+//! the noise that they average. So each colour of each pixel gets a bounded gain last, which scales with the
+//! input as well.
 //!
 //! Noise in the albedo (depth of field, 4 spp edges) is removed before: the built-in networks read it from a
-//! prefilter, a small network of the same kind, which was trained by itself and is not trained any further. Its kernels filter
-//! the normal alike, for the [refit](crate::filters::refit) that comes last. The samples that made an albedo noisy made the
-//! radiance noisy alike, though, and their quotient is free of that noise: so each pixel says how far it is to be divided by the
-//! noisy albedo, not by the clean one. Normals are read as noisy as they are for the same reason.
+//! prefilter, a small network of the same kind, which was trained by itself and is not trained any further.
+//! Its kernels filter the normal alike, for the [refit](crate::filters::refit) that comes last. The samples
+//! that made an albedo noisy made the radiance noisy alike, though, and their quotient is free of that noise:
+//! so each pixel says how far it is to be divided by the noisy albedo, not by the clean one. Normals are read
+//! as noisy as they are for the same reason.
 //!
-//! What normals alone show, such as a moulding, is often thinner than any kernel that is wide enough to average its noise. A fit
-//! of light over normals ([`Shading`]) finds it; each pixel says how far its gain is to follow that.
+//! What normals alone show, such as a moulding, is often thinner than any kernel that is wide enough to
+//! average its noise. A fit of light over normals ([`Shading`]) finds it; each pixel says how far its gain is
+//! to follow that.
 
 mod bands;
 mod light;
@@ -28,7 +31,9 @@ mod trunk;
 
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
-use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate, squares};
+use super::network::{
+    Architecture, Batch, Config, Design, Network, Stacked, Taped, convolution_weights, duplicate,
+};
 use crate::{
     Result,
     companion::Companion,
@@ -67,8 +72,8 @@ pub fn prefilter() -> Config {
     Config::new(Architecture::Prefilter, &PREFILTER_OF_M)
 }
 
-/// Rows and columns of the radiance kernels at full resolution: what is as thin as a pixel there, texture and edges, was
-/// divided away with the guides, whose own kernels need more than nine pixels to average along it.
+/// Rows and columns of the radiance kernels at full resolution: what is as thin as a pixel there, texture and
+/// edges, was divided away with the guides, whose own kernels need more than nine pixels to average along it.
 const FULL_KERNEL: usize = 3;
 
 /// What the names of a prefilter's layers begin with.
@@ -86,7 +91,9 @@ pub static DESIGN: Design = Design {
     inputs: "guides/logarithm/1",
     levels: LEVELS,
     prefilter_levels: LEVELS,
-    least_parameters: |config| squares(2, &config.widths) + squares(2, &config.prefilter),
+    least_parameters: |config| {
+        convolution_weights(2, &config.widths) + convolution_weights(2, &config.prefilter)
+    },
     build: |config, seed| Box::new(Pyramid::new(config, seed)),
 };
 

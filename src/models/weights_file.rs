@@ -58,7 +58,8 @@ pub struct Facts {
     /// The weights file whose prefilter it got, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<String>,
-    /// The names of the parameters that alone were trained, `*` for any part of one; if there are none, all were.
+    /// The names of the parameters that alone were trained, `*` for any part of one; if there are none, all
+    /// were.
     #[serde(default)]
     pub only: Vec<String>,
     /// Seconds of training.
@@ -80,7 +81,8 @@ fn adam() -> String {
 pub struct Metadata {
     /// The network.
     pub network: Config,
-    /// What it was trained to read, see [`Architecture::inputs`]; files without it hold the first that there were.
+    /// What it was trained to read, see [`Architecture::inputs`]; files without it hold the first that there
+    /// were.
     #[serde(default)]
     pub inputs: Option<String>,
     /// How it was trained.
@@ -231,8 +233,8 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
     Ok((metadata, tensors))
 }
 
-/// Whether a network that was trained on the inputs `held` reads those that are made `now`; why not, if it does not. Files that do
-/// not say hold the first of their kind.
+/// Whether a network that was trained on the inputs `held` reads those that are made `now`; why not, if it
+/// does not. Files that do not say hold the first of their kind.
 fn check_inputs(held: Option<&str>, now: &str) -> Result<(), String> {
     let (kind, _) = now.rsplit_once('/').expect("inputs end in a number");
     let first = format!("{kind}/1");

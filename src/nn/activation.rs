@@ -11,8 +11,8 @@ use crate::kernels::{
     narrow::Operand,
 };
 
-/// The gradient of one activation or field while the tape runs backward; `None` until something flows in. Nobody waits for the
-/// lock: it lets what has no tape go to another thread.
+/// The gradient of one activation or field while the tape runs backward; `None` until something flows in.
+/// Nobody waits for the lock: it lets what has no tape go to another thread.
 #[derive(Debug)]
 pub(super) struct Gradient<B>(Arc<Mutex<Option<B>>>);
 
@@ -100,13 +100,13 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         Self::constant(Data::F32(data))
     }
 
-    /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each 2x2 square
+    /// A network input at half resolution from `(N, C, H, W)` values: the four pixels of each quad
     /// become channels (space to depth). (N, C, H, W) -> (N, 4C, H/2, W/2)
     ///
     /// # Panics
     /// If rows or columns are odd, or the length of `values` is not what `shape` demands.
     pub fn input_halved(shape: Shape, values: &[f32]) -> Self {
-        let mut data = Buffer::new(shape.squares());
+        let mut data = Buffer::new(shape.quads());
         to_blocked(values, 2, data.view_mut());
         Self::constant(Data::F32(data))
     }
@@ -194,7 +194,8 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         values.saved.data.view().data().iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
-    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a gradient.
+    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a
+    /// gradient.
     pub(super) fn output(data: Data, tape: T, learns: bool) -> (Self, Saved) {
         let saved = Saved { data: Arc::new(data), gradient: learns.then(Gradient::default) };
         (Self { saved: saved.clone(), tape }, saved)

@@ -23,7 +23,8 @@ pub enum Precision {
     F32,
     /// To bfloat16 (8 bits of mantissa), as matrix units want them.
     Bf16,
-    /// To 8 bits, in steps that fit the ranges a trained network's inputs and activations have; for inference only.
+    /// To 8 bits, in steps that fit the ranges a trained network's inputs and activations have; for inference
+    /// only.
     Int8,
 }
 
@@ -84,8 +85,8 @@ impl Arithmetic {
         }
     }
 
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, of narrow weights rounded to a format or not.
-    /// `taped` is for training.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, of narrow weights rounded to a
+    /// format or not. `taped` is for training.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
@@ -222,8 +223,8 @@ impl Arithmetic {
     }
 }
 
-/// [`conv::convolve`] in training: by squares of outputs where that is faster, though sums are then rounded otherwise where a frame is
-/// cut otherwise.
+/// [`conv::convolve`] in training: by cells of outputs where that is faster, though sums are then rounded
+/// otherwise where a frame is cut otherwise.
 fn convolve_taped(
     tier: Tier,
     sources: &[View],

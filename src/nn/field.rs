@@ -143,11 +143,11 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     }
 
     /// Channels `first..first + channels` of a layer's output as planes, each value at its own pixel for
-    /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a 2x2 square.
+    /// `factor` 1; for `factor` 2, four consecutive channels become the pixels of a quad.
     /// (N, K, H, W) -> (N, channels / factor^2, factor * H, factor * W)
     ///
     /// # Panics
-    /// If there are not as many channels, or they are not whole squares from `first` on.
+    /// If there are not as many channels, or they are not whole quads from `first` on.
     pub fn from_activation(activation: Activation<T>, first: usize, channels: usize, factor: usize) -> Self {
         let activation = activation.into_f32();
         let shape = activation.shape();
@@ -227,7 +227,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each 2x2 square weighted by
+    /// Halves the field, (N, 3, H, W) -> (N, 3, H/2, W/2), each quad weighted by
     /// `exp(confidence)`, (N, 1, H, W). See [`reduce`].
     ///
     /// # Panics
@@ -297,7 +297,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Its channels and then those of another field of the same size: (N, C, H, W) and (N, D, H, W) -> (N, C + D, H, W)
+    /// Its channels and then those of another field of the same size:
+    /// (N, C, H, W) and (N, D, H, W) -> (N, C + D, H, W)
     ///
     /// # Panics
     /// If sizes differ.
@@ -396,8 +397,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Radiance over one albedo, an input (N, 3, H, W), divided by another as far as `logits`, (N, 1, H, W), say;
-    /// `ratio` is the logarithm of the first albedo over the second. See [`crate::kernels::redivide`].
+    /// Radiance over one albedo, an input (N, 3, H, W), divided by another as far as `logits`, (N, 1, H, W),
+    /// say; `ratio` is the logarithm of the first albedo over the second. See [`crate::kernels::redivide`].
     ///
     /// # Panics
     /// If extents differ.
@@ -428,9 +429,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic is
-    /// `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W).
-    /// See [`crate::kernels::blend`].
+    /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic
+    /// is `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W). See
+    /// [`crate::kernels::blend`].
     ///
     /// # Panics
     /// If extents do not fit together.
@@ -525,8 +526,8 @@ impl Field<NoneTape> {
         Self { saved: Saved { values, gradient: None }, tape: NoneTape }
     }
 
-    /// [`Field::filter`], all alike, of some rows of fields that hold more rows of one image each: `logits` are of
-    /// those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
+    /// [`Field::filter`], all alike, of some rows of fields that hold more rows of one image each: `logits`
+    /// are of those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
     ///
     /// # Panics
     /// As [`Field::filter`], or if there are not as many rows.

@@ -32,7 +32,8 @@ pub struct Conv {
     pub weight: Param,
     /// `(O)`.
     pub bias: Param,
-    /// The largest value that its ReLU left, as far as was observed; 8 bits reach from zero to some way beyond.
+    /// The largest value that its ReLU left, as far as was observed; 8 bits reach from zero to some way
+    /// beyond.
     pub range: Option<f32>,
     arithmetic: Arithmetic,
     relu: bool,
@@ -103,7 +104,8 @@ impl Conv {
         self
     }
 
-    /// [`Activation::input_halved`] for this layer alone, frozen or not: already rounded if it would do so first.
+    /// [`Activation::input_halved`] for this layer alone, frozen or not: already rounded if it would do so
+    /// first.
     ///
     /// # Panics
     /// As that.
@@ -118,11 +120,12 @@ impl Conv {
         }
     }
 
-    /// Takes over the weights of a narrower layer of the same kind so that it computes the same, and every channel
-    /// counts: further channels copy the old ones in turn, and what reads a channel and its copies divides its weight
-    /// among them, at random (after Chen et al. 2016, Net2Net, where shares are equal). Their gradients then differ from
-    /// the first step on. Channels that begin without effect hardly learn one. Further outputs of a layer without ReLU,
-    /// which are no features, begin at zero. Returns whether the layers fit.
+    /// Takes over the weights of a narrower layer of the same kind so that it computes the same, and every
+    /// channel counts: further channels copy the old ones in turn, and what reads a channel and its copies
+    /// divides its weight among them, at random (after Chen et al. 2016, Net2Net, where shares are equal).
+    /// Their gradients then differ from the first step on. Channels that begin without effect hardly learn
+    /// one. Further outputs of a layer without ReLU, which are no features, begin at zero. Returns whether
+    /// the layers fit.
     pub fn widen_from(&mut self, narrow: &Arithmetic, weight: &[f32], bias: &[f32], rng: &mut Rng) -> bool {
         let wide = &self.arithmetic;
         let fits = wide.geometry == narrow.geometry
@@ -177,8 +180,8 @@ impl Conv {
         self.frozen = None;
     }
 
-    /// Takes in the batch norm that follows, with its running statistics and its ReLU: one layer computes what
-    /// the two did.
+    /// Takes in the batch norm that follows, with its running statistics and its ReLU: one layer computes
+    /// what the two did.
     ///
     /// # Panics
     /// If the layer has a ReLU of its own, or is transposed.
@@ -308,7 +311,8 @@ impl Conv {
     }
 
     /// [`Conv::forward`] of a layer without ReLU and without a tape, as planes at once: see
-    /// [`Field::from_activation`], whose `factor` this is. (N, I, H, W) -> (N, O / factor^2, factor * H, factor * W)
+    /// [`Field::from_activation`], whose `factor` this is. (N, I, H, W) -> (N, O / factor^2, factor * H,
+    /// factor * W)
     ///
     /// # Panics
     /// As [`Conv::forward`], if the layer has a ReLU, or if its channels are no whole planes.

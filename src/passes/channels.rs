@@ -1,7 +1,8 @@
 //! What the name of a channel says, and the channels of each view layer and stereo view by their passes.
 //!
-//! A channel is `<view layer>.<pass>[.<view>].<component>`, in files of several parts often a bare component in a part of
-//! that name. Views are named as OpenEXR's "Storing Multi-View Images" has it, as Nuke does and as Blender does.
+//! A channel is `<view layer>.<pass>[.<view>].<component>`, in files of several parts often a bare component
+//! in a part of that name. Views are named as OpenEXR's "Storing Multi-View Images" has it, as Nuke does and
+//! as Blender does.
 
 use std::collections::BTreeMap;
 
@@ -70,8 +71,8 @@ impl ChannelName {
         };
         let (prefix, view) = without_view(prefix, part);
         let (view_layer, pass) = prefix.rsplit_once('.').unwrap_or(("", prefix));
-        // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a pass's:
-        // a view layer may be called like a pass.
+        // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a
+        // pass's: a view layer may be called like a pass.
         let is_rendered = |name: &str| is_blender(name) || light_group(name).is_some();
         let of_pass =
             view_layer.rsplit_once('.').filter(|(_, owner)| is_rendered(owner) && !is_rendered(pass));
@@ -173,7 +174,8 @@ fn entry(found: &mut Vec<(LayerKey, ByPass)>, key: LayerKey) -> &mut ByPass {
     &mut found[at].1
 }
 
-/// Parts may have any name: where nothing in a view is called like a beauty, the colours of its first part are it.
+/// Parts may have any name: where nothing in a view is called like a beauty, the colours of its first part
+/// are it.
 fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
     if !frame.is_multi_part() {
         return;

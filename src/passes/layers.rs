@@ -63,8 +63,9 @@ pub fn layers_by(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
     found.map(|((name, view), channels)| assign(name, view, channels, mapping)).collect()
 }
 
-/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised` or
-/// `ViewLayer.Denoised`: each with those as its Combined and nothing else, in file order, once for each stereo view.
+/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised`
+/// or `ViewLayer.Denoised`: each with those as its Combined and nothing else, in file order, once for each
+/// stereo view.
 pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<Layer> {
     let found = by_pass(frame).into_iter();
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
@@ -76,7 +77,8 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
     found.filter_map(as_combined).collect()
 }
 
-/// The layers of a file of its own that are a pass: those of its name, or else the pictures that it holds without a name.
+/// The layers of a file of its own that are a pass: those of its name, or else the pictures that it holds
+/// without a name.
 pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
     let named: Vec<Layer> =
         layers(frame).into_iter().filter(|layer| layer.passes.contains_key(&pass)).collect();
@@ -115,7 +117,8 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
     let best = by_all.iter().rev().max_by_key(|(_, passes)| told(passes)); // `max_by_key` keeps the last of equals
     let (renderer, passes) = best.expect("there are renderers");
     (layer.renderer, layer.passes) = (renderer, passes.clone());
-    // Compositors give names of several. What Blender itself leaves out stays out: its passes differ from others' of one name.
+    // Compositors give names of several. What Blender itself leaves out stays out: its passes differ from
+    // others' of one name.
     if !renderer.is_blender() {
         for (pass, at) in by_all.iter().flat_map(|(_, passes)| passes) {
             if is_common(&at.name) && *pass != Pass::Normal {
@@ -248,8 +251,9 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
     }
 }
 
-/// The view layer to hold against one of that name in another file: its namesake, or the only one with Combined besides the
-/// compositor's. A file without view layers, whose name is empty, has nothing to choose by: see [`choose`].
+/// The view layer to hold against one of that name in another file: its namesake, or the only one with
+/// Combined besides the compositor's. A file without view layers, whose name is empty, has nothing to choose
+/// by: see [`choose`].
 ///
 /// # Errors
 /// There is none; the message lists what there is.
@@ -304,8 +308,8 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
     set.renderer = layer.renderer;
-    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had. Programs that write a render
-    // anew leave it out: then what render pairs are named by.
+    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had. Programs that
+    // write a render anew leave it out: then what render pairs are named by.
     let told = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
     let told = told.and_then(|count| count.trim().parse().ok());
     set.samples = told.or_else(|| samples(frame.path()));
@@ -328,8 +332,8 @@ pub fn read_light_groups(frame: &Frame, layer: &Layer) -> Result<BTreeMap<String
     Ok(groups)
 }
 
-/// Decodes channels, cut to a window, and hands them out under their keys. One decoding run for each part: in single-part files
-/// all passes share their blocks.
+/// Decodes channels, cut to a window, and hands them out under their keys. One decoding run for each part: in
+/// single-part files all passes share their blocks.
 fn decode<'a, K>(
     frame: &Frame,
     window: Window,

@@ -19,8 +19,8 @@ const WORDS: [(&str, &[Pass]); 5] = [
 pub struct Mapping(BTreeMap<Pass, String>);
 
 impl Mapping {
-    /// Adds what one line says, such as `albedo=My Albedo`: the pass and the name of its layer in the file, with the view
-    /// layer before it or without.
+    /// Adds what one line says, such as `albedo=My Albedo`: the pass and the name of its layer in the file,
+    /// with the view layer before it or without.
     ///
     /// # Errors
     /// It says nothing of the kind, or another name for a pass that has one; says what it should.

@@ -188,7 +188,8 @@ pub struct PassSet {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// Where the first pixel lies in the coordinates of the display window: other than 0, 0 in cropped renders.
+    /// Where the first pixel lies in the coordinates of the display window: other than 0, 0 in cropped
+    /// renders.
     pub origin: (i32, i32),
     /// Samples of a pixel, or the most that it may have had, where the file tells.
     pub samples: Option<u32>,
@@ -242,7 +243,8 @@ impl PassSet {
         self.padded_rows(passes, rows, size)
     }
 
-    /// Some rows of those of `passes` that it holds, grown to a width and height as [`Planes::padded_to`] does.
+    /// Some rows of those of `passes` that it holds, grown to a width and height as [`Planes::padded_to`]
+    /// does.
     ///
     /// # Panics
     /// As [`Planes::padded_rows`].
@@ -310,7 +312,8 @@ impl PassSet {
         }
     }
 
-    /// Whether the pixels of `reference` are those of this frame: as many, at the same place of the display window.
+    /// Whether the pixels of `reference` are those of this frame: as many, at the same place of the display
+    /// window.
     ///
     /// # Errors
     /// They are not.
@@ -355,7 +358,8 @@ pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet>
     read(&Frame::read(path)?, view_layer)
 }
 
-/// Reads a file and the passes of the view layer that is to be held against one of that name: see [`choose_like`].
+/// Reads a file and the passes of the view layer that is to be held against one of that name: see
+/// [`choose_like`].
 ///
 /// # Errors
 /// The file is unusable, or has no such view layer.

@@ -1,7 +1,8 @@
 //! The one table of what renderers call their passes, and how each is told to write them.
 //!
-//! Blender 5 writes `Diffuse Color`, Blender 4 and older `DiffCol`; other renderers have names of their own, which were
-//! looked up where each table says. How a channel is named beyond its pass is `channels`' business.
+//! Blender 5 writes `Diffuse Color`, Blender 4 and older `DiffCol`; other renderers have names of their own,
+//! which were looked up where each table says. How a channel is named beyond its pass is `channels`'
+//! business.
 
 use std::{collections::HashSet, fmt, sync::LazyLock};
 
@@ -25,7 +26,8 @@ pub fn light_group(pass: &str) -> Option<&str> {
 /// How the components of a pass are named; alternatives are tried in order.
 pub type Components = &'static [&'static [&'static str]];
 
-/// How renderers name the components of a pass: see [`super::channels::is_component`] for how they are compared.
+/// How renderers name the components of a pass: see [`super::channels::is_component`] for how they are
+/// compared.
 pub fn components(pass: Pass) -> Components {
     match pass.quantity() {
         Quantity::Direction | Quantity::Place => &[&["X", "Y", "Z"], &["R", "G", "B"]],
@@ -42,7 +44,8 @@ pub fn components(pass: Pass) -> Components {
 pub struct PassNames {
     /// The meaning.
     pub pass: Pass,
-    /// The renderer's names. Letter case, spaces and underscores do not matter where no name is the very same.
+    /// The renderer's names. Letter case, spaces and underscores do not matter where no name is the very
+    /// same.
     pub names: &'static [&'static str],
     /// How the renderer is told to write it, as a sentence part.
     pub setting: &'static str,
@@ -76,8 +79,8 @@ macro_rules! blender {
     };
 }
 
-/// Blender, whose names are those of [`Pass`] too. `Image` is what its File Output node calls the beauty. Names: Cycles'
-/// `engine.py`.
+/// Blender, whose names are those of [`Pass`] too. `Image` is what its File Output node calls the beauty.
+/// Names: Cycles' `engine.py`.
 pub static BLENDER: Renderer = Renderer {
     name: "Blender",
     motion: &[],
@@ -139,7 +142,8 @@ static ARNOLD: Renderer = Renderer {
     ],
 };
 
-/// V-Ray for 3ds Max and for what names render elements alike. Names: Chaos' documentation, "Render Elements".
+/// V-Ray for 3ds Max and for what names render elements alike. Names: Chaos' documentation, "Render
+/// Elements".
 static VRAY: Renderer = Renderer {
     name: "V-Ray",
     motion: &["VRayVelocity"],
@@ -251,7 +255,8 @@ static CORONA: Renderer = Renderer {
     ],
 };
 
-/// Mitsuba 3, whose users name their AOVs. Names: those of its documentation's examples, "Arbitrary Output Variables".
+/// Mitsuba 3, whose users name their AOVs. Names: those of its documentation's examples, "Arbitrary Output
+/// Variables".
 static MITSUBA: Renderer = Renderer {
     name: "Mitsuba",
     motion: &[],
@@ -293,8 +298,8 @@ static LUXCORE: Renderer = Renderer {
     ],
 };
 
-/// Unreal's Movie Render Queue: `FinalImage`, and with the name of a post-process material behind it. Names: its
-/// documentation, "Render Passes", and files that it wrote.
+/// Unreal's Movie Render Queue: `FinalImage`, and with the name of a post-process material behind it. Names:
+/// its documentation, "Render Passes", and files that it wrote.
 static UNREAL: Renderer = Renderer {
     name: "Unreal",
     motion: &["FinalImageMovieRenderQueue_MotionVectors", "FinalImagePWMotionVectors"],
@@ -335,7 +340,8 @@ static MOONRAY: Renderer = Renderer {
     ],
 };
 
-/// Every renderer demc knows. A layer is said to be of the one that knows most of its names, and of the first among equals.
+/// Every renderer demc knows. A layer is said to be of the one that knows most of its names, and of the first
+/// among equals.
 pub static RENDERERS: [&Renderer; 14] = [
     &BLENDER, &ARNOLD, &VRAY, &VRAY_MAYA, &RENDERMAN, &REDSHIFT, &KARMA, &OCTANE, &CORONA, &MITSUBA, &PBRT,
     &LUXCORE, &UNREAL, &MOONRAY,
@@ -343,7 +349,8 @@ pub static RENDERERS: [&Renderer; 14] = [
 
 /// What depth is called where a channel is called nothing but `Z`.
 pub const BARE_DEPTH: &str = "Z";
-/// Names that mean something else in other renderers, where they are light: they count in files of their own renderer.
+/// Names that mean something else in other renderers, where they are light: they count in files of their own
+/// renderer.
 const AMBIGUOUS: [&str; 1] = ["diffuse"];
 
 impl Renderer {

@@ -1,9 +1,10 @@
-//! Normals of other renderers as Cycles' Denoising Normal has them: camera space, x to the right, y up, z away from the
-//! camera, in -1..1.
+//! Normals of other renderers as Cycles' Denoising Normal has them: camera space, x to the right, y up, z
+//! away from the camera, in -1..1.
 //!
-//! Which way a file has them is found out from the values. What is seen faces the camera: where nearly every normal points
-//! against the ray through its pixel, they are in camera space already. Else they are in world space, and are turned by the camera's matrix where
-//! the file has it (OpenEXR's `worldToCamera`), or by what is seen: nothing that faces away is.
+//! Which way a file has them is found out from the values. What is seen faces the camera: where nearly every
+//! normal points against the ray through its pixel, they are in camera space already. Else they are in world
+//! space, and are turned by the camera's matrix where the file has it (OpenEXR's `worldToCamera`), or by what
+//! is seen: nothing that faces away is.
 
 use std::fmt;
 
@@ -59,13 +60,15 @@ const UNIT: std::ops::Range<f32> = 0.9..1.1;
 const FACING: f64 = 0.97;
 /// Half the horizontal field of view of a usual camera, as a tangent: 53 degrees across.
 const HALF_FIELD: f32 = 0.5;
-/// How far a normal may point away from the camera all the same: lenses and interpolated normals differ by as much.
+/// How far a normal may point away from the camera all the same: lenses and interpolated normals differ by as
+/// much.
 const GRAZING: f32 = 0.05;
 /// Share of the surfaces that must be of unit length for a range to be the right one.
 const MOST: f64 = 0.5;
 
-/// Makes (3, H, W) normals of any renderer those of Cycles. `world_to_camera` is OpenEXR's attribute of that name, by rows:
-/// vectors are multiplied from the left. Returns what was done; nothing where no normal is there to tell.
+/// Makes (3, H, W) normals of any renderer those of Cycles. `world_to_camera` is OpenEXR's attribute of that
+/// name, by rows: vectors are multiplied from the left. Returns what was done; nothing where no normal is
+/// there to tell.
 pub fn to_camera_space(normals: &mut Planes, world_to_camera: Option<[f32; 16]>) -> Option<Change> {
     let was_unit_range = is_unit_range(normals);
     if was_unit_range {
@@ -161,8 +164,8 @@ fn seen_from(normals: &Planes) -> Option<Turn> {
     if is_most(away) {
         return Some(Turn::None);
     }
-    // Floors are seen more than ceilings: up is up unless all is inside out. A frame of nothing but ceiling is rarer still
-    // than normals that point inwards.
+    // Floors are seen more than ceilings: up is up unless all is inside out. A frame of nothing but ceiling
+    // is rarer still than normals that point inwards.
     let turn = if up < -0.2 * count as f32 { Turn::Inwards } else { Turn::TowardsCamera };
     is_most(towards).then_some(turn)
 }
@@ -176,15 +179,17 @@ fn rotation(matrix: [f32; 16]) -> Option<[Vec3; 3]> {
     is_square.then_some(rows)
 }
 
-/// How far a normal counts that faces a direction: floors seen at a slant tell as much as walls seen straight on.
+/// How far a normal counts that faces a direction: floors seen at a slant tell as much as walls seen straight
+/// on.
 const SLANT: f32 = 0.2;
 /// Directions that are tried for the camera's.
 const DIRECTIONS: usize = 2000;
 /// Normals that are looked at.
 const SAMPLE: usize = 4096;
 
-/// The camera's axes in the world (right, up, forward), as far as the normals of what it sees tell. Forward is the direction
-/// that most of them face against; up is the world's, y or z, whichever more surfaces lie flat towards.
+/// The camera's axes in the world (right, up, forward), as far as the normals of what it sees tell. Forward
+/// is the direction that most of them face against; up is the world's, y or z, whichever more surfaces lie
+/// flat towards.
 fn camera_axes(seen: &[Vec3]) -> [Vec3; 3] {
     let sample: Vec<Vec3> = seen.iter().step_by(seen.len().div_ceil(SAMPLE)).copied().collect();
     let facing = |forward: Vec3| sample.iter().map(|n| (-dot(*n, forward)).min(SLANT)).sum::<f32>();

@@ -1,4 +1,5 @@
-//! Frames of a test set that are followed by others of their sequence: what methods made of them is kept until those are scored.
+//! Frames of a test set that are followed by others of their sequence: what methods made of them is kept
+//! until those are scored.
 
 use std::{collections::HashMap, path::Path};
 
@@ -68,7 +69,8 @@ impl<'a> Before<'a> {
         Self { pair, view_layer, reference: None, images: HashMap::new(), loaded: None }
     }
 
-    /// The flicker of a method from this frame to the next, of which `image` is its result; none where no pixel can be followed.
+    /// The flicker of a method from this frame to the next, of which `image` is its result; none where no
+    /// pixel can be followed.
     ///
     /// # Errors
     /// Says why there is none.

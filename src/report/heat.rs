@@ -1,8 +1,8 @@
 //! A heat map: what each method makes of each case, as a ratio to something.
 //!
-//! A row is a case, a column a method, once for each group of columns (a sample count). Blue is below one, red above, on a
-//! logarithmic scale that is full at a factor of ten; each cell has its number. A frame marks what is out of bounds; a case that a
-//! method has no number for has a cross.
+//! A row is a case, a column a method, once for each group of columns (a sample count). Blue is below one,
+//! red above, on a logarithmic scale that is full at a factor of ten; each cell has its number. A frame marks
+//! what is out of bounds; a case that a method has no number for has a cross.
 
 use plotters::prelude::*;
 

@@ -2,10 +2,10 @@
 //!
 //! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
 //! `summary.csv`, the charts `speed_vs_accuracy`, `bars_relmse` and `bars_ssim` as PNG and SVG,
-//! `bars_flicker` and slices of sequences, `error_over_samples` where scenes were rendered at several sample counts,
-//! `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish; those of earlier
-//! runs into the folder stay in `scores.csv` as long as they hold, and are not run again. All else shows what this
-//! run asked for.
+//! `bars_flicker` and slices of sequences, `error_over_samples` where scenes were rendered at several sample
+//! counts, `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish; those
+//! of earlier runs into the folder stay in `scores.csv` as long as they hold, and are not run again. All else
+//! shows what this run asked for.
 
 mod axis;
 mod bars;

@@ -27,7 +27,8 @@ pub struct Provenance {
     pub cpu: String,
     /// Logical processors that the process may use.
     pub cores: usize,
-    /// Instructions that the kernels use, AVX-512, AVX2 or portable, and what networks round their factors to.
+    /// Instructions that the kernels use, AVX-512, AVX2 or portable, and what networks round their factors
+    /// to.
     pub instructions: String,
     /// Operating system and architecture.
     pub system: String,

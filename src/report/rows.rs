@@ -90,8 +90,8 @@ pub struct Row {
     pub reference: PathBuf,
     /// Why the method failed here, so that it is tried again; empty where all is well.
     pub reason: String,
-    /// What else a reader should know: why a score is not defined, what the method said of the frame. Of the pair itself that is
-    /// in the row of `noisy`.
+    /// What else a reader should know: why a score is not defined, what the method said of the frame. Of the
+    /// pair itself that is in the row of `noisy`.
     #[serde(default)]
     pub note: String,
 }
@@ -112,7 +112,8 @@ impl Row {
         }
     }
 
-    /// The row as it was read, but a number that is none made empty and given as the reason, so that it is measured again.
+    /// The row as it was read, but a number that is none made empty and given as the reason, so that it is
+    /// measured again.
     fn checked(mut self) -> Self {
         let numbers = [
             &mut self.relmse,
@@ -284,7 +285,8 @@ impl Table {
         Ok(())
     }
 
-    /// Rewrites the table in the order of `keys`, the other rows last, and gives the rows that were asked for.
+    /// Rewrites the table in the order of `keys`, the other rows last, and gives the rows that were asked
+    /// for.
     pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
         let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();
         let text = to_csv(&COLUMNS, rows.iter().chain(&self.others).map(Row::cells));

@@ -1,7 +1,8 @@
 //! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
 //!
-//! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after one of its own that is
-//! not timed: a machine that slows down slows them all. Memory is measured apart, once for each method and size of frame.
+//! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after
+//! one of its own that is not timed: a machine that slows down slows them all. Memory is measured apart, once
+//! for each method and size of frame.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -217,8 +218,8 @@ impl Loaded {
         self.shot.as_stored().expect("a pair without Combined is not loaded")
     }
 
-    /// Reads the frames around the noisy one that lie beside it, for methods that make use of them; those that cannot be read are
-    /// left out.
+    /// Reads the frames around the noisy one that lie beside it, for methods that make use of them; those
+    /// that cannot be read are left out.
     pub fn read_neighbours(&mut self, reach: usize, view_layer: Option<&str>) {
         for (offset, path) in denoise::neighbours(&self.shot.passes.path, reach) {
             if let Ok(shot) = shot::prepare(&path, view_layer) {
@@ -228,7 +229,8 @@ impl Loaded {
     }
 }
 
-/// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the reference its namesake.
+/// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the
+/// reference its namesake.
 ///
 /// # Errors
 /// A file is unusable or lacks Combined, or they do not hold the same pixels.
@@ -356,8 +358,8 @@ fn run_pair(
     }
 }
 
-/// A run, right after one that does not count: cores that have waited for another process are slow for some 20 ms (twice as slow
-/// in a virtual machine), which must not be put down to whichever method comes next.
+/// A run, right after one that does not count: cores that have waited for another process are slow for some
+/// 20 ms (twice as slow in a virtual machine), which must not be put down to whichever method comes next.
 fn timed_run(denoiser: &dyn Denoiser, shot: &Shot) -> Result<Run> {
     if !denoiser.is_warm() {
         denoiser.denoise(shot)?;

@@ -1,7 +1,8 @@
 //! `error_over_samples`: RelMSE and SSIM over samples per pixel, a line for each method.
 //!
-//! Over the scenes that all methods scored at every sample count, so that a line falls for its samples and not for its scenes:
-//! geometric means of RelMSE, means of SSIM. A method that rises above the line of the input makes frames worse.
+//! Over the scenes that all methods scored at every sample count, so that a line falls for its samples and
+//! not for its scenes: geometric means of RelMSE, means of SSIM. A method that rises above the line of the
+//! input makes frames worse.
 
 use std::collections::{BTreeMap, BTreeSet};
 

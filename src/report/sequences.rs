@@ -1,7 +1,8 @@
 //! Sequences of a test set: every frame as each method shows it, to step through, and slices through time.
 //!
-//! A slice is one row of all frames, one below the other: what moves makes slanted lines, what is still upright ones, and what
-//! flickers breaks them up. In: what sheets show. Out: `frames/<pair>/<method>.png`, and `slices/<scene>_<spp>spp.png`.
+//! A slice is one row of all frames, one below the other: what moves makes slanted lines, what is still
+//! upright ones, and what flickers breaks them up. In: what sheets show. Out: `frames/<pair>/<method>.png`,
+//! and `slices/<scene>_<spp>spp.png`.
 
 use std::path::{Path, PathBuf};
 

@@ -59,8 +59,9 @@ impl Settings {
         write_file(path, (text + "\n").as_bytes())
     }
 
-    /// Whether `row`, made with the settings `self`, would come out the same with `now`. What the stamp of a method that `now`
-    /// does not have would be is not known, unless it came with the program, as `noisy` does.
+    /// Whether `row`, made with the settings `self`, would come out the same with `now`. What the stamp of a
+    /// method that `now` does not have would be is not known, unless it came with the program, as `noisy`
+    /// does.
     pub fn still_holds(&self, row: &Row, now: &Self) -> bool {
         let pair = self.pairs.get(&name(&row.noisy, &row.reference));
         let (before, after) = (&self.provenance, &now.provenance);

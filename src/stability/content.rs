@@ -1,10 +1,10 @@
-//! How methods do on each scene of a test set as it was rendered: a row for each scene, sample count and method, with the spread over
-//! noise seeds, and whether it is within the bounds.
+//! How methods do on each scene of a test set as it was rendered: a row for each scene, sample count and
+//! method, with the spread over noise seeds, and whether it is within the bounds.
 //!
-//! In: the rows of [`super::run`]. Renders of one scene and sample count are its seeds. Bounds: the result has at most the input's
-//! RelMSE, since a denoiser that makes a frame worse had better be off; and all light in it is within 2% of the reference's, about
-//! the least difference in brightness that an eye sees (Weber's fraction), and as much more as the input itself is off, which has
-//! fireflies or lacks what few paths find.
+//! In: the rows of [`super::run`]. Renders of one scene and sample count are its seeds. Bounds: the result
+//! has at most the input's RelMSE, since a denoiser that makes a frame worse had better be off; and all light
+//! in it is within 2% of the reference's, about the least difference in brightness that an eye sees (Weber's
+//! fraction), and as much more as the input itself is off, which has fireflies or lacks what few paths find.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,11 +1,12 @@
-//! How much a method's result changes when its input is not what it should be, and on which scenes it fails as they are.
+//! How much a method's result changes when its input is not what it should be, and on which scenes it fails
+//! as they are.
 //!
-//! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene the result is
-//! scored against what the reference then is, and beside the result for the frame as it was rendered: `ratio` is its
-//! RelMSE over that one's, `deviation` the RelMSE between the two. A method that is indifferent to the change has a
-//! ratio of 1 and a deviation of 0. Methods see what is in the frame alone: half buffers that lie beside it, which do not have the
-//! change, are not used, not for the frame as it was rendered either. What comes of frames as they were rendered is judged
-//! in [`content`].
+//! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene
+//! the result is scored against what the reference then is, and beside the result for the frame as it was
+//! rendered: `ratio` is its RelMSE over that one's, `deviation` the RelMSE between the two. A method that is
+//! indifferent to the change has a ratio of 1 and a deviation of 0. Methods see what is in the frame alone:
+//! half buffers that lie beside it, which do not have the change, are not used, not for the frame as it was
+//! rendered either. What comes of frames as they were rendered is judged in [`content`].
 
 pub mod content;
 mod page;
@@ -116,9 +117,9 @@ pub struct StabilityOptions {
     pub threads: usize,
 }
 
-/// Runs every trial of every method on every pair. Each row is appended to `stability.csv`, then told; at the end
-/// `stability_summary.csv` (trials), `stability_scenes.csv` (scenes as rendered), their maps and `stability.html` are written. A pair
-/// or method that fails has rows that say why.
+/// Runs every trial of every method on every pair. Each row is appended to `stability.csv`, then told; at the
+/// end `stability_summary.csv` (trials), `stability_scenes.csv` (scenes as rendered), their maps and
+/// `stability.html` are written. A pair or method that fails has rows that say why.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -254,7 +255,8 @@ fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair
     chosen
 }
 
-/// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial leaves there.
+/// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial
+/// leaves there.
 fn measure(
     trial: Trial,
     method: &Contender,

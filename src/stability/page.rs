@@ -1,4 +1,5 @@
-//! `stability.html`: the maps, what is out of bounds, and the worst scenes with pictures, on one page that needs nothing but itself.
+//! `stability.html`: the maps, what is out of bounds, and the worst scenes with pictures, on one page that
+//! needs nothing but itself.
 
 use std::path::Path;
 

@@ -59,8 +59,8 @@ const DARK: f32 = 1.0 / 256.0;
 /// Factor of [`Trial::MuchDarker`] and its inverse's of [`Trial::MuchBrighter`].
 const VERY_DARK: f32 = 1.0 / 4096.0;
 
-/// World axes in camera space of [`Trial::WorldNormals`]: a camera that looks 30 degrees to the side and 25 down on a world
-/// whose z points up.
+/// World axes in camera space of [`Trial::WorldNormals`]: a camera that looks 30 degrees to the side and 25
+/// down on a world whose z points up.
 const WORLD_AXES: [[f32; 3]; 3] =
     [[0.866_025, -0.211_309, 0.453_154], [0.5, 0.365_998, -0.784_886], [0.0, 0.906_308, 0.422_618]];
 
@@ -375,7 +375,8 @@ mod tests {
         }
     }
 
-    /// Normals as others store them are put right where the values tell how: nearly so where a camera has to be guessed.
+    /// Normals as others store them are put right where the values tell how: nearly so where a camera has to
+    /// be guessed.
     #[test]
     fn normals_of_other_renderers_are_put_right() {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/s0000_room_0004spp.exr");

@@ -62,8 +62,8 @@ enum Values {
 }
 
 impl Values {
-    /// Halves, but for places and distances: far from the origin, what a half cannot tell apart is larger than what is
-    /// looked at, and no half holds the 1e10 of a ray that hits nothing.
+    /// Halves, but for places and distances: far from the origin, what a half cannot tell apart is larger
+    /// than what is looked at, and no half holds the 1e10 of a ray that hits nothing.
     fn of(pass: Pass, values: &[f32]) -> Self {
         match pass {
             Pass::Position | Pass::Depth | Pass::DenoisingDepth => Self::Full(values.to_vec()),
@@ -84,9 +84,9 @@ impl Values {
 }
 
 impl Dataset {
-    /// Decodes of every pair the passes that must be there and those that may, the `targets` of its reference, and, if
-    /// `raw_references`, what the references were before they were denoised. Frames smaller than `least` in either direction are an
-    /// error, since no crop fits them.
+    /// Decodes of every pair the passes that must be there and those that may, the `targets` of its
+    /// reference, and, if `raw_references`, what the references were before they were denoised. Frames
+    /// smaller than `least` in either direction are an error, since no crop fits them.
     ///
     /// # Errors
     /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
@@ -134,19 +134,19 @@ impl Dataset {
         (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
-    /// The side of a step's crops: `most` pixels, or as many as a frame drawn by `rng` holds, down to a multiple of
-    /// `multiple`.
+    /// The side of a step's crops: `most` pixels, or as many as a frame drawn by `rng` holds, down to a
+    /// multiple of `multiple`.
     pub fn draw_side(&self, most: usize, multiple: usize, rng: &mut Rng) -> usize {
         let side = self.draw_frame(rng).1.side();
         most.min(side / multiple * multiple)
     }
 
     /// A random square crop of `side` pixels, augmented; all of it decided by `rng`. A frame is drawn as
-    /// often as it is large, one that is too small never. Where there are more renders of it with as many samples, each pixel
-    /// comes from one of two: Cycles draws the samples of each pixel apart, so that is a render with a seed of its own,
-    /// and no network gets to learn the noise of those that there are by heart.
-    /// `guide_dropout` is the share of crops that lack guides.
-    /// A frame of `side` pixels must be there, as it is for a side from [`Self::draw_side`].
+    /// often as it is large, one that is too small never. Where there are more renders of it with as many
+    /// samples, each pixel comes from one of two: Cycles draws the samples of each pixel apart, so that is a
+    /// render with a seed of its own, and no network gets to learn the noise of those that there are by
+    /// heart. `guide_dropout` is the share of crops that lack guides. A frame of `side` pixels must be there,
+    /// as it is for a side from [`Self::draw_side`].
     pub fn draw(&self, side: usize, guide_dropout: f64, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
@@ -194,7 +194,8 @@ fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     frames.iter().enumerate().map(others).collect()
 }
 
-/// Puts what [stands in](stand_in) for them in the place of the albedo, the normal, or both, of a share of crops.
+/// Puts what [stands in](stand_in) for them in the place of the albedo, the normal, or both, of a share of
+/// crops.
 fn drop_guides(passes: &mut PassSet, share: f64, rng: &mut Rng) {
     if share == 0.0 || f64::from(rng.uniform()) >= share {
         return;

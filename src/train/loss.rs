@@ -34,11 +34,12 @@ pub enum Loss {
     /// brightness: steps in a smooth gradient and soft edges weigh little as errors of pixels, but are what
     /// people see first (and what SSIM measures).
     Edges,
-    /// Mean over images of `ln(1 + RelMSE / 0.0002)`, for the geometric mean over scenes by which methods are compared. A
-    /// plain mean is all but made of the noisiest images; what is left to gain on even walls counts for nothing in it.
+    /// Mean over images of `ln(1 + RelMSE / 0.0002)`, for the geometric mean over scenes by which methods are
+    /// compared. A plain mean is all but made of the noisiest images; what is left to gain on even walls
+    /// counts for nothing in it.
     Geomean,
-    /// [`Loss::Geomean`] and ten times `1 - SSIM` of what a display would show, at each image's exposure, against the
-    /// clean reference: 1% of RelMSE for 0.001 of SSIM.
+    /// [`Loss::Geomean`] and ten times `1 - SSIM` of what a display would show, at each image's exposure,
+    /// against the clean reference: 1% of RelMSE for 0.001 of SSIM.
     Ssim,
 }
 
@@ -121,11 +122,11 @@ fn relmse(
     scale: &[f32],
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
     let weight = weights(reference, scale);
-    squares(image, reference, raw, weight)
+    weighted_error(image, reference, raw, weight)
 }
 
-/// The logarithm's gradient by way of weights: those of each image divided by its error. That is against the clean
-/// reference: the noise of a raw one would make every image look as bad.
+/// The logarithm's gradient by way of weights: those of each image divided by its error. That is against the
+/// clean reference: the noise of a raw one would make every image look as bad.
 fn geomean(
     image: Images<Taped>,
     reference: &[f32],
@@ -144,7 +145,7 @@ fn geomean(
         (error / SMALL_ERROR).ln_1p()
     });
     let logarithms: Vec<f32> = logarithms.collect(); // in the order of images, whatever the threads do
-    let loss = squares(image, reference, raw, weight);
+    let loss = weighted_error(image, reference, raw, weight);
     // Same gradient, but the value of the logarithm.
     let value = logarithms.iter().sum::<f32>() / images as f32;
     let shift = value - loss.as_vec()[0];
@@ -163,7 +164,7 @@ fn weights(reference: &[f32], scale: &[f32]) -> Vec<f32> {
 }
 
 /// The mean of weighted squared errors against the raw reference, if there is one.
-fn squares(
+fn weighted_error(
     image: Images<Taped>,
     reference: &[f32],
     raw: Option<Vec<f32>>,
@@ -216,7 +217,8 @@ fn edges(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, Cpu, Tap
     })
 }
 
-/// Mean of `1 - SSIM` of the images as a display would show them, exposed by their references; of a black reference, 0.
+/// Mean of `1 - SSIM` of the images as a display would show them, exposed by their references; of a black
+/// reference, 0.
 fn dissimilarity(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, Cpu, Taped> {
     let &(n, c, h, w) = image.shape();
     let exposures: Vec<Option<f64>> = reference
@@ -236,8 +238,8 @@ fn dissimilarity(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, 
     })
 }
 
-/// The sum over planes of what `of` makes of the number, the image and the reference of one, a sum and its gradient by the
-/// image's pixels, divided by `count`: one operation on the tape.
+/// The sum over planes of what `of` makes of the number, the image and the reference of one, a sum and its
+/// gradient by the image's pixels, divided by `count`: one operation on the tape.
 fn mean_of_planes(
     image: Images<Taped>,
     reference: &[f32],
@@ -272,8 +274,8 @@ mod tests {
     use super::*;
     use crate::rng::Rng;
 
-    /// The loss of a flat image of `value` and its mean gradient by a pixel, against a flat clean reference of
-    /// 0.5 and, if there is one, a raw one.
+    /// The loss of a flat image of `value` and its mean gradient by a pixel, against a flat clean reference
+    /// of 0.5 and, if there is one, a raw one.
     fn relmse_at(value: f32, raw: Option<Vec<f32>>) -> (f32, f32) {
         const SHAPE: (usize, usize, usize, usize) = (1, 3, 16, 16);
         let count = 3 * 16 * 16;

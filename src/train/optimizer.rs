@@ -18,9 +18,9 @@ pub enum Rule {
     #[default]
     Adam,
     /// Muon (Jordan et al. 2024) for the weights of convolutions, seen as matrices of outputs by inputs and
-    /// taps: momentum, made orthogonal, so that no few directions take all of a step. Updates have the size of
-    /// Adam's (Liu et al. 2025), so the same learning rates serve. Adam for biases and for the heads, whose
-    /// outputs are no features.
+    /// taps: momentum, made orthogonal, so that no few directions take all of a step. Updates have the size
+    /// of Adam's (Liu et al. 2025), so the same learning rates serve. Adam for biases and for the heads,
+    /// whose outputs are no features.
     Muon,
 }
 
@@ -61,8 +61,8 @@ const CPU: &str = "the CPU allocates or aborts";
 
 impl Optimizer {
     /// One that has seen nothing. Each step takes `weight_decay` times the learning rate of the hidden
-    /// convolutions' weights away (Loshchilov and Hutter 2019): Muon's updates are as long where a gradient is
-    /// all noise, and what they add up to there would never go.
+    /// convolutions' weights away (Loshchilov and Hutter 2019): Muon's updates are as long where a gradient
+    /// is all noise, and what they add up to there would never go.
     pub fn new(rule: Rule, weight_decay: f64) -> Self {
         Self { rule, weight_decay, first: Gradients::leaky(), second: Gradients::leaky() }
     }
@@ -100,8 +100,8 @@ impl Optimizer {
                     MOMENTUM * *m + g
                 });
                 let direction = nesterov.collect();
-                // Where nothing is learned, as when all that a layer feeds is cut off by ReLUs, momentum fades but
-                // keeps its direction, in which steps of full length would lead ever on.
+                // Where nothing is learned, as when all that a layer feeds is cut off by ReLUs, momentum
+                // fades but keeps its direction, in which steps of full length would lead ever on.
                 if gradient.iter().any(|g| *g != 0.0) {
                     matrices.push((param, direction));
                 }

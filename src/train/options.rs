@@ -38,7 +38,8 @@ pub struct TrainOptions {
     /// Whether squared errors are against references as they were before they were denoised.
     #[serde(default)]
     pub raw_references: bool,
-    /// Share of the crops that lack albedo, normal, or both, see [`Denoiser::dispensable`](crate::models::Denoiser::dispensable).
+    /// Share of the crops that lack albedo, normal, or both, see
+    /// [`Denoiser::dispensable`](crate::models::Denoiser::dispensable).
     #[serde(default)]
     pub guide_dropout: f64,
     /// How gradients become updates.

@@ -55,8 +55,8 @@ const MOST_SKIPPED: usize = 10;
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
 /// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
-/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint follows a step
-/// that was skipped: where all are, the weights of the one before are good.
+/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint follows a
+/// step that was skipped: where all are, the weights of the one before are good.
 ///
 /// # Errors
 /// A pair is unusable, the run folder cannot be read or written, or step after step had no finite gradient.
@@ -165,7 +165,8 @@ pub fn run(
     Ok(())
 }
 
-/// Warns of steps that were skipped beside the `taken` ones since the last row of the log before which some were.
+/// Warns of steps that were skipped beside the `taken` ones since the last row of the log before which some
+/// were.
 ///
 /// # Errors
 /// None was taken, in [`MOST_SKIPPED`] steps or more.
@@ -188,7 +189,8 @@ fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(T
     Ok(())
 }
 
-/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one of those widths.
+/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one of those
+/// widths.
 fn set_prefilter(network: &mut dyn Network, options: &TrainOptions) -> Result<()> {
     let wanted = &options.network.prefilter;
     if wanted.is_empty() {
@@ -282,8 +284,8 @@ fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step
     }
 }
 
-/// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames. The layers of `trained` learn
-/// what range their outputs have there.
+/// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames. The layers of `trained`
+/// learn what range their outputs have there.
 fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
     let mut network = trained.duplicate();

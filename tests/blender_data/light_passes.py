@@ -1,6 +1,8 @@
-"""Renders a small frame with every light pass and two light groups: path, samples, and "film" for a transparent film.
+"""Renders a small frame with every light pass and two light groups: path, samples, and "film" for a
+transparent film.
 
-A textured floor, a glossy ball, a glass ball, a glowing cube and fog in the far corner, before a sky or before nothing.
+A textured floor, a glossy ball, a glass ball, a glowing cube and fog in the far corner, before a sky or
+before nothing.
 """
 
 import os

@@ -1,6 +1,7 @@
 """Writes a furniture library of Sweet Home 3D and a folder of images: make_furniture.py FOLDER.
 
-The library holds a table, drawn upside down, with a glass top, a model whose file is empty, and one of unknown depth.
+The library holds a table, drawn upside down, with a glass top, a model whose file is empty, and one of
+unknown depth.
 """
 
 import sys

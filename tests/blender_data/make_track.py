@@ -1,4 +1,5 @@
-"""Writes a game's data folder with two tracks: make_track.py DIR. One is a courtyard of two walls, the other's mesh is damaged."""
+"""Writes a game's data folder with two tracks: make_track.py DIR. One is a courtyard of two walls, the
+other's mesh is damaged."""
 
 import os
 import struct
@@ -12,7 +13,8 @@ WALLS = [((-20, 0, 20), (20, 0, 20), (20, 8, 20), (-20, 8, 20)), ((-20, 0, -20),
 
 
 def spm(textures, quads):
-    """A mesh file of quadrangles in the game's axes, Y up, one material each: normals, and colours for the first corner alone."""
+    """A mesh file of quadrangles in the game's axes, Y up, one material each: normals, and colours for the
+    first corner alone."""
     data = b"SP" + bytes([1 << 3, 0b011]) + struct.pack("<6f", *[0.0] * 6) + struct.pack("<H", len(textures))
     data += b"".join(bytes([len(name)]) + name.encode() + b"\0" for name in textures)
     data += struct.pack("<HH", 1, len(quads))

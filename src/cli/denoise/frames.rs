@@ -1,7 +1,8 @@
 //! `--frames`: which of the inputs are worked on, by the number that ends their names.
 //!
-//! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the files
-//! whose names end in one of these numbers, as Blender writes them: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`.
+//! In: `7`, `1-9`, `1-9:4` or as others write it `1-9x4` (every fourth), `-5--1`, or a list of them. Out: the
+//! files whose names end in one of these numbers, as Blender writes them: `shot_0004spp.0017.exr`,
+//! `shot0017.exr`, `shot.-0003.exr`.
 
 use std::str::FromStr;
 

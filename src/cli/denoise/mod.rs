@@ -71,8 +71,9 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 
-    /// Denoise N frames at once, each with its share of the threads: the same results, sooner where frames are small or
-    /// threads many. Each frame takes its own memory, up to three times that of a frame of its kind
+    /// Denoise N frames at once, each with its share of the threads: the same results, sooner where frames
+    /// are small or threads many. Each frame takes its own memory, up to three times that of a frame of its
+    /// kind
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     jobs: u16,
 
@@ -85,19 +86,21 @@ pub struct Args {
     #[arg(long, value_name = "A-B[:S],...", allow_hyphen_values = true)]
     frames: Option<Frames>,
 
-    /// Search directories with all that are in them; results lie below --out as their inputs do below the directory named
+    /// Search directories with all that are in them; results lie below --out as their inputs do below the
+    /// directory named
     #[arg(long)]
     recursive: bool,
 
-    /// Go on with renders that are still coming in, each when its file is whole, until Ctrl-C, or until nothing new has come
-    /// for SECONDS; with --overwrite, a frame that is rendered again is denoised again
+    /// Go on with renders that are still coming in, each when its file is whole, until Ctrl-C, or until
+    /// nothing new has come for SECONDS; with --overwrite, a frame that is rendered again is denoised again
     #[arg(long, value_name = "SECONDS", num_args = 0..=1, conflicts_with = "temporal",
           value_parser = clap::value_parser!(u32).range(1..))]
     #[allow(clippy::option_option, reason = "not at all, for ever, for some time")]
     watch: Option<Option<u32>>,
 
-    /// Take frames of a sequence (names that end in a number) together with N before and N after each, found beside them
-    /// and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without a number]
+    /// Take frames of a sequence (names that end in a number) together with N before and N after each, found
+    /// beside them and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without
+    /// a number]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
           value_parser = clap::value_parser!(u8).range(1..=8))]
     temporal: Option<u8>,
@@ -110,7 +113,8 @@ pub struct Args {
     #[arg(long, value_enum, value_name = "HOW", default_value_t = AlphaChoice::Auto)]
     alpha: AlphaChoice,
 
-    /// Whether the left and the right edge meet, as those of an all-round panorama: auto believes the file's attribute envmap
+    /// Whether the left and the right edge meet, as those of an all-round panorama: auto believes the file's
+    /// attribute envmap
     #[arg(long, value_enum, value_name = "HOW", default_value_t = WrapChoice::Auto)]
     wrap: WrapChoice,
 
@@ -118,13 +122,13 @@ pub struct Args {
     #[arg(long)]
     passes: bool,
 
-    /// Add a layer that tells how far off each pixel is expected to be: `<layer> Error`, the squared error relative to the
-    /// squared light, which RelMSE is the mean of
+    /// Add a layer that tells how far off each pixel is expected to be: `<layer> Error`, the squared error
+    /// relative to the squared light, which RelMSE is the mean of
     #[arg(long)]
     confidence: bool,
 
-    /// List the frames by their expected RelMSE at the end, the worst first; with a number, also how many samples those above
-    /// it want
+    /// List the frames by their expected RelMSE at the end, the worst first; with a number, also how many
+    /// samples those above it want
     #[arg(long, value_name = "RELMSE", num_args = 0..=1, value_parser = parse_wish, conflicts_with_all = ["json", "temporal"])]
     #[allow(clippy::option_option, reason = "not at all, the list, what is wanted besides")]
     report: Option<Option<f64>>,
@@ -300,8 +304,8 @@ impl Work {
 
 /// A watch over the inputs, for files that are there and others that come.
 ///
-/// # Errors
-/// Of what is there already, two results would have one path, or one that of its input; or a glob is malformed.
+/// # Errors Of what is there already, two results would have one path, or one that of its input; or a glob is
+/// malformed.
 fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
     let (inputs, frames, out) = (args.inputs.clone(), args.frames.clone(), args.out.clone());
     let is_wanted = move |input: &denoise::Input| frames.as_ref().is_none_or(|frames| frames.has(input));

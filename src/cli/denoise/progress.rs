@@ -129,8 +129,8 @@ impl Progress {
         }
     }
 
-    /// How fast frames are denoised and when the last will be, as the end of a sentence; empty before there is a pace, and
-    /// after the last.
+    /// How fast frames are denoised and when the last will be, as the end of a sentence; empty before there
+    /// is a pace, and after the last.
     fn pace(&self, count: usize) -> String {
         let left = self.total.map_or(0, |total| total - count);
         match self.speed() {

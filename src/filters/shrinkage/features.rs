@@ -1,5 +1,5 @@
-//! What is read of the sums over squares of pixels, for the [perceptrons](super::perceptron) that judge by it: logarithms of mean
-//! squares and correlations, over three neighbourhoods of the square.
+//! What is read of the sums over squares of pixels, for the [perceptrons](super::perceptron) that judge by
+//! it: logarithms of mean squares and correlations, over three neighbourhoods of the square.
 
 use rayon::prelude::*;
 
@@ -19,8 +19,8 @@ use crate::{
 pub const WINDOWS: [&[f32]; 3] =
     [&[1.0, 2.0, 1.0], &[1.0, 4.0, 6.0, 4.0, 1.0], &[1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]];
 
-/// What is read of each neighbourhood, and in all: besides these the brightness of the place, the logarithm to base 2 of
-/// the number of samples, and whether it is known.
+/// What is read of each neighbourhood, and in all: besides these the brightness of the place, the logarithm
+/// to base 2 of the number of samples, and whether it is known.
 const OF_WINDOW: usize = 11;
 pub const FEATURES: usize = WINDOWS.len() * OF_WINDOW + 3;
 
@@ -30,7 +30,8 @@ pub const TINY: f32 = 1e-8;
 /// Exposed radiance that is added before the brightness's logarithm.
 const BLACK: f32 = 0.02;
 
-/// What `make` makes of every row of squares, given its number and its features, [`FEATURES`] lines: so many lines each.
+/// What `make` makes of every row of squares, given its number and its features, [`FEATURES`] lines: so many
+/// lines each.
 pub fn each_row(
     sums: &[f32],
     squares: usize,

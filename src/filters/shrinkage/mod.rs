@@ -1,21 +1,24 @@
 //! Takes back what a denoiser changed beyond the noise.
 //!
-//! A denoiser that was trained on noisy frames blurs clean ones. How far it should be followed is an old question of
-//! statistics: an unbiased but noisy value `c` (the render) and a biased one `d` (what was denoised) are best mixed as
-//! `d + w (c - d)`, with a share `w` that grows with the bias and falls with the noise (James and Stein 1961). Neither is
-//! known of one frame alone, but what was changed tells of both:
-//! - Cycles draws every pixel by itself, so noise has no direction, while edges and texture have. Of the second
+//! A denoiser that was trained on noisy frames blurs clean ones. How far it should be followed is an old
+//! question of statistics: an unbiased but noisy value `c` (the render) and a biased one `d` (what was
+//! denoised) are best mixed as `d + w (c - d)`, with a share `w` that grows with the bias and falls with the
+//! noise (James and Stein 1961). Neither is known of one frame alone, but what was changed tells of both:
+//! - Cycles draws every pixel by itself, so noise has no direction, while edges and texture have. Of the
+//!   second
 //!   differences along four directions, the smallest holds next to nothing but noise. They are taken of the light, and
 //!   of the light over the albedo as rendered, which divides texture away.
-//! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred detail: with
+//! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred
+//!   detail: with
 //!   its neighbours, with the detail that is left, and with that of the albedo.
 //!
-//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share (`restraint`).
-//! Of a noisy frame all of `d` is taken. By the same sums another one tells how far off the result is (`expected`).
+//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share
+//! (`restraint`). Of a noisy frame all of `d` is taken. By the same sums another one tells how far off the
+//! result is (`expected`).
 //!
-//! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing, and is kept.
-//! Of few samples, though, antialiasing is noise like any other: a gap of a blind before a bright sky is a quarter of the
-//! sky, or nothing.
+//! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing,
+//! and is kept. Of few samples, though, antialiasing is noise like any other: a gap of a blind before a
+//! bright sky is a quarter of the sky, or nothing.
 
 mod expected;
 mod features;
@@ -37,36 +40,38 @@ use crate::{
     planes::Planes,
 };
 
-/// Exposed radiance that is added to what is denoised before residuals are divided by it: relative errors of what is
-/// darker count less and less.
+/// Exposed radiance that is added to what is denoised before residuals are divided by it: relative errors of
+/// what is darker count less and less.
 const FLOOR: f32 = 0.02;
 
-/// Added to a pixel's own squared residual before its logarithm is compared with that of the mean near by, of which it may be
-/// so many times as large or as small: `e` to this power.
+/// Added to a pixel's own squared residual before its logarithm is compared with that of the mean near by, of
+/// which it may be so many times as large or as small: `e` to this power.
 const OWN_FLOOR: f32 = 1e-6;
 const OWN_RANGE: f32 = 3.0;
 
 /// Shares nearer than this to none or to all of the render are none or all.
 const SNAP: f32 = 1.0 / 64.0;
 
-/// Of one sample, as far as files tell, no share below the first counts; of `n` samples, none below the second over `n`. What
-/// looks like a picture in a frame of few samples is noise more often than not.
+/// Of one sample, as far as files tell, no share below the first counts; of `n` samples, none below the
+/// second over `n`. What looks like a picture in a frame of few samples is noise more often than not.
 const DOUBT: (f32, f32) = (0.5, 2.0);
 
-/// From this many samples on, the more of the render is kept the more samples there are, by this power of their number: few
-/// frames that were learned from had more.
+/// From this many samples on, the more of the render is kept the more samples there are, by this power of
+/// their number: few frames that were learned from had more.
 const FINAL_SAMPLES: f32 = 192.0;
 const FINAL_POWER: f32 = 0.75;
 
-/// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing; the larger the
-/// share, the more. What is rendered brighter than that by far is noise as long as most around it is.
+/// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing;
+/// the larger the share, the more. What is rendered brighter than that by far is noise as long as most around
+/// it is.
 const LARGEST_CHANGE: f32 = 1.5;
 
-/// What a frame is taken for that does not tell its number of samples, where it comes to light that is seen directly.
+/// What a frame is taken for that does not tell its number of samples, where it comes to light that is seen
+/// directly.
 const UNKNOWN_SAMPLES: u32 = 16;
 
-/// Of no more than the first number of samples, no light is kept because the albedo shows it: its antialiasing is noise,
-/// as all of it is through glass. From the second on, all is.
+/// Of no more than the first number of samples, no light is kept because the albedo shows it: its
+/// antialiasing is noise, as all of it is through glass. From the second on, all is.
 const KEPT_SAMPLES: (f32, f32) = (16.0, 64.0);
 
 /// What is known of a frame besides what was denoised.
@@ -79,12 +84,13 @@ pub struct Render<'a> {
     pub exposure: f32,
     /// Samples of a pixel, where the file tells.
     pub samples: Option<u32>,
-    /// How many times brighter than all others of the 5x5 around it a pixel is a firefly, which is not taken back.
+    /// How many times brighter than all others of the 5x5 around it a pixel is a firefly, which is not taken
+    /// back.
     pub firefly: f32,
 }
 
-/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more than noise. The share
-/// of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
+/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more
+/// than noise. The share of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
 ///
 /// # Panics
 /// If sizes differ.
@@ -92,14 +98,14 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
     drop(shrink_by_sums(image, render, shares));
 }
 
-/// Whether a frame is nothing but light that the camera sees directly, or black: [`shrink`] keeps all of it, whatever was
-/// denoised.
+/// Whether a frame is nothing but light that the camera sees directly, or black: [`shrink`] keeps all of it,
+/// whatever was denoised.
 pub fn is_kept_whole(render: &Render) -> bool {
     render.radiance.data.iter().all(|v| *v <= 0.0) || Seen::of(render).is_all()
 }
 
-/// As [`shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the result, relative to the
-/// squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
+/// As [`shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the result,
+/// relative to the squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
 ///
 /// # Panics
 /// If sizes differ.
@@ -121,8 +127,8 @@ fn shrink_by_sums(image: &mut Planes, render: &Render, shares: Option<&mut Plane
     sums
 }
 
-/// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of pixels,
-/// (36, H / 4, W / 4) rounded up. For training.
+/// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of
+/// pixels, (36, H / 4, W / 4) rounded up. For training.
 ///
 /// # Panics
 /// If sizes differ.
@@ -326,7 +332,8 @@ mod tests {
 
     #[test]
     fn light_seen_directly_is_kept_and_chance_is_not() {
-        // A screen of 20x10 whose light is in the albedo, a pixel that has its albedo's brightness, and a star.
+        // A screen of 20x10 whose light is in the albedo, a pixel that has its albedo's brightness, and a
+        // star.
         let is_screen = |x: usize, y: usize| (30..50).contains(&x) && (20..30).contains(&y);
         let light = |c: usize, x: usize, y: usize| match (x, y) {
             _ if is_screen(x, y) => 3.0 + ((x * 7 + y * 5 + c) % 11) as f32,
@@ -352,7 +359,8 @@ mod tests {
 
     #[test]
     fn the_exposure_of_the_film_hides_no_light_that_is_seen() {
-        // A screen over a third of the frame; the rest is a noisy wall. The film's exposure multiplies light alone.
+        // A screen over a third of the frame; the rest is a noisy wall. The film's exposure multiplies light
+        // alone.
         let albedo = planes(|c, x, y| if x < 30 { 0.2 + ((x * 7 + y * 5 + c) % 11) as f32 } else { 0.5 });
         let wall = noisy(0.3);
         let radiance = planes(|c, x, y| (if x < 30 { &albedo } else { &wall }).channel(c)[y * SIZE.0 + x]);
@@ -401,7 +409,8 @@ mod tests {
         };
         let image = shrunk(&truth, &sky, &albedo, Some(4));
         assert!(off(&image) < 0.05 * off(&sky), "{} of {}", off(&image), off(&sky));
-        // So is what a sky of fine clouds looks like: its noise is in the albedo as well, which it is divided by.
+        // So is what a sky of fine clouds looks like: its noise is in the albedo as well, which it is divided
+        // by.
         let clouds = planes(|_, x, y| if is_wall(x) { 0.25 } else { 0.8 + 0.2 * seen[y * w + x] });
         let albedo = planes(|c, x, y| if is_wall(x) { 0.5 } else { clouds.channel(c)[y * w + x] });
         let truth = planes(|_, x, _| if is_wall(x) { 0.25 } else { 1.0 });

@@ -1,8 +1,8 @@
 //! How much of the render a place should keep, learned from renders and their references.
 //!
-//! In: the sums over squares of pixels. Out: for each square numbers from which every pixel's share follows. The perceptron was
-//! trained by `eval/training/restraint.py` to make the squared error of the mixture least, on frames of 1 to 256 samples;
-//! references need not be clean for that, only unbiased.
+//! In: the sums over squares of pixels. Out: for each square numbers from which every pixel's share follows.
+//! The perceptron was trained by `eval/training/restraint.py` to make the squared error of the mixture least,
+//! on frames of 1 to 256 samples; references need not be clean for that, only unbiased.
 
 use std::sync::LazyLock;
 
@@ -12,8 +12,8 @@ use super::{
     perceptron::Perceptron,
 };
 
-/// What comes out of a square: the share's logit, its slope over the logarithm of a pixel's own squared residual, and the
-/// logarithm of the mean squared residual near by, which that is compared with.
+/// What comes out of a square: the share's logit, its slope over the logarithm of a pixel's own squared
+/// residual, and the logarithm of the mean squared residual near by, which that is compared with.
 pub const OUTPUTS: usize = 3;
 
 static PERCEPTRON: LazyLock<Perceptron> =

@@ -1,39 +1,44 @@
 //! Tells light that comes straight to the camera, and fireflies.
 //!
-//! Cycles writes light that is seen directly (sky, screens, lamps) into the albedo as well as into the beauty. The film's
-//! exposure, which multiplies light alone, is found first, from the quotient that most such pixels agree on.
+//! Cycles writes light that is seen directly (sky, screens, lamps) into the albedo as well as into the
+//! beauty. The film's exposure, which multiplies light alone, is found first, from the quotient that most
+//! such pixels agree on.
 
 use super::Render;
 use crate::{kernels::logarithm::ln, planes::Planes};
 
-/// A frame whose pixels are all their albedo but for this share is no picture of light on surfaces: all of it is kept.
+/// A frame whose pixels are all their albedo but for this share is no picture of light on surfaces: all of it
+/// is kept.
 const UNLIKE: f64 = 1e-3;
 
-/// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter counts less.
+/// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter
+/// counts less.
 const ALONE: f32 = 4.0;
 
-/// By how much radiance may differ from the albedo and still be light that is seen directly: a few steps of a half
-/// float, and next to nothing besides.
+/// By how much radiance may differ from the albedo and still be light that is seen directly: a few steps of a
+/// half float, and next to nothing besides.
 pub const SAME: (f32, f32) = (0.004, 1e-6);
 
-/// Light that is seen directly is its albedo times the film's exposure, which Cycles applies to light alone. It is told
-/// from the quotients of light and albedo, counted by these steps of an octave over so many octaves up and down.
+/// Light that is seen directly is its albedo times the film's exposure, which Cycles applies to light alone.
+/// It is told from the quotients of light and albedo, counted by these steps of an octave over so many
+/// octaves up and down.
 const STEPS: usize = 128;
 const OCTAVES: usize = 20;
 
-/// An exposure needs at least this many pixels, and this many times more of them than its second and third neighbours
-/// have on the average: quotients of what is only lit are spread by noise and by shape.
+/// An exposure needs at least this many pixels, and this many times more of them than its second and third
+/// neighbours have on the average: quotients of what is only lit are spread by noise and by shape.
 const LEAST_EXPOSED: u32 = 16;
 const PEAK: f32 = 8.0;
 
 /// About as many pixels as are counted.
 const COUNTED: usize = 1 << 17;
 
-/// Pixels of the 3x3 around one, itself included, that must be seen directly for it to be: any pixel may be as bright as
-/// its albedo by chance.
+/// Pixels of the 3x3 around one, itself included, that must be seen directly for it to be: any pixel may be
+/// as bright as its albedo by chance.
 const SEEN_TOGETHER: usize = 6;
 
-/// What light that is seen directly was multiplied by, as most such light of the frame has it; 1 if there is any such.
+/// What light that is seen directly was multiplied by, as most such light of the frame has it; 1 if there is
+/// any such.
 pub fn film_exposure(render: &Render) -> f32 {
     let Render { radiance, albedo, .. } = render;
     let pixels = radiance.pixels();
@@ -73,7 +78,8 @@ fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
     (0..3).all(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute))
 }
 
-/// Pixels (x, y) of the square of `2 reach + 1` rows and columns around one that lie in the frame, itself included.
+/// Pixels (x, y) of the square of `2 reach + 1` rows and columns around one that lie in the frame, itself
+/// included.
 fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item = (usize, usize)> {
     let around = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
     let columns = around(x, planes.width);
@@ -123,8 +129,8 @@ impl Seen<'_> {
         }
     }
 
-    /// The share of a pixel's light that is such, or comes by way of mirrors, as far as the albedo shows it beyond
-    /// white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
+    /// The share of a pixel's light that is such, or comes by way of mirrors, as far as the albedo shows it
+    /// beyond white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
     pub fn beyond_white(&self, x: usize, y: usize) -> f32 {
         let Self { radiance, albedo, film } = self;
         let beyond = |x: usize, y: usize| {

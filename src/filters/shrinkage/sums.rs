@@ -1,4 +1,5 @@
-//! What is summed up over squares of pixels: the noise, what the denoiser changed, and how alike that is to detail.
+//! What is summed up over squares of pixels: the noise, what the denoiser changed, and how alike that is to
+//! detail.
 
 use rayon::prelude::*;
 
@@ -24,7 +25,8 @@ pub const NOISE: [usize; 2] = [2, 3];
 pub const CUT: usize = 4;
 /// The products of residuals with those to the right and below: noise has none.
 pub const NEXT: [usize; 2] = [5, 6];
-/// The squares of the detail of what is denoised and of the albedo, each the difference to the four pixels around.
+/// The squares of the detail of what is denoised and of the albedo, each the difference to the four pixels
+/// around.
 pub const DETAIL: [usize; 2] = [7, 8];
 /// The products of the residual with the detail of what is denoised, of the albedo, and of the render.
 pub const BY_DETAIL: [usize; 3] = [9, 10, 11];
@@ -34,8 +36,8 @@ pub const LIGHT: usize = 12;
 /// Added to the albedo before light is divided by it.
 const ALBEDO_FLOOR: f32 = 0.02;
 
-/// Relative residuals are cut at this: a firefly would decide on all around it. The square of what is cut off is at most
-/// the last.
+/// Relative residuals are cut at this: a firefly would decide on all around it. The square of what is cut off
+/// is at most the last.
 pub const LARGEST_RESIDUAL: f32 = 1.0;
 const LARGEST_CUT: f32 = 100.0;
 
@@ -43,8 +45,9 @@ const LARGEST_CUT: f32 = 100.0;
 const LARGEST_DIFFERENCE: f32 = 6.0;
 const LARGEST_DETAIL: f32 = 1.0;
 
-/// The variance of noise over the mean of the smallest squared second difference of four directions: a sixth for one
-/// direction, the rest for taking the smallest (of independent normal values, by drawing 360,000 of them).
+/// The variance of noise over the mean of the smallest squared second difference of four directions: a sixth
+/// for one direction, the rest for taking the smallest (of independent normal values, by drawing 360,000 of
+/// them).
 const VARIANCE_OF_SMALLEST: f32 = 3.5706 / 6.0;
 
 /// Rows of squares that a thread gathers at once: the rows of pixels just above and below are computed twice.
@@ -78,7 +81,8 @@ pub fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
     sums
 }
 
-/// What is read of a row of pixels. Each line has one value more on either side, where the row's mirror image lies.
+/// What is read of a row of pixels. Each line has one value more on either side, where the row's mirror image
+/// lies.
 struct PixelRow {
     /// The mean of the colours of the render.
     light: Vec<f32>,
@@ -134,8 +138,8 @@ impl Vectorised for Read<'_> {
         let [light, ratio, denoised, white, of_light, of_ratio, residual, cut] =
             [light, ratio, denoised, white, of_light, of_ratio, residual, cut]
                 .map(|line| &mut line[1..][..width]);
-        // Until it is needed, `cut` holds by how much more than a rounding error the light differs from the albedo: 0
-        // where it is seen directly.
+        // Until it is needed, `cut` holds by how much more than a rounding error the light differs from the
+        // albedo: 0 where it is seen directly.
         for c in 0..3 {
             for x in 0..width {
                 // No surface reflects more light than it gets: what is beyond white is light that is seen.
@@ -152,7 +156,8 @@ impl Vectorised for Read<'_> {
             }
         }
         for x in 0..width {
-            // The noise of light that is seen directly is in the albedo as well, and their quotient tells nothing of it.
+            // The noise of light that is seen directly is in the albedo as well, and their quotient tells
+            // nothing of it.
             let is_seen = cut[x] <= 0.0;
             ratio[x] = if is_seen { light[x] } else { ratio[x] };
             of_ratio[x] = if is_seen { denoised[x] } else { of_ratio[x] };

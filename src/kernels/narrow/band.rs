@@ -29,7 +29,7 @@ pub enum Target {
 pub struct Band<'a> {
     pub engine: Engine,
     pub grid: Grid,
-    /// Packed, `[output plane][phase][term][16 rows]`, or as squares want them.
+    /// Packed, `[output plane][phase][term][16 rows]`, or as cells want them.
     pub weights: &'a [Wide],
     /// How many groups of rows of its weights each term needs.
     pub groups: &'a [u8],
@@ -41,7 +41,7 @@ pub struct Band<'a> {
     pub scale: &'a [Block],
     pub bias: &'a [Block],
     pub epilogue: Epilogue,
-    /// The terms of each phase; those of the planes as they are where squares are computed.
+    /// The terms of each phase; those of the planes as they are where cells are computed.
     pub phases: &'a [Vec<Term>],
     pub out: Shape,
     pub target: Target,
@@ -106,7 +106,8 @@ impl Band<'_> {
         let accumulate = self.epilogue.accumulate;
         let mut position = from;
         while position < end {
-            // Positions run from the left border, over the pixels, to the right border, and may begin or end in either.
+            // Positions run from the left border, over the pixels, to the right border, and may begin or end
+            // in either.
             let line = position / grid.stride();
             let left = line * grid.stride() + grid.pad;
             let pixels = position.max(left)..end.min(left + grid.w);

@@ -1,8 +1,8 @@
 //! Convolutions and input gradients of narrow factors, the geometries of [`crate::kernels::conv`].
 //!
-//! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for a
-//! pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the operands,
-//! then taps. Where squares of outputs are computed together, they are as `winograd::pack` says.
+//! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for
+//! a pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the
+//! operands, then taps. Where cells of outputs are computed together, they are as `winograd::pack` says.
 
 use std::ops::Range;
 
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::{
     Engine, FITTING_STEPS, Format, GROUP, LANES, Operand, Steps, Term, WEIGHT_STEPS, WORD, Wide,
     band::{Band, SharedWide, Target},
-    winograd::{self, FITTING_SUM, Part, Squares},
+    winograd::{self, Cells, FITTING_SUM, Part},
 };
 use crate::kernels::{
     Block, Shape, Shared, ViewMut,
@@ -34,7 +34,7 @@ struct Tap {
 
 /// The taps of an output phase, those of the first input phase first.
 fn taps_of(geometry: Geometry, phase: usize) -> Vec<Tap> {
-    // Of steps of two, the input at 2m + d is pixel d mod 2 of the square at m + d div 2.
+    // Of steps of two, the input at 2m + d is pixel d mod 2 of the quad at m + d div 2.
     let step = if geometry == Geometry::Strided { 2 } else { 1 };
     let of_phase = |tap: conv::Tap| Tap {
         phase: (step * tap.dy.rem_euclid(step) + tap.dx.rem_euclid(step)).unsigned_abs(),
@@ -59,7 +59,7 @@ pub struct Weights {
     pub(super) rows: Vec<Wide>,
     /// Groups of rows that each term of a phase, or each part, needs; the same for every phase.
     pub(super) groups: Vec<u8>,
-    /// The parts of the sources where squares of outputs are computed together; none where it is tap by tap.
+    /// The parts of the sources where cells of outputs are computed together; none where it is tap by tap.
     parts: Vec<Part>,
     /// Whether sums of four products in 8 bits fit into 16.
     fit_16_bits: bool,
@@ -115,9 +115,9 @@ impl Weights {
         }
     }
 
-    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels in 8 bits
-    /// of some step, of which one is zero. Steps of sources become part of the weights; each output then has a step of its
-    /// own, as fine as its largest weights allow.
+    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels
+    /// in 8 bits of some step, of which one is zero. Steps of sources become part of the weights; each output
+    /// then has a step of its own, as fine as its largest weights allow.
     ///
     /// # Panics
     /// If `weights` has the wrong length, or a phase of a transposed layer would need a shift of its own.
@@ -166,7 +166,7 @@ impl Weights {
             (scale[o / LANES].0[o % LANES], shift[o / LANES].0[o % LANES]) = of_output;
         }
         let inputs = sources.iter().map(|&(channels, steps)| (channels, Format::Int8(steps))).collect();
-        if engine.prefers_squares(geometry) {
+        if engine.prefers_winograd(geometry) {
             let parts = winograd::parts(sources.iter().map(|(channels, _)| *channels));
             let kernel = |o: usize, i: usize| {
                 let of_channel = &rounded[(o * total + i) * taps..];
@@ -189,7 +189,8 @@ impl Weights {
         Self { fit_16_bits: in_16_bits, scale, shift, ..packed }
     }
 
-    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has them.
+    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has
+    /// them.
     fn build(
         geometry: Geometry,
         inputs: Vec<(usize, Format)>,
@@ -255,7 +256,8 @@ fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     pairs
 }
 
-/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added up in 16 bits or not.
+/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added
+/// up in 16 bits or not.
 fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     let mut largest = 0.0f32;
     // Of the first two channels of either row and of the others, of either sign.
@@ -268,8 +270,8 @@ fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
-/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as neighbouring pixels differ
-/// little.
+/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as
+/// neighbouring pixels differ little.
 fn round(taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
@@ -287,12 +289,12 @@ pub enum Output<'a> {
     /// To a narrow one, without adding to it; the upper 16 of 32 channels become zero where it has none. Only
     /// a ReLU's output goes into 8 bits.
     Narrow(&'a mut Operand),
-    /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor` times its
-    /// size (see [`crate::kernels::layout`]).
+    /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor`
+    /// times its size (see [`crate::kernels::layout`]).
     Planes {
         /// Of the activation.
         shape: Shape,
-        /// 1, or 2 where four channels are the pixels of a square.
+        /// 1, or 2 where four channels are the pixels of a quad.
         factor: usize,
         /// (N, C / factor^2, factor H, factor W).
         values: &'a mut [f32],
@@ -365,14 +367,14 @@ pub fn convolve(
         };
         terms(geometry, planes.len(), phase).into_iter().enumerate().map(place).collect()
     };
-    let by_squares = !weights.parts.is_empty();
+    let by_cells = !weights.parts.is_empty();
     let phases_of = |n: usize| -> Vec<Vec<Term>> {
-        if by_squares { vec![places(n)] } else { (0..spread * spread).map(|phase| terms(n, phase)).collect() }
+        if by_cells { vec![places(n)] } else { (0..spread * spread).map(|phase| terms(n, phase)).collect() }
     };
     let phases: Vec<Vec<Vec<Term>>> = (0..out.n).map(phases_of).collect();
     // Bands of rows keep every thread busy and their input in the second-level cache.
     let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
-    let band = grid.h.div_ceil(bands).next_multiple_of(if by_squares { SIDE } else { 1 });
+    let band = grid.h.div_ceil(bands).next_multiple_of(if by_cells { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
     let (target, step) = match output {
         Output::F32(view) => (Target::F32(Shared(view.data.as_mut_ptr())), 1.0),
@@ -422,8 +424,8 @@ pub fn convolve(
             rows,
         };
         engine.ready(|| {
-            if by_squares {
-                tier.run(Squares { band, parts: &weights.parts });
+            if by_cells {
+                tier.run(Cells { band, parts: &weights.parts });
             } else {
                 tier.run(band);
             }

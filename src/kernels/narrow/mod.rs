@@ -1,11 +1,11 @@
-//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter of
-//! the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
+//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter
+//! of the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
 //! multiplies matrix tiles (AMX).
 //!
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
-//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones. Where products are
-//! dear, 3x3 convolutions go by squares of outputs, with fewer of them (`winograd.rs`).
+//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones.
+//! Where products are dear, 3x3 convolutions go by cells of outputs, with fewer of them (`winograd.rs`).
 //!
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.
@@ -38,8 +38,8 @@ use super::{
 pub enum Format {
     /// bfloat16: f32 with 8 bits of mantissa.
     Bf16,
-    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign. Sums
-    /// are exact.
+    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign.
+    /// Sums are exact.
     Int8(Steps),
 }
 
@@ -96,8 +96,9 @@ const GROUP: usize = 4;
 /// Largest weight in steps.
 const WEIGHT_STEPS: f32 = 127.0;
 
-/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves, before rounding them adds up to
-/// one step each: 128 times the largest activation is the most that 16 bits hold.
+/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves,
+/// before rounding them adds up to one step each: 128 times the largest activation is the most that 16 bits
+/// hold.
 const FITTING_STEPS: f32 = 124.0 - 1e-4;
 
 /// Largest activation in steps.
@@ -168,7 +169,7 @@ pub fn clear() {
     FREE.clear();
 }
 
-/// A plane of positions, and how the four pixels of a square are dealt to four planes where a convolution
+/// A plane of positions, and how the four pixels of a quad are dealt to four planes where a convolution
 /// takes steps of two.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Grid {
@@ -261,13 +262,13 @@ impl Operand {
         operand
     }
 
-    /// Planes in a format, whose pixels in 2x2 squares become channels of one pixel (space to depth):
+    /// Planes in a format, whose pixels in 2x2 quads become channels of one pixel (space to depth):
     /// (N, C, H, W) -> (N, 4C, H/2, W/2)
     ///
     /// # Panics
     /// If rows or columns are odd, or there are not as many values as `planes` demands.
     pub fn halved(engine: Engine, format: Format, planes: Shape, values: &[f32]) -> Self {
-        let shape = planes.squares();
+        let shape = planes.quads();
         assert_eq!(values.len(), shape.n * shape.c * shape.h * shape.w, "values of all planes");
         let mut operand = Self::new(shape, format);
         let (planes, blocks) = (operand.planes(), format.channels() / LANES);
@@ -447,7 +448,7 @@ pub fn max_pool(input: &Operand) -> Operand {
     output
 }
 
-/// The maxima of the 2x2 squares of two rows.
+/// The maxima of the 2x2 quads of two rows.
 struct PoolRow<'a> {
     format: Format,
     top: &'a [Wide],
@@ -459,8 +460,8 @@ impl Vectorised for PoolRow<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { format, top, bottom, row } = self;
-        let squares = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
-        for (out, (top, bottom)) in row.iter_mut().zip(squares) {
+        let quads = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+        for (out, (top, bottom)) in row.iter_mut().zip(quads) {
             *out = format.max(&format.max(&top[0], &top[1]), &format.max(&bottom[0], &bottom[1]));
         }
     }

@@ -62,8 +62,8 @@ impl Channels {
 /// An output gradient, positions interleaved two by two.
 #[derive(Debug)]
 pub struct Pairs {
-    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so that no tap
-    /// reaches beyond the first position of the input.
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so
+    /// that no tap reaches beyond the first position of the input.
     data: Pooled<Wide>,
     rows: usize,
     grid: Grid,
@@ -109,7 +109,8 @@ impl Pairs {
     }
 }
 
-/// Adds the weight gradient of one source to `gradient`; see [`crate::kernels::weight_grad::weight_gradient`].
+/// Adds the weight gradient of one source to `gradient`; see
+/// [`crate::kernels::weight_grad::weight_gradient`].
 ///
 /// # Panics
 /// If sizes, borders or lengths do not fit together.
@@ -136,7 +137,7 @@ pub fn weight_gradient(
                 let (dy, dx) = (signed(t / k) - signed(k / 2), signed(t % k) - signed(k / 2));
                 (dy * signed(grid.stride()) + dx, 0)
             }
-            // out[2m + k - 1] += in[m] w[k]: the gradient at square m + (k - 1) div 2, pixel (k - 1) mod 2.
+            // out[2m + k - 1] += in[m] w[k]: the gradient at quad m + (k - 1) div 2, pixel (k - 1) mod 2.
             _ => {
                 let (ky, kx) = (signed(t / 4) - 1, signed(t % 4) - 1);
                 let shift = ky.div_euclid(2) * signed(grid.stride()) + kx.div_euclid(2);

@@ -1,22 +1,25 @@
-//! 3x3 convolutions in 8 bits by squares of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as tap by tap.
+//! 3x3 convolutions in 8 bits by cells of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as
+//! tap by tap.
 //!
-//! Fractions would be rounded, and what comes out would depend on where a square begins. Whole numbers modulo 2^32 do without: weights
-//! at the points take 16 bits, and sums of their products make 9 x 2^k times the output. Nine has an inverse modulo 2^32, and a shift takes the
-//! rest away. So nothing but an output times 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last
-//! row or column may be anything.
+//! Fractions would be rounded, and what comes out would depend on where a cell begins. Whole numbers modulo
+//! 2^32 do without: weights at the points take 16 bits, and sums of their products make 9 x 2^k times the
+//! output. Nine has an inverse modulo 2^32, and a shift takes the rest away. So nothing but an output times
+//! 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last row or column may be
+//! anything.
 
 use std::num::Wrapping;
 
 use rayon::prelude::*;
 
-use super::{CHUNK, LANES, Sums, WIDE, WORD, Wide, allocate, band::Band, engine::SQUARES};
+use super::{CHUNK, LANES, Sums, WIDE, WORD, Wide, allocate, band::Band, engine::CELLS};
 use crate::kernels::{
     simd::{Kernel, Simd},
     winograd::{PATCH, POINTS, SIDE, evaluate_kernel},
 };
 
-/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before rounding them adds one step
-/// to each at most: 2^6 times that times the largest activation fits into 32 bits.
+/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before
+/// rounding them adds one step to each at most: 2^6 times that times the largest activation fits into 32
+/// bits.
 pub const FITTING_SUM: f32 = 130_000.0;
 
 /// Up to 32 channels of a source, half a [`Wide`] of it, which take all of one between the transforms.
@@ -50,8 +53,8 @@ pub fn groups(parts: &[Part]) -> Vec<u8> {
     parts.iter().map(|part| part.count.div_ceil(WIDE / super::GROUP) as u8).collect()
 }
 
-/// Packs the weights `kernel(output, input)` of a layer, in steps: `[output plane][point][part][16 rows]`, each row holding the weights
-/// of 16 outputs for a pair of input channels side by side.
+/// Packs the weights `kernel(output, input)` of a layer, in steps: `[output plane][point][part][16 rows]`,
+/// each row holding the weights of 16 outputs for a pair of input channels side by side.
 pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i16; 9] + Sync) -> Vec<Wide> {
     let rows_of_plane = POINTS * parts.len() * LANES;
     let mut rows = vec![Wide::ZERO; outputs.div_ceil(LANES) * rows_of_plane];
@@ -72,38 +75,40 @@ pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i1
     rows
 }
 
-/// The work of one task by squares: some rows of all output planes of one image.
-pub struct Squares<'a> {
+/// The work of one task by cells: some rows of all output planes of one image.
+pub struct Cells<'a> {
     pub band: Band<'a>,
     pub parts: &'a [Part],
 }
 
-impl Kernel for Squares<'_> {
+impl Kernel for Cells<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Squares { band, parts } = self;
+        let Cells { band, parts } = self;
         let (grid, engine, planes) = (band.grid, band.engine, &band.phases[0]);
-        // Points lie one value further apart than they need to, so that not all are in the same few sets of a cache.
-        let (point, product) = (parts.len() * SQUARES + 1, 2 * SQUARES + 1);
+        // Points lie one value further apart than they need to, so that not all are in the same few sets of a
+        // cache.
+        let (point, product) = (parts.len() * CELLS + 1, 2 * CELLS + 1);
         let rows_of_plane = POINTS * parts.len() * LANES;
         let mut points = allocate(POINTS * point);
         let mut products = allocate(POINTS * product);
         let mut sums: [Sums; SIDE] = std::array::from_fn(|_| Sums::default());
         for y in (band.rows.0..band.rows.1).step_by(SIDE) {
-            // The row above a square, as counted from the border's; rows below the border's may be any.
+            // The row above a cell, as counted from the border's; rows below the border's may be any.
             let starts: [usize; PATCH] =
                 std::array::from_fn(|i| grid.row((y + i).min(grid.h + 1)) - grid.stride() - 1);
-            for x in (0..grid.w).step_by(SIDE * SQUARES) {
-                let squares = (grid.w - x).div_ceil(SIDE).min(SQUARES);
+            for x in (0..grid.w).step_by(SIDE * CELLS) {
+                let cells = (grid.w - x).div_ceil(SIDE).min(CELLS);
                 for (p, part) in parts.iter().enumerate() {
                     for half in 0..part.count.div_ceil(LANES) {
                         let lane = part.half * WIDE + half * LANES;
-                        // SAFETY: `convolve` made sure of the border; slack covers what a last square reads beyond it. Points hold two bytes a channel.
+                        // SAFETY: `convolve` made sure of the border; slack covers what a last cell reads
+                        // beyond it. Points hold two bytes a channel.
                         unsafe {
                             let patch = starts
                                 .map(|start| planes[part.plane].input.add(start + x).cast::<u8>().add(lane));
-                            let points = points.as_mut_ptr().add(p * SQUARES).cast::<u8>();
-                            engine.evaluate(patch, squares, points.add(2 * half * LANES), point);
+                            let points = points.as_mut_ptr().add(p * CELLS).cast::<u8>();
+                            engine.evaluate(patch, cells, points.add(2 * half * LANES), point);
                         }
                     }
                 }
@@ -119,18 +124,18 @@ impl Kernel for Squares<'_> {
                                 points.as_ptr().add(i * point),
                                 rows,
                                 (outputs, rows_of_plane),
-                                squares,
+                                cells,
                                 products.as_mut_ptr().add(i * product),
                             );
                         }
                     }
-                    for first in (0..squares).step_by(CHUNK / SIDE) {
-                        let count = (squares - first).min(CHUNK / SIDE);
-                        for (o, square) in (0..outputs).flat_map(|o| (0..count).map(move |i| (o, i))) {
-                            // SAFETY: as above; a chunk of sums has room for as many squares.
+                    for first in (0..cells).step_by(CHUNK / SIDE) {
+                        let count = (cells - first).min(CHUNK / SIDE);
+                        for (o, cell) in (0..outputs).flat_map(|o| (0..count).map(move |i| (o, i))) {
+                            // SAFETY: as above; a chunk of sums has room for as many cells.
                             unsafe {
-                                let products = products.as_ptr().add(o * SQUARES + first + square);
-                                engine.interpolate(products, product, &mut sums, (o, SIDE * square));
+                                let products = products.as_ptr().add(o * CELLS + first + cell);
+                                engine.interpolate(products, product, &mut sums, (o, SIDE * cell));
                             }
                         }
                         let column = x + SIDE * first;

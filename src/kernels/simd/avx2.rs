@@ -183,7 +183,8 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn bytes(self, v: Self::V) -> [u8; LANES] {
-        // SAFETY: the token's promise; both are 16 bytes. What no whole number of 32 bits holds would come out negative.
+        // SAFETY: the token's promise; both are 16 bytes. What no whole number of 32 bits holds would come
+        // out negative.
         unsafe {
             let most = _mm256_set1_ps(255.0);
             let low = _mm256_cvtps_epi32(_mm256_min_ps(v.0, most));

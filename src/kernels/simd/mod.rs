@@ -1,8 +1,9 @@
 //! Sixteen f32 lanes on every processor: the vector type of the kernels and the choice of tier.
 //!
 //! A kernel implements [`Kernel`] once; [`Tier::run`] compiles it for the portable, AVX2+FMA and
-//! AVX-512 lanes and calls the one asked for. Each has a file here. Lanes can only be had from what was detected, so holding
-//! them proves that the processor has their instructions, and arithmetic on them is safe; reading and writing memory is not.
+//! AVX-512 lanes and calls the one asked for. Each has a file here. Lanes can only be had from what was
+//! detected, so holding them proves that the processor has their instructions, and arithmetic on them is
+//! safe; reading and writing memory is not.
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -20,7 +21,8 @@ use avx2::Avx2;
 pub(super) use avx512::Avx512;
 use portable::Portable;
 
-/// Sixteen f32 lanes. A value proves that the processor has the instructions: only [`Simd::detect`] makes one.
+/// Sixteen f32 lanes. A value proves that the processor has the instructions: only [`Simd::detect`] makes
+/// one.
 pub trait Simd: Copy {
     /// What `DEMC_TIER` calls it, but for its capital.
     const NAME: &str;
@@ -120,8 +122,8 @@ pub trait Simd: Copy {
     fn transpose_pairs(self, rows: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
         exchange(self, rows)
     }
-    /// Doubles a line of which `p` is one value before the first: each value twice, and the value on the other side of
-    /// each of the two halves of it. From `a b c d ..`: `b b c c ..` and `a c b d ..`.
+    /// Doubles a line of which `p` is one value before the first: each value twice, and the value on the
+    /// other side of each of the two halves of it. From `a b c d ..`: `b b c c ..` and `a c b d ..`.
     ///
     /// # Safety
     /// `p` is valid for reads of 16 values; ten count.
@@ -137,7 +139,8 @@ pub trait Simd: Copy {
             [self.load(&own), self.load(&near)]
         }
     }
-    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See [`exp`](super::exponential::exp).
+    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See
+    /// [`exp`](super::exponential::exp).
     #[inline(always)]
     fn exp(self, x: Self::V) -> Self::V {
         let mut values = Block::default();

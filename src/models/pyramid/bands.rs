@@ -1,4 +1,5 @@
-//! A network's layers from top to bottom of a frame, band by band, to the same bits as [`Network::forward`] on the whole of it.
+//! A network's layers from top to bottom of a frame, band by band, to the same bits as [`Network::forward`]
+//! on the whole of it.
 //!
 //! Every layer goes as far down as the rows above it allow and no row is computed twice; rows are kept only
 //! while something below needs them. Memory so grows with the width of a frame, not with its height, and
@@ -53,14 +54,14 @@ pub struct Feed<'a, S> {
 }
 
 impl<'a, S: Subject> Feed<'a, S> {
-    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made for as many rows
-    /// as [`padded`] has.
+    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made
+    /// for as many rows as [`padded`] has.
     pub fn new(trunk: &'a Trunk, subject: S, size: (usize, usize), band: usize) -> Self {
         Self { frame: Progress::new(trunk, subject, padded(size.1), band), size }
     }
 
-    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them, times `scale`,
-    /// and its first row.
+    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them,
+    /// times `scale`, and its first row.
     pub fn push(
         &mut self,
         inputs: S::Inputs,

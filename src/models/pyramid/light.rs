@@ -1,5 +1,5 @@
-//! Light on its way through the built-in network: radiance that is divided by an albedo, filtered and multiplied again, with
-//! whatever is denoised along with it.
+//! Light on its way through the built-in network: radiance that is divided by an albedo, filtered and
+//! multiplied again, with whatever is denoised along with it.
 
 use std::ops::Range;
 
@@ -11,10 +11,11 @@ use super::{
 };
 use crate::{companion::Kind, features::LightInputs, nn::Line, planes::Planes};
 
-/// Rows of radiance and its companions. They are handed out in this order, each (3, R, W): radiance, exposed, the normal,
-/// what radiance was divided by, and the companions.
+/// Rows of radiance and its companions. They are handed out in this order, each (3, R, W): radiance, exposed,
+/// the normal, what radiance was divided by, and the companions.
 pub struct LightImages {
-    /// What is divided by the clean albedo, and the logarithm of that over the noisy one, until the network says which is to divide.
+    /// What is divided by the clean albedo, and the logarithm of that over the noisy one, until the network
+    /// says which is to divide.
     quotient: Line<Field>,
     ratio: Line<Field>,
     /// Companions wait for the same. They are the images of each scale after the first.

@@ -1,5 +1,5 @@
-//! The prefilter: a small network of the same kind as the built-in one, which denoises albedo and normal for it. Its heads
-//! predict kernels that filter both.
+//! The prefilter: a small network of the same kind as the built-in one, which denoises albedo and normal for
+//! it. Its heads predict kernels that filter both.
 
 use std::ops::Range;
 

@@ -1,9 +1,10 @@
-//! Inference on a frame, to the same bits as [`Network::forward`] on the whole of it: strip by strip from left to right, each
-//! [band by band](super::bands) from top to bottom, refitted and written once its rows are through.
+//! Inference on a frame, to the same bits as [`Network::forward`] on the whole of it: strip by strip from
+//! left to right, each [band by band](super::bands) from top to bottom, refitted and written once its rows
+//! are through.
 //!
-//! What bands keep under way grows with their width. So frames that are wider than most are denoised in vertical strips, each
-//! with as many columns beside its own as they depend on. A strip begins where squares of pixels do at every level. What
-//! depends on the whole frame, exposures and shading, is computed once.
+//! What bands keep under way grows with their width. So frames that are wider than most are denoised in
+//! vertical strips, each with as many columns beside its own as they depend on. A strip begins where quads
+//! of pixels do at every level. What depends on the whole frame, exposures and shading, is computed once.
 
 use std::ops::Range;
 
@@ -29,15 +30,16 @@ use crate::{
     planes::Planes,
 };
 
-/// Pixels of a band, all strips together: enough to keep threads busy, few enough for an 8K frame to fit in 3 GiB.
+/// Pixels of a band, all strips together: enough to keep threads busy, few enough for an 8K frame to fit in 3
+/// GiB.
 const BAND_PIXELS: usize = 9 << 14;
 
-/// Columns of the widest strip: few enough for bands of few rows to fit in little memory, while strips, which overlap, take
-/// about a tenth longer at most.
+/// Columns of the widest strip: few enough for bands of few rows to fit in little memory, while strips, which
+/// overlap, take about a tenth longer at most.
 const WIDEST: usize = 6144;
 
-/// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean albedo and
-/// normal, where they are known; `rows` those of a band, if the user has an opinion.
+/// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean
+/// albedo and normal, where they are known; `rows` those of a band, if the user has an opinion.
 ///
 /// # Errors
 /// A pass is missing.
@@ -92,7 +94,8 @@ fn infer_in(
     Ok(image)
 }
 
-/// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them, each (3, H, W).
+/// What a prefilter makes of a frame's guides, as [`guide_targets`](crate::features::guide_targets) has them,
+/// each (3, H, W).
 ///
 /// # Errors
 /// A pass is missing.
@@ -127,8 +130,8 @@ fn exposure_of_guides(passes: &PassSet) -> Result<f32> {
     Ok(albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?))
 }
 
-/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as [`Feed::push`]
-/// does: albedo and normal.
+/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as
+/// [`Feed::push`] does: albedo and normal.
 fn prefilter_bands(
     prefilter: &Prefilter,
     passes: &PassSet,
@@ -156,8 +159,8 @@ struct Strip {
 }
 
 impl Strip {
-    /// As few of a width as make up a frame, none wider than `widest`. They see as far beyond their own columns as `reach`
-    /// says, and what prefilters those as far again as its second number.
+    /// As few of a width as make up a frame, none wider than `widest`. They see as far beyond their own
+    /// columns as `reach` says, and what prefilters those as far again as its second number.
     fn all(width: usize, widest: usize, reach: [usize; 2]) -> impl Iterator<Item = Self> {
         let beside = move |columns: &Range<usize>, reach: usize| {
             let reach = reach.next_multiple_of(MULTIPLE);
@@ -208,8 +211,8 @@ impl Cut {
         self.columns.start..self.columns.end.next_multiple_of(MULTIPLE)
     }
 
-    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below themselves, so
-    /// as many come at once as that may take.
+    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below
+    /// themselves, so as many come at once as that may take.
     fn is_last(&self, end: usize) -> bool {
         self.unpadded < end + MULTIPLE
     }
@@ -295,7 +298,8 @@ impl Whole<'_> {
         })
     }
 
-    /// What the network reads of some rows, whose clean albedo and normal are given, and the companions, divided as radiance is.
+    /// What the network reads of some rows, whose clean albedo and normal are given, and the companions,
+    /// divided as radiance is.
     fn inputs(
         &self,
         cut: &Cut,
@@ -391,8 +395,8 @@ impl<'a> Last<'a> {
     }
 }
 
-/// Changes the first `done` rows of a light as a refit changed the beauty: to the `scale` of the result, times the beauty
-/// after over the beauty `before`.
+/// Changes the first `done` rows of a light as a refit changed the beauty: to the `scale` of the result,
+/// times the beauty after over the beauty `before`.
 fn follow(light: &mut Planes, (before, after): (&Planes, &Planes), done: usize, scale: f32) {
     let (width, pixels) = (light.width, light.pixels());
     light.data.par_chunks_mut(pixels).enumerate().for_each(|(c, plane)| {

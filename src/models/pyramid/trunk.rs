@@ -1,8 +1,9 @@
-//! What the built-in network and its prefilter have in common: two encoders, a decoder, and the kernels that their heads
-//! predict. Two inputs at full resolution come in; logits for every level of a pyramid of images go out.
+//! What the built-in network and its prefilter have in common: two encoders, a decoder, and the kernels that
+//! their heads predict. Two inputs at full resolution come in; logits for every level of a pyramid of images
+//! go out.
 //!
-//! [`Trunk::new`] declares its layers, and what each reads. All else follows from that list: the run on a tape here, that
-//! [band by band](super::bands), parameters, arithmetic, reach, and how layers are frozen.
+//! [`Trunk::new`] declares its layers, and what each reads. All else follows from that list: the run on a
+//! tape here, that [band by band](super::bands), parameters, arithmetic, reach, and how layers are frozen.
 
 use dfdx::tensor::{Cpu, Merge, Tape};
 
@@ -22,8 +23,8 @@ pub const MULTIPLE: usize = 1 << LEVELS;
 /// Rows and columns of kernels, but for some of full resolution.
 pub const KERNEL: usize = 5;
 
-/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where radiance is
-/// filtered, which albedo to divide by, and how far to follow the shading.
+/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where
+/// radiance is filtered, which albedo to divide by, and how far to follow the shading.
 const GAINS: usize = 3;
 const DIVISOR: usize = 1;
 const SHADE: usize = 1;
@@ -34,8 +35,8 @@ const DECODER_EXTRA: usize = 16;
 /// Heads begin this much smaller than Xavier: kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
-/// What inputs may be in 8 bits: logarithms up to 300 times white, beyond which brightness decides on no kernel; and all that
-/// albedo and normals are.
+/// What inputs may be in 8 bits: logarithms up to 300 times white, beyond which brightness decides on no
+/// kernel; and all that albedo and normals are.
 const LOGARITHMS: Steps = Steps::to(3.0);
 const GUIDES: Steps = Steps::within(1.0);
 
@@ -56,7 +57,8 @@ pub struct Variant<'a> {
 pub struct Trunk {
     /// Each after those that it reads: those of the radiance encoder, of the guide encoder, of the decoder.
     pub layers: Vec<Layer>,
-    /// One for each level of the pyramid of images, full resolution first, which predicts the rest of a frame besides.
+    /// One for each level of the pyramid of images, full resolution first, which predicts the rest of a frame
+    /// besides.
     pub heads: Vec<Head>,
     /// Rows and columns of the kernels of full resolution.
     full_kernel: usize,
@@ -80,7 +82,7 @@ pub struct Layer {
 /// What a layer does.
 #[derive(Clone)]
 pub enum Step {
-    /// Makes channels of the 2x2 squares of an input, which in 8 bits may have these values.
+    /// Makes channels of the quads of an input, which in 8 bits may have these values.
     Input(Steps),
     /// Halves rows and columns.
     Pool,
@@ -254,8 +256,9 @@ impl Trunk {
             let before = layer.sources.iter().map(|source| reaches[*source]).max();
             reaches.push(before.unwrap_or(0) + layer.reach());
         }
-        // The head of full resolution leaves half a pixel of the finest level behind. Then come the kernels, and below full
-        // resolution a pixel for the corners of an upsampling and half a one for the squares of an image.
+        // The head of full resolution leaves half a pixel of the finest level behind. Then come the kernels,
+        // and below full resolution a pixel for the corners of an upsampling and half a one for the quads
+        // of an image.
         let layers = reaches.into_iter().max().unwrap_or(0) + 1;
         let kernels: usize = (0..=LEVELS).map(|level| (self.kernel(level) / 2) << level).sum();
         let pyramid: usize = (1..=LEVELS).map(|level| 3 << (level - 1)).sum();
@@ -304,8 +307,8 @@ impl Trunk {
     }
 }
 
-/// Channels of a level's head for one pixel: k x k kernel, confidence, the mask that blends the level below, and the
-/// corners from which that is upsampled.
+/// Channels of a level's head for one pixel: k x k kernel, confidence, the mask that blends the level below,
+/// and the corners from which that is upsampled.
 const fn head_of(k: usize) -> usize {
     k * k + 2 + CORNERS
 }
@@ -326,8 +329,8 @@ pub struct Prediction<T> {
 pub struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     pub gain: Field<T>,
-    /// But for a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading is
-    /// multiplied by before it is added to all gains' logits, both (N, 1, H, W).
+    /// But for a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading
+    /// is multiplied by before it is added to all gains' logits, both (N, 1, H, W).
     pub refined: Option<(Field<T>, Field<T>)>,
 }
 
@@ -363,8 +366,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     }
 }
 
-/// Some planes of a head's output; `factor` 2 where each 2x2 square of pixels shares one pixel of the trunk. The tape goes
-/// with the first that are asked for.
+/// Some planes of a head's output; `factor` 2 where each quad of pixels shares one pixel of the trunk.
+/// The tape goes with the first that are asked for.
 fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
     mut head: Activation<T>,
     factor: usize,
@@ -377,8 +380,9 @@ fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
     }
 }
 
-/// Filters an image, (N, 3, H, W), by what is predicted for every level of its pyramid, full resolution first: from the coarsest
-/// up, each level is blended with what filtering made of the one below, and filtered.
+/// Filters an image, (N, 3, H, W), by what is predicted for every level of its pyramid, full resolution
+/// first: from the coarsest up, each level is blended with what filtering made of the one below, and
+/// filtered.
 pub fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(
     mut image: Field<T>,
     levels: Vec<Prediction<T>>,

@@ -1,4 +1,5 @@
-//! AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. 8 bits and conversions are those of AVX-512.
+//! AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. 8 bits and conversions are those of
+//! AVX-512.
 
 use std::{arch::asm, sync::OnceLock};
 

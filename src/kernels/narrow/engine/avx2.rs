@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{Backend, NINTH, Product, SQUARES};
+use super::{Backend, CELLS, NINTH, Product};
 use crate::kernels::{
     LANES,
     conv::Geometry,
@@ -13,7 +13,7 @@ use crate::kernels::{
 /// Positions whose sums stay in registers, two for each.
 const TILE: usize = 4;
 
-/// Squares whose products stay in registers, two for each.
+/// Cells whose products stay in registers, two for each.
 const STRIP: usize = 4;
 
 /// Lanes of a register.
@@ -34,12 +34,12 @@ impl Backend for Avx2 {
         true
     }
 
-    fn prefers_squares(self, geometry: Geometry) -> bool {
+    fn prefers_winograd(self, geometry: Geometry) -> bool {
         geometry == Geometry::Same(3)
     }
 
     fn adds_in_16_bits(self, geometry: Geometry) -> bool {
-        !self.prefers_squares(geometry)
+        !self.prefers_winograd(geometry)
     }
 
     #[target_feature(enable = "avx2")]
@@ -49,17 +49,18 @@ impl Backend for Avx2 {
     }
 
     #[target_feature(enable = "avx2")]
-    unsafe fn evaluate(self, patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
+    unsafe fn evaluate(self, patch: [*const u8; PATCH], cells: usize, points: *mut u8, stride: usize) {
         let nothing = Halves(self, _mm256_setzero_si256());
         // Columns of a patch at the points, the last two of which are the next patch's first.
         let mut columns = [[nothing; PATCH]; PATCH];
-        for square in 0..squares {
-            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that as points.
+        for cell in 0..cells {
+            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that
+            // as points.
             unsafe {
-                for x in if square == 0 { 0 } else { PATCH - SIDE }..PATCH {
+                for x in if cell == 0 { 0 } else { PATCH - SIDE }..PATCH {
                     let mut column = [nothing; PATCH];
                     for y in 0..PATCH {
-                        let bytes = patch[y].add((SIDE * square + x) * size_of::<Wide>());
+                        let bytes = patch[y].add((SIDE * cell + x) * size_of::<Wide>());
                         column[y] = Halves(self, _mm256_cvtepu8_epi16(_mm_load_si128(bytes.cast())));
                     }
                     columns[x] = winograd::evaluate(column);
@@ -71,7 +72,7 @@ impl Backend for Avx2 {
                     }
                     let row = winograd::evaluate(row);
                     for x in 0..PATCH {
-                        let at = ((PATCH * y + x) * stride + square) * size_of::<Wide>();
+                        let at = ((PATCH * y + x) * stride + cell) * size_of::<Wide>();
                         _mm256_store_si256(points.add(at).cast(), row[x].1);
                     }
                 }
@@ -86,15 +87,15 @@ impl Backend for Avx2 {
         groups: &[u8],
         points: *const Wide,
         weights: *const Wide,
-        squares: usize,
+        cells: usize,
         products: *mut Wide,
     ) {
-        for first in (0..squares).step_by(STRIP) {
+        for first in (0..cells).step_by(STRIP) {
             // SAFETY: the caller's promise; a value is two registers.
             unsafe {
                 let mut acc = [[_mm256_setzero_si256(); 2]; STRIP];
                 for (part, &groups) in groups.iter().enumerate() {
-                    let mut x = points.add(part * SQUARES + first).cast::<u8>();
+                    let mut x = points.add(part * CELLS + first).cast::<u8>();
                     let mut w = weights.add(part * LANES).cast::<__m256i>();
                     for _ in 0..groups {
                         for row in 0..GROUP {
@@ -116,7 +117,7 @@ impl Backend for Avx2 {
                 }
             }
         }
-        const { assert!(SQUARES.is_multiple_of(STRIP)) };
+        const { assert!(CELLS.is_multiple_of(STRIP)) };
     }
 
     #[target_feature(enable = "avx2")]

@@ -11,11 +11,12 @@ use crate::kernels::{
     simd::{Avx512 as Lanes, Simd},
 };
 
-/// Sums that stay in registers, of the positions of a tile for one output plane or two, beside as many registers of weights.
-/// Fewer would wait for each other.
+/// Sums that stay in registers, of the positions of a tile for one output plane or two, beside as many
+/// registers of weights. Fewer would wait for each other.
 const SUMS: usize = 16;
 
-/// AVX512-VNNI: four multiply-accumulates of 8 bits a lane, of twice as many as AVX2 has. bfloat16 is the portable engine's.
+/// AVX512-VNNI: four multiply-accumulates of 8 bits a lane, of twice as many as AVX2 has. bfloat16 is the
+/// portable engine's.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Vnni(Lanes);
 
@@ -49,7 +50,8 @@ impl Backend for Avx512 {
         is_x86_feature_detected!("avx512bf16").then(Vnni::detect).flatten().map(Self)
     }
 
-    /// AMD's processors are faster so; on Intel's (Emerald Rapids) a training step in bfloat16 takes 1.7 x as long.
+    /// AMD's processors are faster so; on Intel's (Emerald Rapids) a training step in bfloat16 takes 1.7 x as
+    /// long.
     fn prefers_bf16(self) -> bool {
         !is_intel()
     }

@@ -1,5 +1,5 @@
-//! What depends on the processor: matrix products and conversions. Each has a file here, which says what it has, what it
-//! prefers, and how it multiplies, behind one trait; [`Engine`] is whichever was found.
+//! What depends on the processor: matrix products and conversions. Each has a file here, which says what it
+//! has, what it prefers, and how it multiplies, behind one trait; [`Engine`] is whichever was found.
 
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod amx;
@@ -21,9 +21,9 @@ use crate::kernels::{
 };
 use portable::{Backend, Portable};
 
-/// Squares side by side that are transformed, multiplied and transformed back together ([`super::winograd`]): what they need
-/// meanwhile stays in the second-level cache.
-pub const SQUARES: usize = 16;
+/// Cells side by side that are transformed, multiplied and transformed back together ([`super::winograd`]):
+/// what they need meanwhile stays in the second-level cache.
+pub const CELLS: usize = 16;
 
 /// The inverse of 9 modulo 2^32.
 const NINTH: u32 = 0x38e3_8e39;
@@ -125,8 +125,8 @@ impl Engine {
         units.into_iter().flatten().map(Engine).collect()
     }
 
-    /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `avx2`, `avxvnni`, `vnni`,
-    /// `avx512`, `amx`) chooses a slower one, to compare them.
+    /// The fastest engine, found once. The environment variable `DEMC_ENGINE` (`portable`, `avx2`, `avxvnni`,
+    /// `vnni`, `avx512`, `amx`) chooses a slower one, to compare them.
     ///
     /// # Panics
     /// If the variable names none that this processor has.
@@ -148,12 +148,14 @@ impl Engine {
         with_backend!(self, backend => backend.prefers_int8())
     }
 
-    /// Whether it has convolutions of 8 bits of a geometry by squares of outputs ([`super::winograd`]) rather than tap by tap.
-    pub(super) fn prefers_squares(self, geometry: Geometry) -> bool {
-        with_backend!(self, backend => backend.prefers_squares(geometry))
+    /// Whether it has convolutions of 8 bits of a geometry by cells of outputs ([`super::winograd`]) rather
+    /// than tap by tap.
+    pub(super) fn prefers_winograd(self, geometry: Geometry) -> bool {
+        with_backend!(self, backend => backend.prefers_winograd(geometry))
     }
 
-    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels, in a convolution of a geometry.
+    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels, in a
+    /// convolution of a geometry.
     pub fn adds_in_16_bits(self, geometry: Geometry) -> bool {
         with_backend!(self, backend => backend.adds_in_16_bits(geometry))
     }
@@ -163,7 +165,8 @@ impl Engine {
         with_backend!(self, backend => backend.ready(work))
     }
 
-    /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]`, both factors in `format`.
+    /// `sums[o][p] = sum over terms of term.input[position + p] * weights[o][term.weights]`, both factors in
+    /// `format`.
     ///
     /// # Safety
     /// Called inside [`Engine::ready`]; every term's 32 rows of input and 16 rows of weights can be read.
@@ -177,51 +180,54 @@ impl Engine {
         }
     }
 
-    /// 16 channels of 8 bits of the patches of `squares` squares side by side, at the 36 points of [`super::winograd`]: `patch` is where
-    /// each row of the first begins, `points` where the first point of the first square goes. Squares follow one another, and points lie `stride`
-    /// squares apart, a [`Wide`] each.
+    /// 16 channels of 8 bits of the patches of `cells` cells side by side, at the 36 points of
+    /// [`super::winograd`]: `patch` is where each row of the first begins, `points` where the first point of
+    /// the first cell goes. Cells follow one another, and points lie `stride` cells apart, a [`Wide`]
+    /// each.
     ///
     /// # Safety
     /// All of them can be read and written.
     pub(super) unsafe fn evaluate(
         self,
         patch: [*const u8; PATCH],
-        squares: usize,
+        cells: usize,
         points: *mut u8,
         stride: usize,
     ) {
         // SAFETY: the caller's promise.
-        unsafe { with_backend!(self, backend => backend.evaluate(patch, squares, points, stride)) }
+        unsafe { with_backend!(self, backend => backend.evaluate(patch, cells, points, stride)) }
     }
 
-    /// `products[o][square] = sum over parts of points[part][square] * weights[o][part]` at one point, for `outputs` (1 or 2) output
-    /// planes whose weights lie `plane` rows apart. `groups` tell how many groups of rows each part needs; the other
-    /// weights are zero.
+    /// `products[o][cell] = sum over parts of points[part][cell] * weights[o][part]` at one point, for
+    /// `outputs` (1 or 2) output planes whose weights lie `plane` rows apart. `groups` tell how many groups
+    /// of rows each part needs; the other weights are zero.
     ///
     /// # Safety
-    /// Parts, and output planes' products, lie [`SQUARES`] values apart, and all of them can be read and written.
+    /// Parts, and output planes' products, lie [`CELLS`] values apart, and all of them can be read and
+    /// written.
     pub(super) unsafe fn multiply_points(
         self,
         groups: &[u8],
         points: *const Wide,
         weights: *const Wide,
         (outputs, plane): (usize, usize),
-        squares: usize,
+        cells: usize,
         products: *mut Wide,
     ) {
         // SAFETY: the caller's promise.
         unsafe {
             for o in 0..outputs {
-                let (weights, products) = (weights.add(o * plane), products.add(o * SQUARES));
+                let (weights, products) = (weights.add(o * plane), products.add(o * CELLS));
                 with_backend!(self, backend => {
-                    backend.multiply_points(groups, points, weights, squares, products);
+                    backend.multiply_points(groups, points, weights, cells, products);
                 });
             }
         }
     }
 
-    /// The sums of a square for one output plane, from its products at the points, which lie `stride` values apart: row `y` of the
-    /// square goes to `sums[y]` of the output plane and from the column that `place` says.
+    /// The sums of a cell for one output plane, from its products at the points, which lie `stride` values
+    /// apart: row `y` of the cell goes to `sums[y]` of the output plane and from the column that `place`
+    /// says.
     ///
     /// # Safety
     /// All of them can be read.

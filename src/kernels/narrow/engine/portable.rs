@@ -1,10 +1,11 @@
-//! What an engine does, by plain loops: the oracle of the other engines, which do so what they have no instructions for.
+//! What an engine does, by plain loops: the oracle of the other engines, which do so what they have no
+//! instructions for.
 
 use std::num::Wrapping;
 
 use half::bf16;
 
-use super::{Correlation, NINTH, Product, SQUARES};
+use super::{CELLS, Correlation, NINTH, Product};
 use crate::kernels::{
     Block, LANES,
     conv::Geometry,
@@ -12,8 +13,8 @@ use crate::kernels::{
     winograd::{self, PATCH, POWERS, SIDE},
 };
 
-/// A way to multiply narrow matrices, by plain loops where it has no instructions. A value proves that the processor has
-/// those: only [`Backend::detect`] makes one.
+/// A way to multiply narrow matrices, by plain loops where it has no instructions. A value proves that the
+/// processor has those: only [`Backend::detect`] makes one.
 pub trait Backend: Copy {
     /// What `DEMC_ENGINE` calls it, but for its capitals.
     const NAME: &str;
@@ -31,8 +32,8 @@ pub trait Backend: Copy {
         false
     }
 
-    /// See [`super::Engine::prefers_squares`].
-    fn prefers_squares(self, _: Geometry) -> bool {
+    /// See [`super::Engine::prefers_winograd`].
+    fn prefers_winograd(self, _: Geometry) -> bool {
         false
     }
 
@@ -68,18 +69,18 @@ pub trait Backend: Copy {
     ///
     /// # Safety
     /// As that.
-    unsafe fn evaluate(self, patch: [*const u8; PATCH], squares: usize, points: *mut u8, stride: usize) {
-        for (square, lane) in (0..squares).flat_map(|square| (0..LANES).map(move |lane| (square, lane))) {
+    unsafe fn evaluate(self, patch: [*const u8; PATCH], cells: usize, points: *mut u8, stride: usize) {
+        for (cell, lane) in (0..cells).flat_map(|cell| (0..LANES).map(move |lane| (cell, lane))) {
             // SAFETY: the caller's promise.
             unsafe {
                 let columns: [[Wrapping<i16>; PATCH]; PATCH] = std::array::from_fn(|x| {
-                    let at = (SIDE * square + x) * size_of::<Wide>() + lane;
+                    let at = (SIDE * cell + x) * size_of::<Wide>() + lane;
                     winograd::evaluate(patch.map(|row| Wrapping(i16::from(*row.add(at)))))
                 });
                 for y in 0..PATCH {
                     let row = winograd::evaluate(columns.map(|column| column[y]));
                     for (x, value) in row.into_iter().enumerate() {
-                        let at = ((PATCH * y + x) * stride + square) * size_of::<Wide>() + 2 * lane;
+                        let at = ((PATCH * y + x) * stride + cell) * size_of::<Wide>() + 2 * lane;
                         points.add(at).cast::<i16>().write(value.0);
                     }
                 }
@@ -96,16 +97,16 @@ pub trait Backend: Copy {
         groups: &[u8],
         points: *const Wide,
         weights: *const Wide,
-        squares: usize,
+        cells: usize,
         products: *mut Wide,
     ) {
-        for square in 0..squares {
+        for cell in 0..cells {
             let mut sums = [0i32; LANES];
             for part in 0..groups.len() {
                 // SAFETY: the caller's promise.
                 let (x, w) = unsafe {
                     let w = std::slice::from_raw_parts(weights.add(part * LANES), LANES);
-                    (&*points.add(part * SQUARES + square), w)
+                    (&*points.add(part * CELLS + cell), w)
                 };
                 for (channel, l) in (0..WIDE).flat_map(|channel| (0..LANES).map(move |l| (channel, l))) {
                     let number = |wide: &Wide, i: usize| i32::from(wide.i16(i));
@@ -114,7 +115,7 @@ pub trait Backend: Copy {
                 }
             }
             // SAFETY: the caller's promise.
-            unsafe { products.add(square).cast::<[i32; LANES]>().write(sums) };
+            unsafe { products.add(cell).cast::<[i32; LANES]>().write(sums) };
         }
     }
 
