@@ -5,6 +5,8 @@
 //! cargo bench --bench batch                      both
 //! cargo bench --bench batch -- --only overlap    32 frames of 1920x1080
 //! cargo bench --bench batch -- --only memory     one frame of 7680x4320
+//! cargo bench --bench batch -- --only temporal   12 frames of 1920x1080 with their neighbours, and without
+//! cargo bench --bench batch -- --only temporal --size 7680x4320 --frames 3
 //! ```
 //! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
 //! repeated, each time at another brightness, until the frame is full (by default the example of this
@@ -32,6 +34,7 @@ use rayon::prelude::*;
 /// What the command line says.
 struct Arguments {
     only: Option<String>,
+    /// 0 where it does not say.
     frames: usize,
     size: Option<(usize, usize)>,
     noise: f32,
@@ -45,7 +48,7 @@ fn main() {
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut arguments = Arguments {
         only: None,
-        frames: 32,
+        frames: 0,
         size: None,
         noise: 0.0,
         model: "demc-m".into(),
@@ -75,11 +78,16 @@ fn main() {
     if wants("memory") {
         memory(&arguments);
     }
+    // Not unless it is asked for: it takes minutes.
+    if arguments.only.as_deref() == Some("temporal") {
+        temporal(&arguments);
+    }
 }
 
 /// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every
 /// value by up to a share `noise` of it: pixels that do not compress are the worst for memory.
-fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path) {
+/// `moved` is by how many columns all of it has moved to the right, [`STEP`] a frame: a pass Vector then says so.
+fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, moved: Option<usize>, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {
         let (w, h) = (layer.size.width(), layer.size.height());
@@ -87,12 +95,13 @@ fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path
         for channel in &mut layer.channel_data.list {
             // Copies look alike only to a person: the factor changes every mantissa.
             let factor = |x: usize, y: usize| 0.7 + 0.6 * (((y / h) * 131 + (x / w) * 71) % 97) as f32 / 97.0;
-            let at = |i: usize| (i / width % h) * w + i % width % w;
+            let column = |i: usize| (i % width + width - moved.unwrap_or(0)) % width;
+            let at = |i: usize| (i / width % h) * w + column(i) % w;
             let chance = |i: usize| {
                 (i as u32).wrapping_mul(0x9E37_79B9).rotate_left(13).wrapping_mul(0x85EB_CA6B) >> 8
             };
             let uniform = |i: usize| chance(i) as f32 / (1 << 24) as f32;
-            let scale = |i: usize| factor(i % width, i / width) * (1.0 - noise * uniform(i));
+            let scale = |i: usize| factor(column(i), i / width) * (1.0 - noise * uniform(i));
             channel.sample_data = match &channel.sample_data {
                 FlatSamples::F16(old) => FlatSamples::F16(
                     (0..width * height)
@@ -109,15 +118,34 @@ fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, to: &Path
             };
         }
     }
+    if moved.is_some() {
+        let mut vector = image.layer_data[0].clone();
+        vector.attributes.layer_name = Some("ViewLayer.Vector".into());
+        let channel = |component: &str, value: f32| AnyChannel {
+            name: format!("ViewLayer.Vector.{component}").as_str().into(),
+            sample_data: FlatSamples::F32(vec![value; width * height]),
+            quantize_linearly: false,
+            sampling: Vec2(1, 1),
+        };
+        // It was so much further left a frame before, and will be as much further right.
+        let step = -(STEP as f32);
+        let channels = [("W", 0.0), ("X", step), ("Y", 0.0), ("Z", step)].map(|(c, v)| channel(c, v));
+        vector.channel_data.list = channels.into_iter().collect();
+        image.layer_data.push(vector);
+    }
     image.attributes.display_window.size = Vec2(width, height);
     image.write().to_file(to).expect("the temporary folder has room");
 }
 
+/// Columns by which everything moves from frame to frame of a sequence.
+const STEP: usize = 4;
+
 /// Runs `demc denoise` on a folder; seconds, and the process's peak memory in MiB where it can be told.
-fn denoise(folder: &Path, out: &Path, model: &str) -> (f64, Option<f64>) {
+fn denoise(folder: &Path, out: &Path, model: &str, more: &[&str]) -> (f64, Option<f64>) {
     let start = Instant::now();
     let mut child = Command::new(env!("CARGO_BIN_EXE_demc"))
         .args(["denoise", "--overwrite", "--model", model])
+        .args(more)
         .arg(folder)
         .arg("--out")
         .arg(out)
@@ -176,13 +204,14 @@ fn describe(costs: &[Cost]) -> String {
 }
 
 fn overlap(arguments: &Arguments) {
+    let frames = if arguments.frames == 0 { 32 } else { arguments.frames };
     let size = arguments.size.unwrap_or((1920, 1080));
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let (input, out) = (folder.path().join("in"), folder.path().join("out"));
     fs::create_dir(&input).expect("the temporary folder is writable");
     let first = input.join("shot.0001.exr");
-    enlarge(&arguments.source, size, arguments.noise, &first);
-    for i in 2..=arguments.frames {
+    enlarge(&arguments.source, size, arguments.noise, None, &first);
+    for i in 2..=frames {
         fs::copy(&first, input.join(format!("shot.{i:04}.exr"))).expect("the temporary folder has room");
     }
 
@@ -207,9 +236,9 @@ fn overlap(arguments: &Arguments) {
             writes.push(write);
         }
     }
-    let pure = median(denoises.iter().map(|c| c.wall).collect()) * arguments.frames as f64;
-    let (wall, peak) = denoise(&input, &out, &arguments.model);
-    let (frames, threads) = (arguments.frames, rayon::current_num_threads());
+    let pure = median(denoises.iter().map(|c| c.wall).collect()) * frames as f64;
+    let (wall, peak) = denoise(&input, &out, &arguments.model, &[]);
+    let threads = rayon::current_num_threads();
     println!("{frames} frames of {}x{}, {threads} threads, {}", size.0, size.1, arguments.model);
     for (stage, costs) in [("read", &reads), ("denoise", &denoises), ("write", &writes)] {
         println!("{stage:<8} one frame alone: {}", describe(costs));
@@ -241,9 +270,9 @@ fn memory(arguments: &Arguments) {
     let size = arguments.size.unwrap_or((7680, 4320));
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let (input, out) = (folder.path().join("huge.exr"), folder.path().join("out"));
-    enlarge(&arguments.source, size, arguments.noise, &input);
+    enlarge(&arguments.source, size, arguments.noise, None, &input);
     let bytes = fs::metadata(&input).expect("just written").len();
-    let (seconds, peak) = denoise(&input, &out, &arguments.model);
+    let (seconds, peak) = denoise(&input, &out, &arguments.model, &[]);
     let file = bytes as f64 / f64::from(1 << 20);
     println!(
         "{}x{} with the passes of {}: a file of {file:.0} MiB, {seconds:.1} s",
@@ -255,4 +284,39 @@ fn memory(arguments: &Arguments) {
         Some(peak) => println!("memory at the peak: {peak:.0} MiB (target 3072)"),
         None => println!("memory at the peak: this system does not tell"),
     }
+}
+
+/// A sequence with two neighbours on each side beside the same frames one by one, in turns.
+fn temporal(arguments: &Arguments) {
+    let size = arguments.size.unwrap_or((1920, 1080));
+    let frames = if arguments.frames == 0 { 12 } else { arguments.frames };
+    let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let (input, out) = (folder.path().join("in"), folder.path().join("out"));
+    fs::create_dir(&input).expect("the temporary folder is writable");
+    for i in 0..frames {
+        let to = input.join(format!("shot.{i:04}.exr"));
+        enlarge(&arguments.source, size, arguments.noise, Some(i * STEP), &to);
+    }
+    let rounds = if size.0 * size.1 > 1 << 22 { 1 } else { 3 };
+    let (mut ratios, mut peaks) = (Vec::new(), [0.0, 0.0]);
+    for _ in 0..rounds {
+        let [alone, together] = [&[][..], &["--temporal"][..]].map(|more| {
+            let (seconds, peak) = denoise(&input, &out, &arguments.model, more);
+            (seconds / frames as f64, peak.unwrap_or(f64::NAN))
+        });
+        peaks = [alone.1.max(peaks[0]), together.1.max(peaks[1])];
+        println!("a frame alone {:.3} s, with its neighbours {:.3} s", alone.0, together.0);
+        ratios.push(together.0 / alone.0);
+    }
+    let (width, height) = size;
+    println!(
+        "{frames} frames of {width}x{height}, {}: {:.2} times (target 1.6)",
+        arguments.model,
+        median(ratios)
+    );
+    let [alone, together] = peaks;
+    println!(
+        "memory at the peak: {alone:.0} and {together:.0} MiB, {:.2} times (target 1.5)",
+        together / alone
+    );
 }

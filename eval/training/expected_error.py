@@ -1,17 +1,18 @@
 """Trains what tells how far off a denoised frame is: src/filters/shrinkage/expected.rs.
 
-    cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s, demc-l likewise)
+    cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m  (others likewise)
     python expected_error.py FEATURES/* --hold-out --out ../../src/filters/shrinkage/expected.safetensors
 
-With --hold-out it reports what it reaches on views that it did not see: the rank correlation with the true error over
-squares of 8x8 pixels, and for each tenth of them, ordered by what was expected, the true error over the expected one.
+With --hold-out it reports what it reaches on views that it did not see: the rank correlation with the true
+error over squares of 8x8 pixels, and for each tenth of them, ordered by what was expected, the true error
+over the expected one.
 
-What is learned is the mean of the squared error over squares of 4x4 pixels, relative to the reference's squared light: what
-is made least is the deviance of a gamma distribution, t / e + ln(e) for an error t and an expected e, which an e equal to the
-mean of t makes least however wide t is spread. The product of the differences to two references that share no noise is, in
-the mean, the squared error without their noise. So a pair is listed twice, the second time with `_b` after its scene's name
-and another reference; of a pair that is listed once, the reference as rendered and as it was denoised serve as two. Needs
-torch and safetensors.
+What is learned is the mean of the squared error over squares of 4x4 pixels, relative to the reference's
+squared light: what is made least is the deviance of a gamma distribution, t / e + ln(e) for an error t and an
+expected e, which an e equal to the mean of t makes least however wide t is spread. The product of the
+differences to two references that share no noise is, in the mean, the squared error without their noise. So a
+pair is listed twice, the second time with `_b` after its scene's name and another reference; of a pair that
+is listed once, the reference as rendered and as it was denoised serve as two. Needs torch and safetensors.
 """
 
 import argparse

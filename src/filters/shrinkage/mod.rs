@@ -5,9 +5,8 @@
 //! denoised) are best mixed as `d + w (c - d)`, with a share `w` that grows with the bias and falls with the
 //! noise (James and Stein 1961). Neither is known of one frame alone, but what was changed tells of both:
 //! - Cycles draws every pixel by itself, so noise has no direction, while edges and texture have. Of the
-//!   second
-//!   differences along four directions, the smallest holds next to nothing but noise. They are taken of the light, and
-//!   of the light over the albedo as rendered, which divides texture away.
+//!   second differences along four directions, the smallest holds next to nothing but noise. They are taken
+//!   of the light, and of the light over the albedo as rendered, which divides texture away.
 //! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred
 //!   detail: with
 //!   its neighbours, with the detail that is left, and with that of the albedo.
