@@ -1,10 +1,10 @@
 //! Where the content of a frame lies in other frames of its sequence, and planes sampled there.
 //!
 //! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with
-//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y
-//! + W) one frame later. Steps chain: each goes on with the vectors of the frame that the one before it ended
-//! in. Vectors are those of the surface that the camera sees first; what mirrors and glass show, and shadows,
-//! move otherwise.
+//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at
+//! (x - Z, y + W) one frame later. Steps chain: each goes on with the vectors of the frame that the one
+//! before it ended in. Vectors are those of the surface that the camera sees first; what mirrors and glass
+//! show, and shadows, move otherwise.
 
 use rayon::prelude::*;
 

@@ -60,7 +60,7 @@ pub trait Denoiser: Send + Sync {
     /// A pass is missing, or the method cannot run here; the message says why.
     fn denoise(&self, shot: &Shot) -> Result<Planes>;
 
-    /// As [`Denoiser::denoise`], working on squares of at most `tile` pixels at a time where the method
+    /// As [`Denoiser::denoise`], working on tiles of at most `tile` pixels a side where the method
     /// can, to bound its memory; a method that cannot ignores the hint.
     ///
     /// # Errors

@@ -22,8 +22,8 @@ use crate::{
     shot::Shot,
 };
 
-/// The built-in model that looks at a frame twice, the second time upside down and with its 2x2 squares one
-/// pixel further on, and answers with the mean: what a network gets wrong depends on how its squares and
+/// The built-in model that looks at a frame twice, the second time upside down and with its quads of 2x2 pixels one
+/// pixel further on, and answers with the mean: what a network gets wrong depends on how its quads and
 /// levels happen to lie on the picture, and half of that averages out (Lim et al. 2017 call it a geometric
 /// self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
@@ -92,7 +92,7 @@ impl Learned {
     }
 
     /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a
-    /// square as before, so a column or row is added at what becomes the beginning; fireflies are tamed
+    /// quad as before, so a column or row is added at what becomes the beginning; fireflies are tamed
     /// before it mirrors them, since two would be company for each other. The clean guides are those of the
     /// first look.
     fn second_look(

@@ -1,5 +1,5 @@
-//! A network's layers from top to bottom of a frame, band by band, to the same bits as [`Network::forward`]
-//! on the whole of it.
+//! A network's layers from top to bottom of a frame, band by band, to the same bits as
+//! [`Network::forward`](super::super::network::Network::forward) on the whole of it.
 //!
 //! Every layer goes as far down as the rows above it allow and no row is computed twice; rows are kept only
 //! while something below needs them. Memory so grows with the width of a frame, not with its height, and
