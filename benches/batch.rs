@@ -85,8 +85,8 @@ fn main() {
 }
 
 /// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every
-/// value by up to a share `noise` of it: pixels that do not compress are the worst for memory.
-/// `moved` is by how many columns all of it has moved to the right, [`STEP`] a frame: a pass Vector then says so.
+/// value by up to a share `noise` of it: pixels that do not compress are the worst for memory. `moved` is by
+/// how many columns all of it has moved to the right, [`STEP`] a frame: a pass Vector then says so.
 fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, moved: Option<usize>, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {

@@ -22,10 +22,10 @@ use crate::{
     shot::Shot,
 };
 
-/// The built-in model that looks at a frame twice, the second time upside down and with its quads of 2x2 pixels one
-/// pixel further on, and answers with the mean: what a network gets wrong depends on how its quads and
-/// levels happen to lie on the picture, and half of that averages out (Lim et al. 2017 call it a geometric
-/// self-ensemble). It has the weights of `demc-m`.
+/// The built-in model that looks at a frame twice, the second time upside down and with its quads of 2x2
+/// pixels one pixel further on, and answers with the mean: what a network gets wrong depends on how its quads
+/// and levels happen to lie on the picture, and half of that averages out (Lim et al. 2017 call it a
+/// geometric self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
 
 /// What [`TURNED`] does to a frame of odd width and height.
