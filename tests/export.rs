@@ -146,14 +146,16 @@ fn stereo_scenes_give_both_views_in_one_file() {
 
 #[test]
 fn a_file_of_two_scenes_says_which_is_rendered() {
-    let shot = Shot::new(&python::python(), "two");
-    let said = shot.export("");
-    assert!(said.contains("shot.blend has 2 scenes: Main, Other; rendering Main"), "{said}");
-    assert_eq!(size(&shot.passes("shot_ref.exr")), (64, 36));
-    assert!(!shot.export("--scene Other --name other").contains("note: "));
-    assert_eq!(size(&shot.passes("other_ref.exr")), (32, 36));
-    let said = shot.refuse("--scene Third", 1);
-    assert!(said.contains("no scene 'Third' in shot.blend; it has Main, Other"), "{said}");
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "two");
+        let said = shot.export("");
+        assert!(said.contains("shot.blend has 2 scenes: Main, Other; rendering Main"), "{said}");
+        assert_eq!(size(&shot.passes("shot_ref.exr")), (64, 36));
+        assert!(!shot.export("--scene Other --name other").contains("note: "));
+        assert_eq!(size(&shot.passes("other_ref.exr")), (32, 36));
+        let said = shot.refuse("--scene Third", 1);
+        assert!(said.contains("no scene 'Third' in shot.blend; it has Main, Other"), "{said}");
+    }
 }
 
 #[test]
@@ -170,30 +172,32 @@ fn a_render_border_is_kept_and_told() {
 
 #[test]
 fn frames_come_in_lists_and_steps_and_keep_to_the_scenes_step() {
-    let shot = Shot::new(&python::python(), "step");
-    let frames = |arguments: &str| {
-        let name = format!("n{}", arguments.len());
-        let said = shot.export(&format!("{arguments} --ref-spp 0 --name {name}"));
-        let prefix = format!("{name}_0001spp.00");
-        let numbers = shot.files().into_iter().filter_map(|file| {
-            file.strip_prefix(&prefix)?.strip_suffix(".exr").map(|number| number.parse::<u32>().unwrap())
-        });
-        (numbers.collect::<Vec<_>>(), said)
-    };
-    let (numbers, said) = frames("--frames 1-5");
-    assert_eq!(numbers, [1, 3, 5]);
-    assert!(said.contains("note: Main renders every 2. frame; --frames A-B:1 renders all"), "{said}");
-    assert_eq!(frames("--frames scene").0, [1, 3, 5]);
-    let (numbers, said) = frames("--frames 1-9x4,2,3-4:1");
-    assert_eq!(numbers, [1, 2, 3, 4, 5, 9]);
-    assert!(!said.contains("note:"), "{said}");
-    for (frames, expected) in [
-        ("1-9:0", "the step is not a number of at least 1"),
-        ("9-1", "the last frame comes before the first"),
-        ("1-x", "'1-x' is no list of frames; write 7, 1-9, 1-9:4 or 1,3,7-9"),
-    ] {
-        let said = shot.refuse(&format!("--frames {frames}"), 2);
-        assert!(said.contains(expected), "{said}");
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "step");
+        let frames = |arguments: &str| {
+            let name = format!("n{}", arguments.len());
+            let said = shot.export(&format!("{arguments} --ref-spp 0 --name {name}"));
+            let prefix = format!("{name}_0001spp.00");
+            let numbers = shot.files().into_iter().filter_map(|file| {
+                file.strip_prefix(&prefix)?.strip_suffix(".exr").map(|number| number.parse::<u32>().unwrap())
+            });
+            (numbers.collect::<Vec<_>>(), said)
+        };
+        let (numbers, said) = frames("--frames 1-5");
+        assert_eq!(numbers, [1, 3, 5]);
+        assert!(said.contains("note: Main renders every 2. frame; --frames A-B:1 renders all"), "{said}");
+        assert_eq!(frames("--frames scene").0, [1, 3, 5]);
+        let (numbers, said) = frames("--frames 1-9x4,2,3-4:1");
+        assert_eq!(numbers, [1, 2, 3, 4, 5, 9]);
+        assert!(!said.contains("note:"), "{said}");
+        for (frames, expected) in [
+            ("1-9:0", "the step is not a number of at least 1"),
+            ("9-1", "the last frame comes before the first"),
+            ("1-x", "'1-x' is no list of frames; write 7, 1-9, 1-9:4 or 1,3,7-9"),
+        ] {
+            let said = shot.refuse(&format!("--frames {frames}"), 2);
+            assert!(said.contains(expected), "{said}");
+        }
     }
 }
 
@@ -254,32 +258,37 @@ fn motion_vectors_come_with_sequences_and_are_usable_or_absent() {
         assert!(back.abs() > 0.5 && (back - on).abs() < 0.3 * back.abs(), "{back} and {on} pixels");
         shot.export("--frames 4 --ref-spp 0 --no-vector --name still");
         assert!(shot.passes("still_0001spp.0004.exr").get(Pass::Vector).is_none());
+
+        let shot = Shot::new(&python, "blur");
+        let said = shot.export("--frames 4 --ref-spp 0 --vector");
+        assert!(said.contains("Vector is left out; --no-motion-blur renders it"), "{said}");
+        assert!(shot.passes("shot_0001spp.0004.exr").get(Pass::Vector).is_none(), "zeros are no vectors");
+        shot.export("--frames 4 --ref-spp 0 --no-motion-blur --name sharp");
+        assert!(shot.passes("sharp_0001spp.0004.exr").get(Pass::Vector).is_some());
     }
-    let shot = Shot::new(&python::python(), "blur");
-    let said = shot.export("--frames 4 --ref-spp 0 --vector");
-    assert!(said.contains("Vector is left out; --no-motion-blur renders it"), "{said}");
-    assert!(shot.passes("shot_0001spp.0004.exr").get(Pass::Vector).is_none(), "zeros are no vectors");
-    shot.export("--frames 4 --ref-spp 0 --no-motion-blur --name sharp");
-    assert!(shot.passes("sharp_0001spp.0004.exr").get(Pass::Vector).is_some());
 }
 
 #[test]
 fn references_keep_their_guides_on_request() {
-    let shot = Shot::new(&python::python(), "");
-    shot.export("--ref-guides");
-    let reference = shot.passes("shot_ref.exr");
-    for pass in [Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
-        assert!(reference.get(pass).is_some(), "{pass}");
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "");
+        shot.export("--ref-guides");
+        let reference = shot.passes("shot_ref.exr");
+        for pass in [Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+            assert!(reference.get(pass).is_some(), "{pass}");
+        }
+        assert!(reference.get(Pass::Position).is_none());
     }
-    assert!(reference.get(Pass::Position).is_none());
 }
 
 #[test]
 fn mistyped_places_are_told_in_a_line() {
-    let shot = Shot::new(&python::python(), "");
-    let said = shot.refuse("--name a/b", 2);
-    assert!(said.contains("'a/b' is no file name: leave out folders"), "{said}");
-    fs::write(shot.out(), "a file").unwrap();
-    let said = shot.refuse("", 1);
-    assert!(said.contains("out is a file, not a folder (--out)"), "{said}");
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "");
+        let said = shot.refuse("--name a/b", 2);
+        assert!(said.contains("'a/b' is no file name: leave out folders"), "{said}");
+        fs::write(shot.out(), "a file").unwrap();
+        let said = shot.refuse("", 1);
+        assert!(said.contains("out is a file, not a folder (--out)"), "{said}");
+    }
 }

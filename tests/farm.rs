@@ -9,12 +9,14 @@ use std::{
     net::TcpListener,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
+    sync::OnceLock,
     thread,
     time::{Duration, Instant},
 };
 
 use assert_cmd::cargo::cargo_bin;
 use common::{
+    debian,
     files::write_render,
     python::{self, run},
 };
@@ -22,6 +24,8 @@ use demc::testset;
 
 /// Far more than anything here takes.
 const PATIENCE: Duration = Duration::from_secs(180);
+/// Debian's packages of Slurm's two daemons and its commands.
+const PACKAGES: [&str; 3] = ["slurmctld", "slurmd", "slurm-client"];
 
 fn farm(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("blender_scripts/farm").join(name)
@@ -79,9 +83,13 @@ impl Slurm {
             env::split_paths(&env::var_os("PATH").unwrap_or_default())
                 .any(|folder| folder.join(name).is_file())
         };
-        if !["slurmctld", "slurmd", "sbatch"].into_iter().all(there) {
+        let complete = || ["slurmctld", "slurmd", "sbatch"].into_iter().all(there);
+        // The tests run at the same time; one installs, the others wait.
+        static THERE: OnceLock<bool> = OnceLock::new();
+        if !THERE.get_or_init(|| complete() || debian::install(&[&PACKAGES]) && complete()) {
             eprintln!(
-                "Slurm is not installed, so its array is not tried (Debian: apt-get install slurm-wlm)"
+                "Slurm is not installed, so its array is not tried (Debian: apt-get install {})",
+                PACKAGES.join(" ")
             );
             return None;
         }

@@ -1,6 +1,7 @@
 """The installed package against the installed command: same bits, same words."""
 
 import json
+import os
 import pathlib
 import re
 import subprocess
@@ -9,6 +10,7 @@ import sysconfig
 import tempfile
 import threading
 import unittest
+from unittest import mock
 
 import numpy as np
 import OpenImageIO as oiio
@@ -113,11 +115,17 @@ class Package(unittest.TestCase):
             ("float64; give float32", (color.astype(np.float64),)),
             ("is a list", ([1.0],)),
             ("arrays of one render", (color, albedo[:-1], normal)),
-            ("demc needs the pass Normal", (color, albedo, normal, "demc")),
             ("no model 'nosuch'", (color, albedo, normal, "nosuch")),
         ]:
             with self.subTest(words), self.assertRaisesRegex(ValueError, words):
                 demc.denoise(*arguments)
+        # In this order: a model that was found stays loaded.
+        for words, weights in [
+            ("demc: its weights are no part of the program", self.folder),
+            ("demc needs the pass Normal", ROOT / "eval/rivals/weights"),
+        ]:
+            with mock.patch.dict(os.environ, DEMC_WEIGHTS=str(weights)), self.assertRaisesRegex(ValueError, words):
+                demc.denoise(color, albedo, normal, "demc")
         with self.assertRaisesRegex(ValueError, "samples is 0"):
             demc.denoise(color, albedo, normal, samples=0)
         missing = self.folder / "missing.exr"
@@ -167,6 +175,20 @@ class Package(unittest.TestCase):
         done = subprocess.run([sys.executable, "-c", code, ROOM, out], capture_output=True, text=True)
         self.assertEqual(done.stdout.strip(), "stopped", done.stderr)
         self.assertFalse(out.exists())
+
+    def test_manuals_and_completions_are_installed_where_they_are_found(self):
+        share = pathlib.Path(sysconfig.get_path("data")) / "share"
+        self.assertEqual(command("man", "--out", self.folder).returncode, 0)
+        pages = sorted(path.name for path in self.folder.iterdir())
+        self.assertIn("demc-denoise.1", pages)
+        for page in pages:
+            self.assertEqual((share / "man/man1" / page).read_bytes(), (self.folder / page).read_bytes(), page)
+        for shell, place in [
+            ("bash", "bash-completion/completions/demc"),
+            ("zsh", "zsh/site-functions/_demc"),
+            ("fish", "fish/vendor_completions.d/demc.fish"),
+        ]:
+            self.assertEqual((share / place).read_text(), command("completions", shell).stdout, shell)
 
     def test_examples_of_the_documentation_run(self):
         text = (ROOT / "docs/python.md").read_text()

@@ -18,6 +18,8 @@ use std::{
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, stream::MaybeTlsStream};
 
+use super::debian;
+
 const NAMES: [&str; 7] = [
     "chromium",
     "chromium-headless-shell",
@@ -34,7 +36,7 @@ const PLACES: [&str; 3] = [
     r"C:\Program Files\Google\Chrome\Application\chrome.exe",
 ];
 /// Debian packages that hold one, smallest first.
-const PACKAGES: [&str; 2] = ["chromium-headless-shell", "chromium"];
+const PACKAGES: [&[&str]; 2] = [&["chromium-headless-shell"], &["chromium"]];
 const PATIENCE: Duration = Duration::from_secs(120);
 
 /// The program, installed first if need be.
@@ -51,7 +53,7 @@ fn program() -> PathBuf {
         panic!(
             "no browser to open report.html with: install Chromium or Chrome (Debian: apt-get install {}), \
              or name one in DEMC_BROWSER",
-            PACKAGES[0]
+            PACKAGES[0].join(" ")
         )
     })
 }
@@ -64,17 +66,8 @@ fn find() -> Option<PathBuf> {
 }
 
 fn install() -> Option<PathBuf> {
-    let apt = |args: &[&str]| {
-        let mut command = Command::new("apt-get");
-        command.args(["-o", "DPkg::Lock::Timeout=600", "-q", "-y"]).args(args);
-        command.env("DEBIAN_FRONTEND", "noninteractive").stdin(Stdio::null());
-        command.output().is_ok_and(|output| output.status.success())
-    };
     eprintln!("installing a browser for the tests (once; about 90 MB)");
-    // An old list of packages names files that are gone; a failed update may still leave a good one.
-    let _ = apt(&["update"]);
-    PACKAGES.iter().find(|package| apt(&["install", "--no-install-recommends", package]))?;
-    find()
+    debian::install(&PACKAGES).then(find)?
 }
 
 /// What the page said and asked for since it was opened.

@@ -2,6 +2,7 @@
 #![allow(dead_code)]
 
 pub mod browser;
+pub mod debian;
 pub mod files;
 pub mod python;
 pub mod tables;

@@ -33,6 +33,8 @@ const NINTH: u32 = 0x38e3_8e39;
 pub struct Product<'a> {
     pub terms: &'a [Term],
     /// How many groups of rows of each term's weights are not zero: an engine may leave out the others.
+    // Plain loops do not, and other processors have those alone.
+    #[cfg_attr(not(target_arch = "x86_64"), expect(dead_code))]
     pub groups: &'a [u8],
     pub position: usize,
     pub weights: *const Wide,
@@ -110,7 +112,7 @@ impl Engine {
     /// Every engine this processor can run, slowest first.
     pub fn available() -> Vec<Engine> {
         let units = [
-            Some(Unit::Portable(Portable)),
+            Backend::detect().map(Unit::Portable),
             #[cfg(target_arch = "x86_64")]
             Backend::detect().map(Unit::Avx2),
             #[cfg(target_arch = "x86_64")]
