@@ -96,7 +96,9 @@ mod tests {
         assert_eq!((plane.width, plane.height, plane.channels), (12, 9, 1));
         let at = |x: usize, y: usize| plane.data[y * 12 + x];
         assert_eq!((at(0, 0), at(11, 8), at(1, 3)), (0.0, 0.0, 0.0), "outside nothing is expected");
-        assert_eq!((at(2, 1), at(10, 6)), (1.0, 6.0), "corners have their square's");
+        assert_eq!(at(2, 1), 1.0, "a corner has its square's");
+        // The last pixel lies 5/8 of the way to the last column's middle, and 7/8 of the way to the last row's.
+        assert_eq!(at(10, 6), 1.0 + 1.625 + 0.875 * 3.0);
         // Pixels 1 and 2 of a square are an eighth of the way before and beyond its middle.
         assert!((at(2 + 5, 1) - 1.875).abs() < 1e-6 && (at(2 + 2, 1) - 1.125).abs() < 1e-6);
     }
