@@ -420,7 +420,8 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         }
         let at = beauty.0;
         if let Some(error) = error {
-            frame.set_expected_error(at.part, &view_name(layer), error.mean());
+            let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
+            frame.set_expected_error(&result, &view_name(layer), error.mean());
             let name = layer_name(&layer.name, &error_layer(options));
             // One that an earlier result had would not be true of this one.
             if options.confidence || frame.is_own_layer(&name) {

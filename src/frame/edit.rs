@@ -133,9 +133,14 @@ impl Frame {
         Ok(recoded)
     }
 
-    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one),
-    /// whose beauty is in a part.
-    pub fn set_expected_error(&mut self, part: usize, view_layer: &str, error: f64) {
+    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one), beside
+    /// the layer `name` that demc made of it.
+    ///
+    /// # Panics
+    /// If demc made no such layer.
+    pub fn set_expected_error(&mut self, name: &str, view_layer: &str, error: f64) {
+        let is_holder = |part: &usize| self.marked(*part).iter().any(|layer| layer == name);
+        let part = (0..self.parts.len()).find(is_holder).expect("the layer was made before");
         let attributes = &mut self.stored[part].attributes;
         let mut errors = expected_errors(attributes);
         errors.retain(|(name, _)| name != view_layer);
