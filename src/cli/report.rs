@@ -23,7 +23,8 @@ use crate::{Error, Result};
 #[command(after_help = "\
 Examples:
   demc report logs/*.jsonl
-  demc report logs/*.jsonl --of renders --by-error 0.005")]
+  demc report logs/*.jsonl --by-error 0.005
+  demc report logs/*.jsonl --of renders")]
 pub struct Args {
     /// Files of what `demc denoise --json` printed, one or several tasks in each
     #[arg(required = true, value_name = "LOG")]
