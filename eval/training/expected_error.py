@@ -23,15 +23,16 @@ import zlib
 
 import numpy as np
 import torch
-from safetensors.numpy import load_file, save_file
-from torch import nn
+from safetensors.numpy import load_file
 from torch.nn import functional as F
 
-# As in perceptron.rs, expected.rs and mod.rs beside it.
-SQUARE, HIDDEN, LEAK = 4, 24, 0.1
+import perceptron
+from perceptron import KNOWN, SAMPLES, Perceptron, Standard
+
+# As in features.rs, expected.rs and mod.rs beside it.
+SQUARE = 4
 FLOOR, BLACK, TINY, LARGEST_CHANGE, LEAST, MOST = 0.02, 0.001, 1e-8, 100.0, -14.0, 4.0
 WINDOW = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0])
-SAMPLES, KNOWN = 34, 35
 
 # Added to both errors: what is smaller counts as alike.
 SMALL = 2e-6
@@ -78,31 +79,22 @@ def read(folders):
     return frames
 
 
-class Perceptron(nn.Module):
-    """What perceptron.rs computes, of standardised features: the logarithm of the error that is expected."""
-
-    def __init__(self, features):
-        super().__init__()
-        self.first, self.second, self.last = nn.Conv2d(features, HIDDEN, 1), nn.Conv2d(HIDDEN, HIDDEN, 1), nn.Conv2d(HIDDEN, 1, 1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.constant_(self.last.bias, -6)
+class Expecting(Perceptron):
+    """The logarithm of the error that is expected."""
 
     def forward(self, standard):
-        hidden = F.leaky_relu(self.second(F.leaky_relu(self.first(standard), LEAK)), LEAK)
-        return self.last(hidden).clamp(LEAST, MOST)
+        return self.outputs(standard).clamp(LEAST, MOST)
 
 
 def train(frames, steps, seed):
-    """The perceptron, and the mean and deviation of the features."""
+    """The perceptron, and what standardises its features."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     features = torch.stack([frame[0] for frame in frames])
     errors = torch.stack([frame[1] for frame in frames])
     logs = torch.tensor([np.log2(frame[3]) for frame in frames]).float()
-    mean, deviation = features.mean((0, 2, 3)), features.std((0, 2, 3)) + 1e-3
-    for column, (m, d) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
-        mean[column], deviation[column] = m, d
-    model = Perceptron(features.shape[1])
+    standardise = Standard(features)
+    model = Expecting(features.shape[1], [-6.0])
     optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
     # Each number of samples is drawn as often as any other, however many frames it has.
@@ -114,20 +106,16 @@ def train(frames, steps, seed):
         known = (torch.rand(BATCH, generator=generator) < 0.75).float()
         blurred = (logs[at] + 0.4 * torch.randn(BATCH, generator=generator)).clamp_min(0)
         seen[:, SAMPLES], seen[:, KNOWN] = (blurred * known).view(-1, 1, 1), known.view(-1, 1, 1)
-        expected = model((seen - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)).exp()
+        expected = model(standardise(seen)).exp()
         # Over squares of 8x8, by which it is judged; the largest ones count by their logarithm.
         expected, error = (F.avg_pool2d(planes, 2) + SMALL for planes in (expected, errors[at]))
         ratio = error / expected
         ratio = torch.where(ratio > 30, 30 + 30 * torch.log(ratio.clamp_min(1) / 30), ratio).clamp_min(-3)
         loss = (ratio + torch.log(expected)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
+        perceptron.step(loss, model, optimizer, schedule)
         if (step + 1) % 1000 == 0:
             print(f"step {step + 1}: {loss.item():.3f}", flush=True)
-    return model, mean, deviation
+    return model, standardise
 
 
 def ranks(values):
@@ -135,7 +123,7 @@ def ranks(values):
     return np.argsort(np.argsort(values))
 
 
-def report(name, frames, model, mean, deviation):
+def report(name, frames, model, standardise):
     """Prints how what is expected of frames goes with what is true."""
     if not frames:
         return
@@ -144,7 +132,7 @@ def report(name, frames, model, mean, deviation):
         features = features.clone()
         features[SAMPLES], features[KNOWN] = float(np.log2(samples)), 1.0
         with torch.no_grad():
-            expected = model(((features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1))[None])[0].exp()
+            expected = model(standardise(features)[None])[0].exp()
         pairs.append([F.avg_pool2d(planes, 2).flatten().numpy() for planes in (expected, error)])
     expected, error = (np.concatenate(part) for part in zip(*pairs))
     correlate = lambda pair: np.corrcoef(*map(ranks, pair))[0, 1]
@@ -176,12 +164,7 @@ def main():
         for samples in sorted({frame[3] for frame in part}) if name != "trained on" else ():
             report(f"  {samples} spp", [frame for frame in part if frame[3] == samples], *trained)
     if options.out:
-        model, mean, deviation = trained
-        # The standardisation goes into the first layer.
-        flat = {name: value.detach().flatten(1) if value.dim() > 1 else value.detach() for name, value in model.state_dict().items()}
-        flat["first.weight"] = flat["first.weight"] / deviation
-        flat["first.bias"] = flat["first.bias"] - flat["first.weight"] @ mean
-        save_file({name: value.numpy().copy() for name, value in flat.items()}, options.out)
+        perceptron.save(*trained, options.out)
 
 
 if __name__ == "__main__":

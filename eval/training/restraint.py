@@ -21,14 +21,15 @@ import zlib
 
 import numpy as np
 import torch
-from safetensors.numpy import load_file, save_file
-from torch import nn
+from safetensors.numpy import load_file
 from torch.nn import functional as F
 
-# As in perceptron.rs and mod.rs beside it.
-SQUARE, HIDDEN, LEAK = 4, 24, 0.1
+import perceptron
+from perceptron import KNOWN, SAMPLES, Perceptron, Standard
+
+# As in restraint.rs and mod.rs beside it.
+SQUARE = 4
 FLOOR, OWN_FLOOR, OWN_RANGE, SNAP, LARGEST_CHANGE = 0.02, 1e-6, 3.0, 1 / 64, 1.5
-SAMPLES, KNOWN = -2, -1
 
 CROP, BATCH, HELD_OUT = 64, 24, 5
 
@@ -59,19 +60,12 @@ class Frames:
         self.scale = torch.maximum(self.errors.min(0).values - noise_of_truth, 0.1 * self.errors[0]).clamp_min(2e-4)
 
 
-class Perceptron(nn.Module):
-    """What perceptron.rs computes, of standardised features."""
-
-    def __init__(self, features):
-        super().__init__()
-        self.first, self.second, self.last = nn.Conv2d(features, HIDDEN, 1), nn.Conv2d(HIDDEN, HIDDEN, 1), nn.Conv2d(HIDDEN, 2, 1)
-        nn.init.zeros_(self.last.weight)
-        self.last.bias.data = torch.tensor([-2.0, 0.0])
+class Sharing(Perceptron):
+    """How much of the render is kept."""
 
     def forward(self, standard, usual, change):
         """The share of the render in every pixel: `share_of_render` of mod.rs."""
-        hidden = F.leaky_relu(self.second(F.leaky_relu(self.first(standard), LEAK)), LEAK)
-        judged = torch.cat([self.last(hidden), usual], 1)
+        judged = torch.cat([self.outputs(standard), usual], 1)
         logit, slope, usual = F.interpolate(judged, scale_factor=SQUARE, mode="bilinear").split(1, 1)
         own = change.clamp(-1, 1)
         unusual = ((own**2 + OWN_FLOOR).log() - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE
@@ -100,14 +94,11 @@ def known_samples(samples, noise, generator):
 
 
 def train(frames, chosen, steps, seed):
-    """The perceptron, and the mean and deviation of the features."""
+    """The perceptron, and what standardises its features."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    of_chosen = frames.features[chosen]
-    mean, deviation = of_chosen.mean((0, 2, 3)), of_chosen.std((0, 2, 3)) + 1e-3
-    for column, (m, d) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
-        mean[column], deviation[column] = m, d
-    model = Perceptron(frames.features.shape[1])
+    standardise = Standard(frames.features[chosen])
+    model = Sharing(frames.features.shape[1], [-2.0, 0.0])
     optimizer = torch.optim.AdamW(model.parameters(), 3e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, steps)
     weights = weights_of(frames)[chosen]
@@ -119,22 +110,18 @@ def train(frames, chosen, steps, seed):
         features = cut(frames.features, 1).clone()
         log, known = known_samples(frames.samples[at], frames.noise[at], generator)
         features[:, SAMPLES], features[:, KNOWN] = log.view(-1, 1, 1), known.view(-1, 1, 1)
-        standard = (features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)
+        standard = standardise(features)
         change, render, truth = (cut(planes, SQUARE) for planes in (frames.change, frames.render, frames.truth))
         share = model(standard, features[:, :1], change)
         gain = ((share * render - truth) ** 2 - truth**2).mean((1, 2, 3)) / frames.scale[at]
         loss = gain.clamp(-20, 20).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
+        perceptron.step(loss, model, optimizer, schedule)
         if (step + 1) % 500 == 0:
             print(f"step {step + 1}: {loss.item():.3f}", flush=True)
-    return model, mean, deviation
+    return model, standardise
 
 
-def report(frames, chosen, model, mean, deviation):
+def report(frames, chosen, model, standardise):
     """Mean squared errors on frames that were not trained on, less the noise of the reference as far as it is
     known."""
     kinds = sorted({(float(frames.noise[at]), float(frames.samples[at])) for at in chosen})
@@ -147,8 +134,7 @@ def report(frames, chosen, model, mean, deviation):
             features[:, SAMPLES] = known * float(np.log2(samples / max(noise, 1 / 64) ** 2))
             features[:, KNOWN] = known
             with torch.no_grad():
-                standard = (features - mean.view(-1, 1, 1)) / deviation.view(-1, 1, 1)
-                share = model(standard, features[:, :1], frames.change[at])
+                share = model(standardise(features), features[:, :1], frames.change[at])
             changes.append(((share * frames.render[at] - frames.truth[at]) ** 2).mean((1, 2, 3)) - frames.errors[1, at])
         denoised = frames.errors[0, at] - frames.errors[1, at]
         figures = [1e4 * float(v.mean()) for v in (denoised, *changes)]
@@ -169,15 +155,11 @@ def main():
     held_out = torch.tensor([zlib.crc32(scene.encode()) % HELD_OUT == 0 for scene in frames.scenes])
     every = torch.arange(len(frames.scenes))
     chosen = every[~held_out] if options.hold_out else every
-    model, mean, deviation = train(frames, chosen, options.steps, options.seed)
+    model, standardise = train(frames, chosen, options.steps, options.seed)
     if options.hold_out:
-        report(frames, every[held_out].tolist(), model, mean, deviation)
+        report(frames, every[held_out].tolist(), model, standardise)
     if options.out:
-        # The standardisation goes into the first layer.
-        flat = {name: value.detach().flatten(1) if value.dim() > 1 else value.detach() for name, value in model.state_dict().items()}
-        flat["first.weight"] = flat["first.weight"] / deviation
-        flat["first.bias"] = flat["first.bias"] - flat["first.weight"] @ mean
-        save_file({name: value.numpy().copy() for name, value in flat.items()}, options.out)
+        perceptron.save(model, standardise, options.out)
 
 
 if __name__ == "__main__":

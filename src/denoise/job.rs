@@ -15,7 +15,7 @@ use crate::{
     Error, Result,
     companion::Companion,
     frame::{Frame, NewChannel, Recoded, SampleKind},
-    models::{Denoiser, ExpectedError},
+    models::{Denoiser, ExpectedError, check_expects},
     passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
@@ -133,8 +133,9 @@ pub struct Views<T> {
 
 /// Reads a frame and decodes the passes the model needs.
 ///
-/// # Errors The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name
-/// that is not demc's.
+/// # Errors
+/// The file is unusable, lacks a pass that the model needs, or holds a layer of the new one's name that is
+/// not demc's.
 pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
     take_apart(Frame::read(input)?, model, options)
@@ -218,11 +219,8 @@ fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
         let name = model.name();
         return wrong(format!("{name} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l"));
     }
-    if options.confidence && !model.expects_errors() {
-        let name = model.name();
-        return wrong(format!(
-            "{name} does not tell how far off it is; --confidence takes demc-s, demc-m or demc-l"
-        ));
+    if options.confidence {
+        check_expects(model, "--confidence")?;
     }
     let by_frame = options.passes || options.confidence || options.alpha == Alpha::Denoise;
     if options.temporal.is_some() && by_frame {
@@ -266,7 +264,7 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let (radiance, error) = run(&shot, &mut along.companions, model, options, report)?;
+        let (radiance, error) = run_expecting(&shot, &mut along.companions, model, options, report)?;
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
         // What was read is of no more use.
         drop(shot);
@@ -285,7 +283,7 @@ pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Plan
     model.check(&shot.passes)?;
     let mut report = Report::default();
     rayon::scope(|_| {
-        let (radiance, _) = run(shot, &mut [], model, options, &mut report)?;
+        let radiance = run(shot, model, options, &mut report)?;
         finite(radiance, model.name(), &shot.passes.path, &mut report)
     })
 }
@@ -315,20 +313,43 @@ impl<T> Views<T> {
     }
 }
 
-/// Runs the model over a view, and what goes along with it.
+/// Runs the model over a view.
 ///
 /// # Errors
 /// The model cannot denoise it.
 pub(super) fn run(
+    shot: &Shot,
+    model: &dyn Denoiser,
+    options: &Options,
+    report: &mut Report,
+) -> Result<Planes> {
+    let denoise =
+        |shot: &Shot, along: &mut [Companion]| Ok((model.denoise_along(shot, along, options.tile)?, None));
+    Ok(run_by(denoise, shot, &mut [], model, report)?.0)
+}
+
+/// As [`run`], of what goes along with the view too, and how far off the result is expected to be.
+fn run_expecting(
     shot: &Shot,
     companions: &mut [Companion],
     model: &dyn Denoiser,
     options: &Options,
     report: &mut Report,
 ) -> Result<(Planes, Option<ExpectedError>)> {
+    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_expecting(shot, along, options.tile);
+    run_by(denoise, shot, companions, model, report)
+}
+
+/// Runs what a model does, and notes what the user should know.
+fn run_by(
+    denoise: impl FnOnce(&Shot, &mut [Companion]) -> Result<(Planes, Option<ExpectedError>)>,
+    shot: &Shot,
+    companions: &mut [Companion],
+    model: &dyn Denoiser,
+    report: &mut Report,
+) -> Result<(Planes, Option<ExpectedError>)> {
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
-    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_expecting(shot, along, options.tile);
     let (radiance, error) =
         if shot.wraps { wrap::joined(shot, companions, denoise)? } else { denoise(shot, companions)? };
     report.seconds += start.elapsed().as_secs_f64();

@@ -223,11 +223,11 @@ impl Window {
         // Half buffers are the frame's own: a model that holds them against each other reads no average
         // beside them.
         let image = if others.is_empty() || model.reads_halves() {
-            run(&own.shot, &mut [], model, options, report)?.0
+            run(&own.shot, model, options, report)?
         } else {
             let mut average = Shot::new(average(&own.shot.passes, &others));
             average.wraps = own.shot.wraps;
-            run(&average, &mut [], model, options, report)?.0
+            run(&average, model, options, report)?
         };
         self.moment_mut(number, view).expect("it is there").result = Some(image);
         Ok(())

@@ -137,6 +137,20 @@ pub(super) fn refuse_companions(name: &str, companions: &[Companion]) -> Result<
     )))
 }
 
+/// Stops a method that does not tell how far off its results are where an `option` asks for that.
+///
+/// # Errors
+/// It does not.
+pub fn check_expects(model: &dyn Denoiser, option: &str) -> Result<()> {
+    if model.expects_errors() {
+        return Ok(());
+    }
+    let name = model.name();
+    Err(Error::Usage(format!(
+        "{name} does not tell how far off it is; {option} takes demc-s, demc-m or demc-l"
+    )))
+}
+
 /// A denoised frame and what it cost.
 pub struct Run {
     /// Denoised radiance, (3, H, W).

@@ -25,6 +25,11 @@ impl ExpectedError {
         Self { squares, size, whole: size, place: (0, 0) }
     }
 
+    /// Of a frame that is kept as it is.
+    pub(crate) fn none(size: (usize, usize)) -> Self {
+        Self::new(Planes::new(1, size.0.div_ceil(SQUARE), size.1.div_ceil(SQUARE)), size)
+    }
+
     /// As part of a larger frame in which nothing else was denoised.
     pub(crate) fn placed_in(self, whole: (usize, usize), place: (usize, usize)) -> Self {
         Self { whole, place, ..self }

@@ -14,8 +14,7 @@ use crate::{
     companion::{Companion, Kind},
     error::remedy,
     features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
-    filters::shrinkage::{Render, is_kept_whole, shrink, shrink_expecting, take_back},
-    filters::squares::SQUARE,
+    filters::shrinkage::{Render, Shrinkage, take_back},
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -246,19 +245,19 @@ impl Learned {
         let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
         let size = (passes.width, passes.height);
         // A clear sky, a black frame: all would be taken back that a network made of it.
-        if is_kept_whole(&render) {
-            let squares = Planes::new(1, size.0.div_ceil(SQUARE), size.1.div_ceil(SQUARE));
+        let shrinkage = Shrinkage::of(&render);
+        if shrinkage.keeps_whole() {
             let mut image = radiance.clone();
             image.data.iter_mut().for_each(|v| *v = v.max(0.0));
-            return Ok((image, expects.then(|| ExpectedError::new(squares, size))));
+            return Ok((image, expects.then(|| ExpectedError::none(size))));
         }
         let mut image = self.looks(passes, companions, tile)?;
         let mut shares = (!companions.is_empty()).then(|| Planes::unwritten(1, size.0, size.1));
         let error = if expects {
-            let squares = shrink_expecting(&mut image, &render, shares.as_mut());
+            let squares = shrinkage.shrink_expecting(&mut image, shares.as_mut());
             Some(ExpectedError::new(squares, size))
         } else {
-            shrink(&mut image, &render, shares.as_mut());
+            shrinkage.shrink(&mut image, shares.as_mut());
             None
         };
         for (companion, shares) in companions.iter_mut().zip(shares.iter().cycle()) {
@@ -267,7 +266,7 @@ impl Learned {
         Ok((image, error))
     }
 
-    /// What the network makes of a frame, all of it: see [`shrink`].
+    /// What the network makes of a frame, all of it: see [`Shrinkage`].
     ///
     /// # Errors
     /// A pass is missing.

@@ -15,7 +15,7 @@ pub mod weights_file;
 
 use std::path::Path;
 
-pub use denoiser::{Denoiser, Run};
+pub use denoiser::{Denoiser, Run, check_expects};
 pub use expected_error::ExpectedError;
 
 use network::{Architecture, Config, Design, Network};

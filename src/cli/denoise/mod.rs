@@ -187,11 +187,8 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let is_one = matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
     let sources = args.guides.sources(&args.names, is_one)?;
     let model = models::open(&args.model)?;
-    if args.report.is_some() && !model.expects_errors() {
-        let model = model.name();
-        return Err(Error::Usage(format!(
-            "{model} does not tell how far off it is; --report takes demc-s, demc-m or demc-l"
-        )));
+    if args.report.is_some() {
+        models::check_expects(&*model, "--report")?;
     }
     let mut ranking = args.report.map(Ranking::new);
     prepare_folder(&args.out)?;
@@ -304,7 +301,8 @@ impl Work {
 
 /// A watch over the inputs, for files that are there and others that come.
 ///
-/// # Errors Of what is there already, two results would have one path, or one that of its input; or a glob is
+/// # Errors
+/// Of what is there already, two results would have one path, or one that of its input; or a glob is
 /// malformed.
 fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
     let (inputs, frames, out) = (args.inputs.clone(), args.frames.clone(), args.out.clone());

@@ -88,42 +88,63 @@ pub struct Render<'a> {
     pub firefly: f32,
 }
 
-/// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more
-/// than noise. The share of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
+/// A frame that is about to be shrunk, and where its light is seen directly.
+pub struct Shrinkage<'a> {
+    render: &'a Render<'a>,
+    seen: Seen<'a>,
+}
+
+impl<'a> Shrinkage<'a> {
+    /// Of a frame.
+    pub fn of(render: &'a Render<'a>) -> Self {
+        Self { render, seen: Seen::of(render) }
+    }
+
+    /// Whether the frame is nothing but light that the camera sees directly, or black: all of it is kept,
+    /// whatever was denoised.
+    pub fn keeps_whole(&self) -> bool {
+        self.render.radiance.data.iter().all(|v| *v <= 0.0) || self.seen.is_all()
+    }
+
+    /// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more
+    /// than noise. The share of the render in each pixel goes into `shares`, (1, H, W), for [`take_back`].
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn shrink(&self, image: &mut Planes, shares: Option<&mut Planes>) {
+        drop(self.shrink_by_sums(image, shares));
+    }
+
+    /// As [`Shrinkage::shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the
+    /// result, relative to the squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn shrink_expecting(&self, image: &mut Planes, shares: Option<&mut Planes>) -> Planes {
+        let sums = self.shrink_by_sums(image, shares);
+        expected::errors(image, self.render, &sums)
+    }
+
+    /// Shrinks; returns the sums that it was done by.
+    fn shrink_by_sums(&self, image: &mut Planes, shares: Option<&mut Planes>) -> Vec<f32> {
+        let Self { render, seen } = self;
+        check(image, render);
+        if image.pixels() == 0 {
+            return Vec::new();
+        }
+        let sums = sums::gather(image, render, seen);
+        let judged = restraint::judge(&sums, image.width.div_ceil(SQUARE), render);
+        mix(image, render, seen, &judged, shares);
+        sums
+    }
+}
+
+/// [`Shrinkage::shrink`] of a frame of which nothing else is asked.
 ///
 /// # Panics
 /// If sizes differ.
 pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) {
-    drop(shrink_by_sums(image, render, shares));
-}
-
-/// Whether a frame is nothing but light that the camera sees directly, or black: [`shrink`] keeps all of it,
-/// whatever was denoised.
-pub fn is_kept_whole(render: &Render) -> bool {
-    render.radiance.data.iter().all(|v| *v <= 0.0) || Seen::of(render).is_all()
-}
-
-/// As [`shrink`]; returns the squared error to be expected in every 4x4 square of pixels of the result,
-/// relative to the squared light there (what RelMSE is the mean of), (1, H / 4, W / 4) rounded up.
-///
-/// # Panics
-/// If sizes differ.
-pub fn shrink_expecting(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) -> Planes {
-    let sums = shrink_by_sums(image, render, shares);
-    expected::errors(image, render, &sums)
-}
-
-/// Shrinks; returns the sums that it was done by.
-fn shrink_by_sums(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) -> Vec<f32> {
-    check(image, render);
-    if image.pixels() == 0 {
-        return Vec::new();
-    }
-    let seen = Seen::of(render);
-    let sums = sums::gather(image, render, &seen);
-    let judged = restraint::judge(&sums, image.width.div_ceil(SQUARE), render);
-    mix(image, render, &seen, &judged, shares);
-    sums
+    Shrinkage::of(render).shrink(image, shares);
 }
 
 /// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of
