@@ -1,14 +1,18 @@
 from os import PathLike
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar, type_check_only
 
 import numpy as np
 from numpy.typing import NDArray
+
+__all__ = ["Error", "__version__", "compare", "denoise", "denoise_file", "inspect"]
 
 __version__: str
 _Float = TypeVar("_Float", np.float32, np.float16)
 
 class Error(RuntimeError): ...
 
+# What `denoise_file` returns; the module itself has no such name.
+@type_check_only
 class Report(TypedDict):
     view_layer: str
     width: int

@@ -176,6 +176,20 @@ class Package(unittest.TestCase):
         self.assertEqual(done.stdout.strip(), "stopped", done.stderr)
         self.assertFalse(out.exists())
 
+    def test_manuals_and_completions_are_installed_where_they_are_found(self):
+        share = pathlib.Path(sysconfig.get_path("data")) / "share"
+        self.assertEqual(command("man", "--out", self.folder).returncode, 0)
+        pages = sorted(path.name for path in self.folder.iterdir())
+        self.assertIn("demc-denoise.1", pages)
+        for page in pages:
+            self.assertEqual((share / "man/man1" / page).read_bytes(), (self.folder / page).read_bytes(), page)
+        for shell, place in [
+            ("bash", "bash-completion/completions/demc"),
+            ("zsh", "zsh/site-functions/_demc"),
+            ("fish", "fish/vendor_completions.d/demc.fish"),
+        ]:
+            self.assertEqual((share / place).read_text(), command("completions", shell).stdout, shell)
+
     def test_examples_of_the_documentation_run(self):
         text = (ROOT / "docs/python.md").read_text()
         examples = re.findall(r"```python\n(.*?)```", text, re.S)
