@@ -1,9 +1,13 @@
 //! Comparison sheets small enough to travel inside the page: JPEG in a `data:` address.
 
-use std::path::Path;
+use std::{fs::File, io::BufReader, path::Path};
 
 use base64::{Engine, engine::general_purpose::STANDARD};
-use image::{DynamicImage, ImageReader, codecs::jpeg::JpegEncoder, imageops::FilterType};
+use image::{
+    DynamicImage,
+    codecs::{jpeg::JpegEncoder, png::PngDecoder},
+    imageops::FilterType,
+};
 
 use crate::{Error, Result};
 
@@ -71,14 +75,14 @@ pub fn small(path: &Path) -> Result<Picture> {
     Ok(Picture { address: address(&jpeg), size: (small.width(), small.height()) })
 }
 
-/// A picture from disk.
+/// A PNG from disk.
 ///
 /// # Errors
 /// The file is unreadable.
 pub fn open(path: &Path) -> Result<DynamicImage> {
-    ImageReader::open(path)
-        .map_err(Error::io("read", path))?
-        .decode()
+    let file = BufReader::new(File::open(path).map_err(Error::io("read", path))?);
+    PngDecoder::new(file)
+        .and_then(DynamicImage::from_decoder)
         .map_err(|e| Error::invalid(path, format!("{e}; remove it and run again")))
 }
 
