@@ -11,7 +11,8 @@ a real frame. The same seed and options give the same scene and the same pixels.
 
 Writes s<seed>_<kind>_<spp>spp.exr with s<seed>_<kind>_ref.exr (all half float, one part; references
 keep their guides, which are what a prefilter aims at), where several crops of a scene add _c0, _c1 ... to
-the name. manifest.csv (scene,noisy,reference,spp) lists the further noisy seeds (..._n1.exr, as scene ..._n1)
+the name. With --sequence N it writes N frames, s<seed>_<kind>_<spp>spp.0001.exr and on, in which camera and
+things move, with vectors, and the reference of the middle one alone. manifest.csv (scene,noisy,reference,spp) lists the further noisy seeds (..._n1.exr, as scene ..._n1)
 and their means (..._mean.exr) too; views.csv lists every file with its seeds, processor seconds and SHA-256.
 Finished scenes are skipped; scenes with nothing to see go to rejected.csv and are not tried again.
 """
@@ -35,7 +36,7 @@ from demc_blender import exr, names, rendering
 from demc_blender.edits import Edits
 from demc_blender.ledger import Ledger
 from demc_blender.position import store_position, write_position
-from demc_scenes import making
+from demc_scenes import making, moving
 from demc_scenes.assets import Library
 from demc_scenes.blends import find_blends
 from demc_scenes.kinds import KINDS
@@ -104,6 +105,14 @@ def parse(arguments):
         metavar="F",
         help="share of crops with a pixel filter that is not Blender's default, half of them a box",
     )
+    parser.add_argument(
+        "--sequence",
+        type=cl.positive,
+        default=1,
+        metavar="N",
+        help="N frames of each crop, an odd number, in which camera and things move, with motion vectors; the "
+        "middle one has a reference and stands in the manifest",
+    )
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
     parser.add_argument("--ref-noise", type=float, default=0.01, metavar="T",
                         help="references stop early below this noise threshold, 0 for never (default 0.01)")
@@ -149,6 +158,10 @@ def parse(arguments):
         )
     if options.clean_share and not options.clean_spp > _LEAST_CLEAN:
         parser.error(f"--clean-spp must be above {_LEAST_CLEAN}, which every pixel gets")
+    if options.sequence % 2 == 0:
+        parser.error("--sequence must be odd: the middle frame is the one with a reference")
+    if options.sequence > 1 and (options.noisy_seeds > 1 or options.also_spp or options.guides_only):
+        parser.error("--sequence does not go with --noisy-seeds, --also-spp and --guides-only")
     for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
         for folder in folders:
             if not os.path.isdir(folder):
@@ -194,7 +207,11 @@ class Crop:
     """What is rendered of a crop, drawn from its name alone: sample counts, reference, pixel filter."""
 
     def __init__(self, options, scene_name, name, seed):
-        self.name, self.seed, self.reference = name, seed, names.reference_name(name)
+        self.name, self.seed = name, seed
+        is_still = options.sequence == 1
+        self.frames = [None] if is_still else list(range(1, options.sequence + 1))
+        self.middle = None if is_still else moving.middle(options.sequence)
+        self.reference = names.reference_name(name, self.middle)
         self.clean = random.Random(f"clean {scene_name}").random() < options.clean_share
         self.counts = self._counts(options)
         rng = random.Random(f"adaptive {name}")
@@ -231,14 +248,15 @@ class Crop:
         return counts, []
 
     def noisy(self):
-        """(file, samples, noise seed) of every noisy render."""
+        """(file, samples, noise seed, frame) of every noisy render; stills have no frame."""
         counts, also = self.counts
-        for spp in counts:
-            for n in range(self.seeds):
-                plain = names.noisy_name(self.name, spp)
-                yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n
-        for spp in also + [rendering.DEFAULT_SAMPLES] * self.adaptive:
-            yield names.noisy_name(self.name, spp), spp, 0
+        for frame in self.frames:
+            for spp in counts:
+                for n in range(self.seeds):
+                    plain = names.noisy_name(self.name, spp, frame)
+                    yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n, frame
+            for spp in also + [rendering.DEFAULT_SAMPLES] * self.adaptive:
+                yield names.noisy_name(self.name, spp, frame), spp, 0, frame
 
     def mean_of(self, spp):
         """The name of the mean of the noisy renders of one sample count."""
@@ -246,7 +264,7 @@ class Crop:
 
     def pairs(self):
         """(scene, file, samples) for the manifest."""
-        for file, spp, n in self.noisy():
+        for file, spp, n in (row[:3] for row in self.noisy() if row[3] == self.middle):
             yield self.name if n == 0 else f"{self.name}_n{n}", file, spp
         for spp in self.counts[0] if self.means else []:
             yield f"{self.name}_mean", self.mean_of(spp), spp * self.seeds
@@ -324,22 +342,26 @@ def render_crop(options, ledger, scene, region, crop, facts):
         )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
-            rendering.enable_passes(passes, layers)
+            rendering.enable_passes(passes, layers, vector=crop.middle is not None)
             store_position(passes, layers)
-            for file, spp, n in crop.noisy():
+            for file, spp, n, frame in crop.noisy():
                 noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0
-                rendering.set_sampling(
-                    passes, scene, spp, rendering.mixed_seed(crop.seed, crop.name, spp, n), noise
-                )
+                words = (crop.seed, crop.name, spp, n)
+                if frame is not None:
+                    scene.frame_set(frame)
+                    words += (frame,)
+                rendering.set_sampling(passes, scene, spp, rendering.mixed_seed(*words), noise)
                 seconds = render_compact(scene, os.path.join(options.out, file))
                 ledger.add(file=file, spp=spp, noise_seed=n, seconds=f"{seconds:.1f}", **facts)
         for spp in crop.counts[0] if crop.means else []:
             write_mean(
-                options.out, crop.mean_of(spp), [file for file, count, _ in crop.noisy() if count == spp]
+                options.out, crop.mean_of(spp), [file for file, count, *_ in crop.noisy() if count == spp]
             )
             ledger.add(
                 file=crop.mean_of(spp), spp=spp * crop.seeds, noise_seed="mean", seconds="0.0", **facts
             )
+        if crop.middle is not None:
+            scene.frame_set(crop.middle)
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             rendering.store_guides(passes, layers)
@@ -397,7 +419,9 @@ def render_scene(options, library, records, ledger, seed, kind, scene_name):
     with Edits() as edits:
         making.set_up(edits, stage, options.threads, finished)
         try:
-            regions = making.look(edits, stage, place_camera, options.crops, options.size, finished)
+            regions = making.look(
+                edits, stage, place_camera, options.crops, options.size, finished, options.sequence
+            )
         except making.Unseen as reason:
             records.reject(scene_name, str(reason))
             return f"rejected, {reason}"

@@ -10,6 +10,7 @@ use std::{
 
 use common::python::{self, run};
 use demc::{
+    filters::motion::{Direction, Flow},
     frame::Frame,
     passes::{self, Pass, PassSet},
     testset,
@@ -262,6 +263,43 @@ fn generates_the_same_pixels_for_the_same_seed() {
     fs::write(&stop, "").unwrap();
     let said = generate(&first, &format!("--seeds 9 --stop-file {}", stop.display()));
     assert!(said.starts_with("stopped"), "{said}");
+}
+
+#[test]
+fn renders_sequences_whose_vectors_lead_to_the_frames_around() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    generate(&out, "--seeds 30:33 --kinds materials --sequence 3 --size 64 --spp 16 --ref-spp 16");
+    let pairs = testset::read(out.join("manifest.csv").to_str().unwrap()).unwrap().pairs;
+    assert_eq!(pairs.len(), 3, "the middle frame of each has a reference");
+    let (mut along, mut in_place) = (0.0, 0.0);
+    for pair in pairs {
+        assert_eq!(pair.frame.as_deref(), Some("0002"));
+        let frames = [1, 2, 3].map(|frame| {
+            passes::load(out.join(format!("{}_0016spp.{frame:04}.exr", pair.scene)), None).unwrap()
+        });
+        let albedos = frames.each_ref().map(|set| set.get(Pass::DenoisingAlbedo).unwrap());
+        let vectors = frames[1].get(Pass::Vector).unwrap();
+        for (neighbour, direction) in [(0, Direction::Back), (2, Direction::Forth)] {
+            let mut flow = Flow::still(64, 64);
+            flow.step(vectors, direction);
+            let there = flow.bilinear(albedos[neighbour]);
+            let own = &albedos[1].data;
+            for ((own, there), unmoved) in own.iter().zip(&there.data).zip(&albedos[neighbour].data) {
+                if !there.is_nan() {
+                    along += (own - there).abs();
+                    in_place += (own - unmoved).abs();
+                }
+            }
+        }
+    }
+    assert!(along < 0.7 * in_place, "albedos differ by {along} along vectors, {in_place} in place");
+    // Two frames have no middle one.
+    let mut command = blender();
+    let arguments = ["--out", "x", "--seeds", "1", "--sequence", "2"];
+    let output = command.arg(script("generate_scenes.py")).args(arguments).output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && said.contains("--sequence must be odd"), "{said}");
 }
 
 #[test]

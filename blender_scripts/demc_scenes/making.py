@@ -6,7 +6,7 @@ import bpy
 
 from demc_blender import rendering
 
-from . import views
+from . import moving, views
 from .blends import open_blend
 from .kinds import KINDS
 from .stage import Stage
@@ -54,9 +54,10 @@ def set_up(edits, stage, threads=None, finished=False, size=None):
     scene.frame_set(1)
 
 
-def look(edits, stage, place_camera, crops, size, finished=False):
+def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
     """Places the camera where it sees enough and exposes the scene; returns the crops, X,Y,W,H each, or
-    raises Unseen where three tries find none. Without a size the whole frame is the crop."""
+    raises Unseen where three tries find none. Without a size the whole frame is the crop. Of several frames
+    it is the middle one that is looked at, and the current one afterwards."""
     reason = "no place for a camera"
     for _ in range(3):
         camera = place_camera()
@@ -78,6 +79,9 @@ def look(edits, stage, place_camera, crops, size, finished=False):
         if len(regions) == crops:
             if not finished:
                 views.expose(stage.rng, stage.scene, guides[0])
+            if frames > 1:
+                stage.scene.frame_set(moving.middle(frames))
+                moving.animate(stage, camera, frames)
             return regions
         reason = "featureless"
     raise Unseen(reason)
