@@ -1,5 +1,5 @@
-//! What a user waits for, and what it takes: a sequence of frames from disk to disk beside its pure
-//! denoising time, and the memory of an 8K frame with all its passes.
+//! What a user waits for, and the memory that it takes: a sequence of frames from disk to disk compared with
+//! the time of denoising alone, and an 8K frame with all its passes.
 //!
 //! ```text
 //! cargo bench --bench batch                      both
@@ -8,10 +8,10 @@
 //! cargo bench --bench batch -- --only temporal   12 frames of 1920x1080 with their neighbours, and without
 //! cargo bench --bench batch -- --only temporal --size 7680x4320 --frames 3
 //! ```
-//! `--frames N`, `--size WxH`, `--model NAME`, and `--source FILE`: the render whose passes are
-//! repeated, each time at another brightness, until the frame is full (by default the example of this
-//! repository), so that noise and compression are those of a render. `--noise 1` multiplies every value by a
-//! random number, so that nothing compresses.
+//! `--frames N`, `--size WxH` and `--model NAME` change what is measured. `--source FILE` is the render whose
+//! passes are repeated, each time at another brightness, until the frame is full, so that noise and
+//! compression are those of a render. By default it is the example of this repository. `--noise 1` multiplies
+//! every value by a random number, so that nothing compresses.
 
 use std::{
     fs,
@@ -34,7 +34,7 @@ use rayon::prelude::*;
 /// What the command line says.
 struct Arguments {
     only: Option<String>,
-    /// 0 where it does not say.
+    /// 0 where the command line does not say.
     frames: usize,
     size: Option<(usize, usize)>,
     noise: f32,
@@ -43,8 +43,8 @@ struct Arguments {
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
-    // up first.
+    // As in `demc`, this thread becomes one of rayon's. From any other thread, each of a network's steps
+    // would have to wake rayon's threads up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut arguments = Arguments {
         only: None,
@@ -78,15 +78,16 @@ fn main() {
     if wants("memory") {
         memory(&arguments);
     }
-    // Not unless it is asked for: it takes minutes.
+    // This runs only if it is asked for, since it takes minutes.
     if arguments.only.as_deref() == Some("temporal") {
         temporal(&arguments);
     }
 }
 
-/// A render of any size: `source` repeated. Every copy is scaled, so that no two compress as one, and every
-/// value by up to a share `noise` of it: pixels that do not compress are the worst for memory. `moved` is by
-/// how many columns all of it has moved to the right, [`STEP`] a frame: a pass Vector then says so.
+/// Writes a render of any size, which is `source` repeated. Every copy is scaled, so that no two compress as
+/// one. Every value is also reduced by a random share of at most `noise`, because pixels that do not compress
+/// are the worst for memory. `moved` is by how many columns the whole picture has moved to the right,
+/// [`STEP`] a frame; a Vector pass then says so.
 fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, moved: Option<usize>, to: &Path) {
     let mut image = read_all_flat_layers_from_file(source).expect("the source is a flat EXR");
     for layer in &mut image.layer_data {
@@ -127,7 +128,8 @@ fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, moved: Op
             quantize_linearly: false,
             sampling: Vec2(1, 1),
         };
-        // It was so much further left a frame before, and will be as much further right.
+        // The picture was so many columns further left a frame before, and will be as many further right a
+        // frame later.
         let step = -(STEP as f32);
         let channels = [("W", 0.0), ("X", step), ("Y", 0.0), ("Z", step)].map(|(c, v)| channel(c, v));
         vector.channel_data.list = channels.into_iter().collect();
@@ -140,7 +142,8 @@ fn enlarge(source: &Path, (width, height): (usize, usize), noise: f32, moved: Op
 /// Columns by which everything moves from frame to frame of a sequence.
 const STEP: usize = 4;
 
-/// Runs `demc denoise` on a folder; seconds, and the process's peak memory in MiB where it can be told.
+/// Runs `demc denoise` on a folder. Returns the seconds that it took, and the process's peak memory in MiB
+/// where the system tells it.
 fn denoise(folder: &Path, out: &Path, model: &str, more: &[&str]) -> (f64, Option<f64>) {
     let start = Instant::now();
     let mut child = Command::new(env!("CARGO_BIN_EXE_demc"))
@@ -174,7 +177,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// Seconds on the clock and of processor time, all threads together.
+/// Seconds on the clock, and seconds of processor time of all threads together.
 #[derive(Clone, Copy)]
 struct Cost {
     wall: f64,
@@ -286,7 +289,8 @@ fn memory(arguments: &Arguments) {
     }
 }
 
-/// A sequence with two neighbours on each side beside the same frames one by one, in turns.
+/// Denoises the frames of a sequence one by one, then with two neighbours on each side, in turns, and
+/// compares the two.
 fn temporal(arguments: &Arguments) {
     let size = arguments.size.unwrap_or((1920, 1080));
     let frames = if arguments.frames == 0 { 12 } else { arguments.frames };

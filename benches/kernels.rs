@@ -1,6 +1,6 @@
-//! GFLOP/s of the kernels beside the FMA peak of this machine: `cargo bench --bench kernels`.
-//! One FLOP is one item, so divan's "item/s" column is FLOP/s; by Winograd, of the FLOPs of the convolution
-//! tap by tap. `DEMC_TIER=avx2` benches that tier.
+//! GFLOP/s of the kernels beside the FMA peak of this machine: `cargo bench --bench kernels`. One FLOP is one
+//! item, so divan's "item/s" column is FLOP/s. For convolutions by Winograd, the FLOPs of the same
+//! convolution tap by tap are counted. `DEMC_TIER=avx2` benches that tier.
 
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
@@ -17,7 +17,8 @@ use demc::kernels::{
 use divan::{Bencher, counter::ItemsCount};
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each kernel has to wake those up first.
+    // As in `demc`, this thread becomes one of rayon's. From any other thread, each kernel would have to wake
+    // rayon's threads up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     divan::main();
 }
@@ -43,7 +44,8 @@ fn blocks(len: usize) -> Vec<Block> {
     (0..len).map(|i| Block([(i % 7) as f32 * 0.1; LANES])).collect()
 }
 
-/// Of a convolution that reads `h` x `w` pixels: a strided one makes a quarter as many, with every tap.
+/// FLOPs of a convolution that reads `h` x `w` pixels. A strided one makes a quarter as many pixels, each
+/// with every tap.
 fn flops((n, i, o, h, w): Layer, geometry: Geometry) -> ItemsCount {
     let pixels = if geometry == Geometry::Strided { h * w / 4 } else { h * w };
     ItemsCount::new(2 * n * i * o * pixels * geometry.taps())
@@ -70,7 +72,7 @@ fn forward(bencher: Bencher, layer: Layer, geometry: Geometry) {
     convolution(bencher, layer, geometry, Epilogue { relu: true, accumulate: false });
 }
 
-/// As `forward`, between activations that stay in a narrow format.
+/// As `forward`, but between activations that stay in a narrow format.
 fn forward_narrow(bencher: Bencher, layer: Layer, geometry: Geometry, format: Format) {
     let (n, i, o, h, w) = layer;
     let engine = Engine::detect();
@@ -122,7 +124,7 @@ fn conv3x3(bencher: Bencher, layer: Layer) {
     forward(bencher, layer, Geometry::Same(3));
 }
 
-/// As training computes it, whose weights are new in every step.
+/// As in training, weights are transformed in every run, because there they are new in every step.
 #[divan::bench(args = LAYERS.into_iter().filter(|layer| winograd::serves(layer.4)))]
 fn conv3x3_winograd(bencher: Bencher, layer: Layer) {
     let (n, i, o, h, w) = layer;
@@ -210,7 +212,7 @@ fn fma_peak(bencher: Bencher) {
     const STEPS: usize = 1_000_000;
     let threads = rayon::current_num_threads();
     bencher.counter(ItemsCount::new(threads * peak::flops(STEPS))).bench_local(|| {
-        // Unless its result is used and its length unknown, the compiler drops it.
+        // The compiler would drop a loop whose result is not used or whose length it knows.
         rayon::broadcast(|_| divan::black_box(peak::run(Tier::detect(), divan::black_box(STEPS))))
     });
 }

@@ -38,7 +38,7 @@ const SIZES: [(usize, usize); 6] =
     [(256, 256), (512, 512), (1280, 720), (1920, 1080), (3840, 2160), (7680, 4320)];
 /// The models that are timed: those that read what [`frame`] makes.
 const LADDER: [&str; 3] = ["demc-s", "demc-m", "demc-l"];
-/// The size that others are compared with.
+/// The size with which the cost at other sizes is compared.
 const USUAL: (usize, usize) = (1280, 720);
 
 /// Something to time.
@@ -46,7 +46,7 @@ struct Job {
     name: String,
     /// Floating-point operations of one run, where they are counted.
     flops: Option<f64>,
-    /// Made on first use: a worker may be asked for one of them only.
+    /// Makes what is timed. It is called on first use, as a worker may be asked for one job only.
     make: Box<dyn Fn() -> Box<dyn FnMut()>>,
 }
 
@@ -58,8 +58,8 @@ struct Arguments {
 }
 
 fn main() {
-    // As `demc` does: from a thread that is not one of rayon's, each of a network's steps has to wake those
-    // up first.
+    // As in `demc`, this thread becomes one of rayon's. From any other thread, each of a network's steps
+    // would have to wake rayon's threads up first.
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("nothing ran before");
     let mut args = std::env::args().skip(1).filter(|a| a != "--bench");
     let mut arguments = Arguments { rounds: 5, small: false, words: Vec::new() };
@@ -213,7 +213,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     f64::midpoint(values[(values.len() - 1) / 2], values[values.len() / 2])
 }
 
-/// All jobs in turns: one turn to warm up, then `rounds`.
+/// Times all jobs in turns: one turn to warm up, then `rounds` turns.
 fn compare(arguments: &Arguments) {
     let mut jobs = jobs(arguments.small);
     let wanted = |name: &str| arguments.words.is_empty() || arguments.words.iter().any(|w| name.contains(w));
@@ -241,7 +241,7 @@ fn compare(arguments: &Arguments) {
     }
 }
 
-/// Says which jobs there are; then a line with a job's name is answered by the seconds of one run.
+/// Prints which jobs there are. Then each line with a job's name is answered by the seconds of one run of it.
 fn serve(jobs: &[Job]) {
     let names: Vec<&str> = jobs.iter().map(|job| job.name.as_str()).collect();
     let mut out = std::io::stdout();
@@ -261,7 +261,7 @@ fn serve(jobs: &[Job]) {
     }
 }
 
-/// Sizes in turns, each warm: what a pixel costs in a small and in a huge frame.
+/// Times every size in turns, each after a run to warm up: what a pixel costs in a small and in a huge frame.
 fn cost_by_size(csv: &PathBuf, arguments: &Arguments) {
     let sizes: Vec<(usize, usize)> = if arguments.small { vec![(96, 64), (160, 96)] } else { SIZES.into() };
     let usual = if arguments.small { sizes[1] } else { USUAL };

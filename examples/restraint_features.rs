@@ -4,11 +4,12 @@
 //! cargo run --release --example restraint_features -- demc-m PAIRS.csv OUT
 //! ```
 //!
-//! For each pair, and for the pair with a part of its noise (where the reference has guides, cleaned by
-//! `eval/training/clean_references.py`), a safetensors file of 32-bit floats: `features` (36, H/4, W/4),
-//! `render`, `denoised`, `result` (what is kept of it with the shipped weights), `truth` and `clean` (the
-//! reference as rendered, and as it was denoised, if it was; 3, H, W), `shares` (1, H, W; of the render in
-//! the result), and `facts`: exposure, samples, and the share of the noise.
+//! Each pair gives a safetensors file of 32-bit floats. Where its reference has an albedo, cleaned by
+//! `eval/training/clean_references.py`, so does the pair with only a part of its noise. A file holds
+//! `features`, (36, H/4, W/4); `render`, `denoised`, `result` (`denoised` after shrinkage with the shipped
+//! weights), `truth` and `clean` (the reference as rendered, and as it was denoised, if it was), (3, H, W)
+//! each; `shares` of the render in the result, (1, H, W); and `facts`: exposure, samples, and the share of
+//! the noise.
 
 use std::path::Path;
 
@@ -25,8 +26,9 @@ use demc::{
 };
 use safetensors::{Dtype, tensor::TensorView};
 
-/// Shares of the noise that a frame is seen with: without any, a result must go back to its input. And how
-/// far what is denoised is blurred besides, in pixels to each side: there are worse denoisers.
+/// In which states each frame is seen: the share of its noise that is left, and by how many pixels to each
+/// side the denoised image is blurred. Without noise, a result must go back to its input. The blur stands for
+/// worse denoisers.
 const SEEN: [(f32, usize); 8] =
     [(1.0, 0), (0.6, 0), (0.3, 0), (0.1, 0), (0.0, 0), (0.3, 2), (0.1, 4), (0.0, 2)];
 
@@ -57,9 +59,9 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// The frame with a share of its noise, and what is true of it: of all of its noise the reference as
-/// rendered, which need not be clean but must be unbiased, and of less the cleaned one, which the rest of the
-/// noise was taken from.
+/// The frame with a share of its noise, and the truth for it. With all of its noise, the truth is the
+/// reference as rendered, which need not be clean but must be unbiased. With less, it is the cleaned
+/// reference, against which the noise is measured.
 fn with_noise(noisy: &PassSet, reference: &PassSet, share: f32) -> Option<(PassSet, Planes)> {
     let clean = reference.get(Pass::Combined)?;
     if share == 1.0 {

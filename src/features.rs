@@ -114,7 +114,7 @@ fn z_score(channel: &mut [f32]) {
 /// The passes of the built-in models' inputs: what Blender's "Denoising Data" switch stores.
 pub const GUIDE_PASSES: [Pass; 3] = [Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo];
 
-/// Those of them that a prefilter denoises.
+/// The guides among them that a prefilter denoises.
 pub const PREFILTERED_PASSES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 
 /// Added to albedo before radiance is divided by it: below this, texture is left in the radiance.
@@ -172,7 +172,7 @@ impl Refined {
 }
 
 /// What a built-in network reads of a frame, as [`light_inputs`] makes it, each of the frame's size. `T` is
-/// an image, or those of several frames.
+/// an image, or the images of several frames.
 #[derive(Clone, Debug)]
 pub struct LightInputs<T = Planes> {
     /// Exposed radiance over the divisor, (3, H, W): what the network filters.
@@ -194,7 +194,7 @@ pub struct LightInputs<T = Planes> {
 }
 
 impl<T> LightInputs<T> {
-    /// In the order in which [`Inputs`] and batches hold them.
+    /// The inputs in the order in which [`Inputs`] and batches hold them.
     pub fn into_list(self) -> [T; 7] {
         let Self { light, divisor, encoded, guide, ratio, shading, normal } = self;
         [light, divisor, encoded, guide, ratio, shading, normal]
@@ -325,11 +325,12 @@ fn divisor(albedo: f32) -> f32 {
 }
 
 /// Normals are scaled by this among a prefilter's targets. With a relative loss, an error of a normal then
-/// counts about as much as the same error of an albedo of a few tenths, and less where the component is long.
+/// counts about as much as the same error of an albedo of a few tenths, and less where the component is
+/// large.
 const NORMAL_SCALE: f32 = 0.1;
 
-/// What a prefilter reads of a frame, as [`guide_inputs`] makes it, each (3, H, W). `T` is an image, or those
-/// of several frames.
+/// What a prefilter reads of a frame, as [`guide_inputs`] makes it, each (3, H, W). `T` is an image, or the
+/// images of several frames.
 #[derive(Clone, Debug)]
 pub struct GuideInputs<T = Planes> {
     /// The exposed divisor that the noisy albedo gives.
@@ -343,7 +344,7 @@ pub struct GuideInputs<T = Planes> {
 }
 
 impl<T> GuideInputs<T> {
-    /// In the order in which [`Inputs`] and batches hold them.
+    /// The inputs in the order in which [`Inputs`] and batches hold them.
     pub fn into_list(self) -> [T; 4] {
         let Self { albedo, normal, encoded, guide } = self;
         [albedo, normal, encoded, guide]
@@ -355,7 +356,7 @@ impl<T> GuideInputs<T> {
     }
 }
 
-/// A prefilter's inputs. What it makes of them is to be multiplied by the inverse of the exposure.
+/// A prefilter's inputs. Its output is to be multiplied by the inverse of the exposure.
 ///
 /// # Errors
 /// A pass is missing.
@@ -424,7 +425,7 @@ pub fn albedo_exposure(albedo: &Planes) -> f32 {
     log_average_exposure(albedo, divisor)
 }
 
-/// The [`exposure`] of `of(value)` taken as radiance.
+/// The [`exposure`] of planes whose values are `of(value)`.
 fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 {
     let (w, h) = (planes.width, planes.height);
     // For each row of squares: the sum of the logarithms, and how many there are.

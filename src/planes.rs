@@ -39,7 +39,7 @@ impl Planes {
         Self { channels, width, height, data: plane_buffer(channels * width * height) }
     }
 
-    /// What `fill(channel, row's number, row)` writes, all of it, into each row; rows are filled on all
+    /// Planes each of whose rows `fill(channel, row's number, row)` writes as a whole. Rows are filled on all
     /// threads.
     pub fn from_rows(
         channels: usize,
@@ -57,7 +57,7 @@ impl Planes {
         self.width * self.height
     }
 
-    /// The first channel in place of every one of `channels`: that many times.
+    /// Planes of as many `channels`, each a copy of the first channel of these planes.
     pub fn of_first(&self, channels: usize) -> Self {
         Self::from_rows(channels, (self.width, self.height), |_, y, row| {
             row.copy_from_slice(&self.channel(0)[y * self.width..][..self.width]);
@@ -75,11 +75,11 @@ impl Planes {
         &mut self.data[c * n..][..n]
     }
 
-    /// Writes a rectangle of other planes, `size` columns and rows from column and row `from` on, to column
-    /// and row `to` on.
+    /// Copies a rectangle of (width, height) pixels from the planes `other`, where its first column and row
+    /// are `from`, into these planes, where they are `to`.
     ///
     /// # Panics
-    /// If channels differ, or the rectangle leaves either.
+    /// If the numbers of channels differ, or the rectangle does not lie inside both.
     pub fn write(
         &mut self,
         to: (usize, usize),
@@ -100,7 +100,7 @@ impl Planes {
         }
     }
 
-    /// Some columns.
+    /// These planes, cut to some of their columns.
     ///
     /// # Panics
     /// If there are no such columns.
@@ -122,10 +122,10 @@ impl Planes {
         })
     }
 
-    /// Planes of (width, height) that are zero but for these, which begin at column `x` and row `y`.
+    /// Planes of (width, height) that hold these planes from column `x` and row `y` on, and zeros elsewhere.
     ///
     /// # Panics
-    /// If they reach beyond.
+    /// If these planes reach beyond (width, height).
     pub fn placed_in(&self, (width, height): (usize, usize), (x, y): (usize, usize)) -> Self {
         let mut whole = Self::new(self.channels, width, height);
         whole.write((x, y), self, (0, 0), (self.width, self.height));
@@ -141,12 +141,12 @@ impl Planes {
         })
     }
 
-    /// Grows the planes, to the right and below, by their mirror image, the last column and row the axes:
-    /// repeated, those would draw their noise out to streaks, which a network takes for something that is
-    /// there.
+    /// Grows the planes to (width, height), to the right and below, by their mirror image about the last
+    /// column and row. If these were repeated instead, they would draw their noise out to streaks, which a
+    /// network takes for something that is there.
     ///
     /// # Panics
-    /// If they are empty, or larger.
+    /// If the planes are empty, or larger than (width, height).
     pub fn padded_to(self, (width, height): (usize, usize)) -> Self {
         if (width, height) == (self.width, self.height) {
             return self;
@@ -154,10 +154,10 @@ impl Planes {
         self.padded_rows(0..self.height, (width, height))
     }
 
-    /// Some rows, grown as [`Planes::padded_to`] does.
+    /// Some rows of the planes, grown to (width, height) as [`Planes::padded_to`] does.
     ///
     /// # Panics
-    /// If they are empty, larger, or not there.
+    /// If the rows are empty, larger than (width, height), or beyond the planes.
     pub fn padded_rows(&self, rows: Range<usize>, (width, height): (usize, usize)) -> Self {
         assert!(self.width <= width && rows.len() <= height, "padding only adds");
         Self::from_rows(self.channels, (width, height), |c, y, out| {
@@ -167,7 +167,7 @@ impl Planes {
         })
     }
 
-    /// The planes with those of the same width and number `below` them.
+    /// These planes with the planes `below`, of the same width and number of channels, attached under them.
     ///
     /// # Panics
     /// If widths or channels differ.
@@ -185,13 +185,13 @@ impl Planes {
     }
 }
 
-/// Fills a row, whose first `width` values are there, with their mirror image.
+/// Fills the rest of a row, whose first `width` values are given, with their mirror image.
 pub fn mirror_beyond(row: &mut [f32], width: usize) {
     let (inside, beyond) = row.split_at_mut(width);
     beyond.iter_mut().zip(width..).for_each(|(out, x)| *out = inside[mirrored(x, width)]);
 }
 
-/// The one of `n` that lies where `i` does, to and fro between the first and the last.
+/// The index, of `n`, that index `i` falls on where indices run to and fro between the first and the last.
 pub fn mirrored(i: usize, n: usize) -> usize {
     let period = (2 * n).saturating_sub(2).max(1);
     (i % period).min(period - i % period)

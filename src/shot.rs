@@ -1,8 +1,8 @@
-//! What a denoiser is given: the passes of a frame, made fit, and what was rendered besides it.
+//! What a denoiser is given: the repaired passes of a frame, and what was rendered besides it.
 //!
-//! In: an EXR file, or passes that are in memory already. Out: a [`Shot`]. Here alone the render takes the
-//! place of what Blender made of it, values that are not finite are repaired, and files that belong to a
-//! frame are looked for: methods see what they are given and read no files.
+//! In: an EXR file, or passes that are in memory already. Out: a [`Shot`]. Only here does the render replace
+//! a Combined that Blender had denoised, are values that are not finite repaired, and are files that belong
+//! to a frame looked for. Methods see what they are given and read no files.
 
 use std::{
     collections::BTreeMap,
@@ -20,15 +20,17 @@ use crate::{
 /// A frame of one view layer, ready for any method.
 #[derive(Clone, Debug)]
 pub struct Shot {
-    /// Its passes: Combined is the render, and every value finite.
+    /// Its passes. Combined is the render before any denoising by Blender, and every value is finite.
     pub passes: PassSet,
-    /// Two renders of it with seeds of their own, half the samples each, see [`Shot::read_halves`].
+    /// Two renders of the same frame with different seeds and half the samples each. See
+    /// [`Shot::read_halves`].
     pub halves: Option<[PassSet; 2]>,
-    /// Frames of its sequence, by how many frames later they are; those before it have negative numbers.
+    /// Other frames of its sequence. The key is how many frames later they are, and negative for earlier
+    /// ones.
     pub neighbours: BTreeMap<i32, PassSet>,
     /// Light groups, which add up to Combined, by name; see [`Shot::read_light_groups`].
     pub light_groups: BTreeMap<String, Planes>,
-    /// Whether its left and right edges meet.
+    /// Whether its left and right edges meet, as in an all-round panorama.
     pub wraps: bool,
     /// Whether Blender had denoised Combined, and the render was taken from the pass `Noisy Image`.
     pub was_denoised: bool,
@@ -36,7 +38,7 @@ pub struct Shot {
     pub normals: Option<String>,
     /// How many values of each pass were not finite and are repaired; passes that were clean are not listed.
     pub repaired: BTreeMap<Pass, usize>,
-    /// The render with values that are not finite, where it had any.
+    /// The render as it was stored, if some of its values were not finite.
     unrepaired: Option<Planes>,
 }
 
@@ -49,15 +51,15 @@ pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot>
     passes::load(path, view_layer).map(Shot::new)
 }
 
-/// As [`prepare`], those of the wanted passes that one view layer, in one stereo view, of a frame has, and
-/// those that lie elsewhere.
+/// As [`prepare`], but reads only the `wanted` passes of one view layer in one stereo view. Passes that lie
+/// elsewhere are taken from where `sources` says.
 ///
 /// # Errors
 /// Pixels cannot be decoded, or a pass is not where it is said to be.
 pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass], sources: &Sources) -> Result<Shot> {
     let mut set = passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat())?;
     let normals = sources.complete(frame, layer, wanted, &mut set)?;
-    // Nobody asks what was stored before it was repaired.
+    // Nobody asks such a shot for the render before it was repaired, so that is dropped.
     Ok(Shot { normals, unrepaired: None, ..Shot::new(set) })
 }
 
@@ -71,7 +73,7 @@ pub fn half_paths(noisy: &Path) -> Option<[PathBuf; 2]> {
 }
 
 impl Shot {
-    /// Passes made fit, and nothing besides them.
+    /// A shot of these passes, which are repaired, and of nothing else.
     pub fn new(mut passes: PassSet) -> Self {
         let was_denoised = passes.use_noisy_image();
         let is_broken = |render: &&Planes| render.data.iter().any(|v| !v.is_finite());
@@ -81,7 +83,7 @@ impl Shot {
         Self { passes, halves, neighbours, light_groups, wraps, was_denoised, normals, repaired, unrepaired }
     }
 
-    /// The render as it was stored, with values that are not finite where it had any.
+    /// The render as it was stored, in which values that are not finite are not repaired.
     pub fn as_stored(&self) -> Option<&Planes> {
         self.unrepaired.as_ref().or_else(|| self.passes.get(Pass::Combined))
     }
@@ -103,7 +105,7 @@ impl Shot {
     /// Reads the half buffers that lie beside the frame's file, if there are any.
     ///
     /// # Errors
-    /// They are unusable, or not of this frame.
+    /// A half buffer is unusable, of a stereo frame, or not of this frame's size.
     pub fn read_halves(&mut self) -> Result<()> {
         let Some(paths) = half_paths(&self.passes.path) else { return Ok(()) };
         let [a, b] = paths.each_ref().map(|path| self.read_half(path));
@@ -174,7 +176,7 @@ mod tests {
         let halves = shot.halves.as_ref().expect("both are there");
         let values = halves.each_ref().map(|half| half.get(Pass::Combined).unwrap().data[0]);
         assert_eq!(values, [1.0, 0.0]);
-        // Those of another frame are an error, not a result.
+        // Half buffers of another frame's size are an error.
         let other = room().with_file_name("no_harm/principled_0064spp.exr");
         std::fs::copy(other, path("shot_0004spp_b.0017.exr")).unwrap();
         let message = shot.read_halves().unwrap_err().to_string();

@@ -28,12 +28,12 @@ pub const KPCN_PASSES: [Pass; 7] = [
     GUIDES[2],
 ];
 
-/// Light that no surface reflects. It has no Monte Carlo noise but for the pixel filter's, so it is added
+/// Light that no surface reflects. Its only Monte Carlo noise is that of the pixel filter, so it is added
 /// back unfiltered.
 pub const KPCN_UNFILTERED: [Pass; 2] = [Pass::Emission, Pass::Environment];
 
-/// Channels that a stream's network reads: colour, normal and albedo with one variance and six
-/// differences each, depth with one and two.
+/// Channels that a stream's network reads: colour, normal and albedo of three channels, each with one
+/// variance and six differences, and depth of one channel, with one variance and two differences.
 pub const KPCN_CHANNELS: usize = 34;
 
 /// Added to albedo before diffuse light is divided by it, and before it is multiplied back.

@@ -1,11 +1,11 @@
 //! Classical building blocks of image denoising: pure functions on [`Planes`](crate::planes::Planes).
 //!
-//! [`nl_means`] holds the patch weights and the filter that averages by them, [`regression`] the
-//! weighted first-order fits over whole windows, [`refit`] those to what is denoised already, gathered in
-//! [`squares`], [`solve`] their small symmetric systems, [`variance`] what is known about the noise, and
-//! [`shrinkage`] takes back what was changed beyond that. Work is cut into tiles of the frame, one a thread;
-//! inner loops run over consecutive pixels so that the compiler can vectorise them. Results do not depend on
-//! the number of threads.
+//! [`nl_means`] holds the patch weights and the filter that averages by them. [`regression`] holds weighted
+//! first-order fits over whole windows, and [`refit`] fits that correct a denoised frame, whose sums are
+//! gathered in [`squares`]; [`solve`] solves the small symmetric systems of both. [`variance`] estimates the
+//! noise, and [`shrinkage`] takes back what was changed beyond the noise. Work is cut into tiles of the
+//! frame, one a thread; inner loops run over consecutive pixels so that the compiler can vectorise them.
+//! Results do not depend on the number of threads.
 //!
 //! For sequences, [`motion`] follows what moves from frame to frame, [`agreement`] tells where two frames
 //! show the same, and [`temporal`] averages them there.

@@ -1,10 +1,10 @@
 //! Where the content of a frame lies in other frames of its sequence, and planes sampled there.
 //!
 //! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with
-//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at
-//! (x - Z, y + W) one frame later. Steps chain: each goes on with the vectors of the frame that the one
-//! before it ended in. Vectors are those of the surface that the camera sees first; what mirrors and glass
-//! show, and shadows, move otherwise.
+//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y
+//! + W) one frame later. Steps can be chained: each uses the vectors of the frame in which the step before it
+//! ended. Vectors are those of the surface that the camera sees first; what mirrors and glass show, and
+//! shadows, move otherwise.
 
 use rayon::prelude::*;
 
@@ -24,7 +24,7 @@ pub enum Direction {
 pub struct Flow {
     width: usize,
     height: usize,
-    /// Columns, then rows, as many as pixels each: 0 is the centre of the first.
+    /// The column for every pixel, then the row for every pixel. 0 is the centre of the first column or row.
     at: PlaneBuffer,
 }
 
@@ -40,7 +40,7 @@ impl Flow {
         Self { width, height, at: at.data }
     }
 
-    /// Goes on by one frame, from that in which the flow ends, whose `vectors`, (4, H, W), are given.
+    /// Extends the flow by one frame. `vectors`, (4, H, W), are those of the frame in which it ended so far.
     ///
     /// # Panics
     /// If the vectors are of another size.
@@ -79,8 +79,8 @@ impl Flow {
         (&columns[y * self.width..][..self.width], &rows[y * self.width..][..self.width])
     }
 
-    /// Planes of the other frame, between pixels bilinearly, at the place of each pixel of this one; NaN
-    /// where that is outside.
+    /// Planes of the other frame, sampled bilinearly at the place of each pixel of this one. Places outside
+    /// of that frame give NaN.
     ///
     /// # Panics
     /// If the planes are of another size.
@@ -105,7 +105,8 @@ pub fn nearest((x, y): (f32, f32), (width, height): (usize, usize)) -> Option<us
     })
 }
 
-/// The value of a plane at a place between its pixels, beyond which the outermost go on; NaN at NaN.
+/// The value of a plane at a place between its pixels. Beyond the outermost pixels their values are repeated.
+/// A place of NaN gives NaN.
 pub fn bilinear(plane: &[f32], (width, height): (usize, usize), (x, y): (f32, f32)) -> f32 {
     if x.is_nan() || y.is_nan() {
         return f32::NAN;
@@ -127,8 +128,8 @@ fn between(v: f32, n: usize) -> (usize, usize, f32) {
     (first, (first + 1).min(n - 1), v - first as f32)
 }
 
-/// As [`bilinear`], of three planes and as sharp as they are: by the cubic spline of Catmull and Rom, kept
-/// between the least and the greatest of the four pixels around so that edges don't ring.
+/// As [`bilinear`], but of three planes and without blurring them. Values follow the cubic spline of Catmull
+/// and Rom, kept between the least and the greatest of the four pixels around so that edges don't ring.
 pub fn sharp(planes: &Planes, (x, y): (f32, f32)) -> [f32; 3] {
     let (width, height) = (planes.width, planes.height);
     let (columns, across) = spline(x, width);

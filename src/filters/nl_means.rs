@@ -263,7 +263,7 @@ mod tests {
         assert!(exp_of_negative(-1e30) < 1e-29);
     }
 
-    /// The formula of the module's header, read aloud.
+    /// The formula of the module's header, computed word for word.
     fn slow_weight(
         guide: &Planes,
         variance: &Planes,

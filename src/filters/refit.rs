@@ -108,7 +108,7 @@ pub struct Guides<'a> {
     pub normal: &'a [f32],
     /// The divisor of radiance that the denoised albedo gives, for R rows from `first` on, (3, R, W).
     pub albedo: &'a [f32],
-    /// The frame's row that is the first of them.
+    /// The row of the frame at which these rows begin.
     pub first: usize,
 }
 
@@ -117,7 +117,8 @@ pub struct Guides<'a> {
 pub enum Samples<'a> {
     /// Exposed and divided by the albedo, for the rows of the guides, (3, R, W).
     Divided(&'a [f32]),
-    /// As rendered, (3, H, W) or wider; the column of it that is the first; and the exposure to apply.
+    /// As rendered, (3, H, W) or wider; the column of it at which the guides begin; and the exposure to
+    /// apply.
     Rendered(&'a Planes, usize, f32),
 }
 
@@ -353,7 +354,7 @@ impl Pixels {
         }
     }
 
-    /// Reads samples over denoised light, the other targets. `read` comes first.
+    /// Reads samples over denoised light, the other targets. `read` has to come before.
     #[inline(always)]
     fn read_samples(&mut self, guides: Guides, samples: Samples, y: usize) {
         let len = SQUARE * self.squares;
@@ -772,7 +773,7 @@ mod tests {
             let of = |planes: &[f32]| Planes::from_vec(3, SIZE.0, SIZE.1, planes.to_vec());
             let [denoised, normal, albedo] = [&frame.image, &frame.normal, &frame.albedo].map(|p| of(p));
             for rows in (0..SIZE.1).step_by(step).map(|y| (y + step).min(SIZE.1)) {
-                // Only rows that are under way are there.
+                // Only rows that are not finished are held.
                 let first = refit.done();
                 let held = |planes: &Planes| planes.window((0, first), (SIZE.0, rows - first));
                 let [mut held, normal, albedo] = [&denoised, &normal, &albedo].map(held);

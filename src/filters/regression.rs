@@ -20,9 +20,9 @@ use crate::{
 
 /// A constant and two screen coordinates come before the features.
 const BEFORE_FEATURES: usize = 3;
-/// Ridge on slopes, as a part of their own square ...
+/// Ridge on slopes, as a share of the sum of their own feature's squares.
 const RIDGE: f32 = 1e-4;
-/// ... and as the variance below which a feature of range 1 counts as flat.
+/// Further ridge on slopes: the variance below which a feature of range 1 counts as flat.
 const FLAT: f32 = 1e-5;
 /// Weights below it do not count.
 const NO_WEIGHT: f32 = 1e-6;
@@ -126,8 +126,8 @@ impl Input<'_> {
         out
     }
 
-    /// Sums over the windows around the tile's pixels: prediction by weight for each colour channel,
-    /// weight and, where asked for, influence by weight; over the tile and the window around it.
+    /// Sums of what the fits of the tile's pixels predict, for the tile and the window around it: prediction
+    /// times weight for each colour channel, the weight and, where asked for, influence times weight.
     #[inline(always)]
     fn fit_tile(&self, tile: (usize, usize), work: &mut Work) -> Vec<f32> {
         const TILE: usize = TILE_W * TILE_H;
@@ -191,7 +191,8 @@ impl Input<'_> {
                 }
                 add(channels, &[1.0; LANES]);
                 if self.influence {
-                    // The prediction at q is b^T A^-1 (... + w b colour_q): follows q by w |L^-1 b|^2.
+                    // The prediction at q is b^T A^-1 (... + w b colour_q): it follows the colour at q by w
+                    // |L^-1 b|^2.
                     matrix.forward(&mut basis);
                     let mut value = [0.0; LANES];
                     for b in &basis {

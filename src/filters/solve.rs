@@ -1,5 +1,5 @@
-//! Small symmetric positive systems, [`LANES`] of them at once, one a lane: Cholesky factorisation with
-//! a ridge that keeps every one solvable.
+//! Solves small symmetric positive systems, [`LANES`] of them at once, one in each lane, by Cholesky
+//! factorisation with a ridge that keeps every system solvable.
 
 /// Systems solved together.
 pub const LANES: usize = 16;
@@ -7,8 +7,8 @@ pub const LANES: usize = 16;
 /// One value of each of the systems.
 pub type Lanes = [f32; LANES];
 
-/// `sum + a * b` in each lane. Whole values go in and out, so that compilers see one vector, where loops
-/// over memory became gathers.
+/// `sum + a * b` in each lane. Arrays are passed and returned by value, so that compilers see one vector;
+/// loops over memory became gathers.
 #[inline(always)]
 pub fn plus_product(mut sum: Lanes, a: Lanes, b: Lanes) -> Lanes {
     for l in 0..LANES {
@@ -44,8 +44,8 @@ pub fn difference(mut a: Lanes, b: Lanes) -> Lanes {
     a
 }
 
-/// Smallest pivot as a part of the diagonal it came from: below it the unknown is what others say
-/// already, up to rounding.
+/// Smallest pivot as a share of the diagonal value it came from. Below it, the unknown already follows from
+/// the others, up to rounding.
 const MIN_PIVOT: f32 = 1e-5;
 
 /// Where (row, column) of a lower triangle is stored.

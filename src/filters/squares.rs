@@ -6,15 +6,16 @@ use crate::kernels::vectorised::{self, Vectorised};
 /// Rows and columns of a square.
 pub const SQUARE: usize = 4;
 
-/// The square before a pixel, counted from middle to middle, and how far on towards the next it is.
+/// The square whose centre comes before a pixel, and how far (0..1) the pixel lies from there towards the
+/// centre of the next.
 pub fn between(at: usize, squares: usize) -> (usize, f32) {
     let place = ((at as f32 + 0.5) / SQUARE as f32 - 0.5).clamp(0.0, (squares - 1) as f32);
     (place as usize, place.fract())
 }
 
-/// Writes to `output` every value of lines of `squares` values, weighted with those around it: `rows` are
-/// those above, at and below it, each with its weight, and `window` holds an odd number of weights for what
-/// is to the left and right. Beyond the frame there is nothing.
+/// Writes to `output`, for every value of lines of `squares` values, the weighted sum of the values around
+/// it. `rows` are those above, at and below it, each with its weight, and `window` holds an odd number of
+/// weights for the values to the left and right. Values beyond the frame count as zero.
 pub fn around<'a>(
     rows: impl Iterator<Item = (f32, &'a [f32])>,
     squares: usize,

@@ -1,4 +1,5 @@
-//! How noisy a pixel is: from two independent renders, or from its surroundings where there is one.
+//! How noisy a pixel is: from two independent renders, or from its surroundings where there is only one
+//! render.
 
 use rayon::prelude::*;
 
@@ -28,7 +29,7 @@ pub fn residual(image: &Planes, features: &Planes, radius: usize) -> Planes {
     for c in 0..image.channels {
         let (values, influence) = (image.channel(c), influence.channel(0));
         for ((fit, v), own) in squares.channel_mut(c).iter_mut().zip(values).zip(influence) {
-            // A residual is smaller than the noise by what the fit follows it.
+            // A residual is smaller than the noise, because the fit follows a part of the noise.
             *fit = (*fit - v) * (*fit - v) / (1.0 - own).max(MIN_FREEDOM);
         }
     }
@@ -39,7 +40,7 @@ pub fn residual(image: &Planes, features: &Planes, radius: usize) -> Planes {
 const MIN_FREEDOM: f32 = 0.25;
 
 /// The variance of one image without knowledge of its content: the squared second difference along the
-/// smoothest of four directions, over 3x3 pixels. Edges are not noise to it; texture is, in part.
+/// smoothest of four directions, over 3x3 pixels. Edges do not count as noise; texture does in part.
 pub fn directional(image: &Planes) -> Planes {
     /// Independent noise of variance v has second differences `a - 2 b + c` of variance 6 v.
     const SECOND_DIFFERENCE: f32 = 6.0;

@@ -1,11 +1,11 @@
 //! Blending the levels of a filtered pyramid, planar f32, one image at a time.
 //!
-//! `(1 - alpha) * fine + alpha * up(coarse)` with `alpha` the logistic of what the network predicts for each
-//! pixel: where the level below, already filtered, says all there is, nothing of the fine level's noise is
-//! left to filter. (Vogels et al. 2018, Section 4.3, keep the fine level's detail, and its noise with it.)
-//! `up` weighs the four nearest coarse pixels: bilinearly, times the exponential of what the network predicts
-//! for each, so that light does not leak over an edge (Balint et al. 2023 predict the whole upsampling
-//! kernel).
+//! `(1 - alpha) * fine + alpha * up(coarse)`, where `alpha` is the logistic of what the network predicts for
+//! each pixel. Where the coarse level, which is already filtered, says all there is, it replaces the fine
+//! level and its noise. (Vogels et al. 2018, Section 4.3, keep the fine level's detail, and its noise with
+//! it.) `up` is a weighted mean of the four nearest coarse pixels. Each weight is the bilinear one times the
+//! exponential of what the network predicts for it, so that light does not leak over an edge (Balint et al.
+//! 2023 predict the whole upsampling kernel).
 
 use rayon::prelude::*;
 
@@ -19,10 +19,12 @@ use super::{
 /// Coarse pixels around a fine one.
 pub const CORNERS: usize = 4;
 
-/// Their bilinear weights: nearest, beside it in the row, beside it in the column, across.
+/// Bilinear weights of these corners: the nearest, its neighbour in the row, its neighbour in the column, and
+/// the one across.
 const BILINEAR: [f32; CORNERS] = [0.5625, 0.1875, 0.1875, 0.0625];
 
-/// The coarse row (or column) of `n` that fine one `i` lies in, and the next nearest, the edge repeated.
+/// The coarse row (or column), of `n`, that the fine one `i` lies in, and the next nearest. The edge is
+/// repeated.
 #[inline(always)]
 fn near(i: usize, n: usize) -> (usize, usize) {
     let own = i / 2;
@@ -45,7 +47,7 @@ fn weights(logits: &[f32], pixels: usize, at: usize) -> [f32; CORNERS] {
     raw.map(|w| w * inverse)
 }
 
-/// What the network predicts for a blend. Logits beyond +-40 count as that, and have no gradient.
+/// What the network predicts for a blend. Logits beyond +-40 count as +-40 and have no gradient.
 #[derive(Clone, Copy)]
 pub struct Masks<'a> {
     /// The share of the coarse level before its logistic, (1, H, W).
@@ -57,15 +59,17 @@ pub struct Masks<'a> {
 /// Which rows of a taller frame are blended.
 #[derive(Clone, Copy, Debug)]
 pub struct Place {
-    /// The frame's row that the fine level's first is.
+    /// The row of the frame at which the fine level begins.
     pub first: usize,
     /// Rows of the frame.
     pub total: usize,
-    /// The coarse frame's row that the coarse level's first is; every coarse row next to a fine one is there.
+    /// The row of the coarse frame at which the coarse level begins. It must hold every coarse row next to a
+    /// fine one.
     pub coarse: usize,
 }
 
-/// Blends a fine level (3, H, W) with a coarse one (3, h, W/2), where h is H/2 if that is all of the frame.
+/// Blends a fine level (3, H, W) with a coarse one (3, h, W/2), where h is H/2 if the levels are the whole
+/// frame.
 ///
 /// # Panics
 /// If lengths do not fit.
@@ -101,7 +105,8 @@ impl Kernel for BlendRow<'_> {
         let h = coarse.len() / (3 * narrow).max(1);
         let (own, other) = near(place.first + y, place.total / 2);
         let of = |values: &'_ [f32], plane: usize| values[plane * n + y * w..][..w].as_ptr();
-        // The coarse lines of each colour, the edge repeated; and what a group of pixels may read beyond.
+        // The coarse lines of each colour with the edge repeated, and room for what a group of pixels may
+        // read beyond.
         let stride = narrow + 2 + LANES;
         let mut lines = vec![0.0; 6 * stride];
         for (i, line) in lines.chunks_exact_mut(stride).enumerate() {
@@ -148,7 +153,7 @@ impl Kernel for BlendRow<'_> {
     }
 }
 
-/// Where the gradients of a blend go, each added to.
+/// Where the gradients of a blend are added.
 pub struct BlendGradient<'a> {
     /// To the fine level, (3, H, W).
     pub fine: &'a mut [f32],
@@ -160,7 +165,7 @@ pub struct BlendGradient<'a> {
     pub corners: &'a mut [f32],
 }
 
-/// Adds what [`blend`]'s output gradient sends back.
+/// Backpropagates the gradient of [`blend`]'s output and adds the results to what `into` holds.
 ///
 /// # Panics
 /// As [`blend`].
@@ -178,7 +183,7 @@ pub fn blend_gradient(
             let at = y * size.w + x;
             let share = logistic(masks.alpha[at]);
             let (corners, weights) = (corners(size, y, x), weights(masks.corners, n, at));
-            // What a unit of each corner's weight, and of the coarse level's share, would change.
+            // Derivatives by each corner's weight, and by the coarse level's share.
             let (mut by_weight, mut by_share) = ([0.0; CORNERS], 0.0);
             for c in 0..3 {
                 let g = output_gradient[c * n + at];

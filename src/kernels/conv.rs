@@ -1,9 +1,9 @@
 //! Dense convolutions and their input gradients, all of them one register-tiled loop.
 //!
-//! Whatever the operation, an output pixel is a sum over taps: input pixel at a fixed offset times a
-//! 16x16 slab of weights. A k x k convolution has k*k taps; a transposed 4x4 convolution of stride 2
-//! is four interleaved output phases of 2x2 taps; its input gradient reads every second pixel through
-//! 16 taps; a 1x1 fusion of several sources is a one-tap convolution whose input planes come from
+//! Whatever the operation, an output pixel is a sum over taps, each of which is the input pixel at a fixed
+//! offset times a 16x16 slab of weights. A k x k convolution has k*k taps; a transposed 4x4 convolution of
+//! stride 2 is four interleaved output phases of 2x2 taps; its input gradient reads every second pixel
+//! through 16 taps; a 1x1 fusion of several sources is a one-tap convolution whose input planes come from
 //! several activations, so that nothing is ever concatenated.
 //!
 //! Packed weights are `[output plane][input plane][tap][16 input lanes]` blocks of 16 output lanes.
@@ -36,7 +36,7 @@ pub enum Geometry {
 }
 
 impl Geometry {
-    /// [`Geometry::Same`] of a kernel that there are convolutions for.
+    /// [`Geometry::Same`] for a kernel size that is supported.
     ///
     /// # Panics
     /// If `k` is not 1, 3 or 5.
@@ -45,7 +45,8 @@ impl Geometry {
         Self::Same(k)
     }
 
-    /// Taps, which is also how many 16x16 slabs a pair of planes has.
+    /// Number of taps, which is also how many 16x16 slabs of weights a pair of an input and an output plane
+    /// has.
     pub fn taps(self) -> usize {
         match self {
             Geometry::Same(k) => k * k,
@@ -130,8 +131,8 @@ pub enum Direction {
     Backward,
 }
 
-/// Where the weight of (output, input, tap) lies in an unpacked tensor: convolutions are
-/// `(O, I, k, k)`, transposed ones `(I, O, 4, 4)`, as everywhere.
+/// Where the weight of (output, input, tap) lies in an unpacked tensor: convolutions are `(O, I, k, k)`,
+/// transposed ones `(I, O, 4, 4)`, as is usual.
 pub fn weight_index(
     geometry: Geometry,
     outputs: usize,
@@ -316,7 +317,7 @@ impl Band<'_> {
         self.geometry.taps_of(phase).into_iter().map(offset).collect()
     }
 
-    /// Every row of the band for one output phase; `STEP` input pixels an output pixel.
+    /// Computes every row of the band for one output phase, with `STEP` input pixels for each output pixel.
     #[inline(always)]
     unsafe fn rows<S: Simd, const STEP: usize>(
         &self,
@@ -331,7 +332,8 @@ impl Band<'_> {
             for source in self.sources {
                 let s = source.shape;
                 for plane in 0..s.planes() {
-                    // Of the whole activation, not of one block of it: taps walk from here over rows.
+                    // The pointer is derived from the whole activation, not from one block of it, because
+                    // taps read other rows from here.
                     let pixel = source.data.as_ptr().wrapping_add(s.row(self.n, plane, y * STEP));
                     inputs.push(Plane { pixel, lanes: s.lanes(plane) });
                 }
@@ -380,7 +382,8 @@ impl Band<'_> {
                 macro_rules! tile {
                     ($($px:literal)*) => {
                         match pixels {
-                            // Widths beyond the tier's tile are constant-folded away.
+                            // Arms for widths beyond the tier's tile are never compiled, as the condition is
+                            // a constant.
                             $($px if $px <= S::TILE.1 => args.run::<S, STEP, $px>(simd),)*
                             _ => unreachable!("tiles are at most TILE.1 pixels wide"),
                         }

@@ -1,10 +1,11 @@
-//! The cross-bilateral filter with parameters of each pixel's own, and its gradient by them: planar f32,
-//! one image at a time.
+//! The cross-bilateral filter whose parameters differ from pixel to pixel, and its gradient with respect to
+//! them: planar f32, one image at a time.
 //!
-//! A pixel i becomes `sum_j w_ij c_j / sum_j w_ij` over the square around it that lies inside the image,
-//! with `w_ij = exp(-sum_m a_m(i) D_m(i, j))`. The distances D are, in this order: that of the pixels
-//! (squared, in units of the radius), that of the colours (squared, over the noise of both), and the
-//! squared distance of each group of features. The a are the pixel's precisions.
+//! A pixel i becomes `sum_j w_ij c_j / sum_j w_ij` over the square around it that lies inside the image, with
+//! `w_ij = exp(-sum_m a_m(i) D_m(i, j))`. The distances D are, in this order: the squared distance between
+//! the pixels in units of the radius, the squared distance between their colours divided by the noise of
+//! both, and the squared distance of each group of features. The factors `a_m(i)` are the precisions of pixel
+//! i.
 
 use rayon::prelude::*;
 
@@ -17,7 +18,7 @@ use super::{
 /// Added to the noise of two colours before their distance is divided by it.
 const NOISE_FLOOR: f32 = 1e-4;
 
-/// No exponent goes below its negative: such a neighbour has no weight that counts.
+/// No exponent goes below minus this: the weight of such a neighbour does not count.
 const MAX_EXPONENT: f32 = 38.0;
 
 /// One image to be filtered.
@@ -39,14 +40,15 @@ pub struct CrossBilateral<'a> {
     pub precision: &'a [f32],
 }
 
-/// Distances of a row to a shifted one: one line of `w` values a precision.
+/// Distances of a row to a shifted one, one line of `w` values for each precision, and the weights that they
+/// give.
 struct Lines {
     distance: Vec<f32>,
     weight: Vec<f32>,
 }
 
 impl CrossBilateral<'_> {
-    /// Precisions of a pixel.
+    /// Number of precisions of a pixel.
     fn precisions(&self) -> usize {
         2 + self.groups.len()
     }
@@ -58,7 +60,8 @@ impl CrossBilateral<'_> {
         assert_eq!(self.precision.len(), self.precisions() * n);
     }
 
-    /// Filters the image: `output` (3, H, W), `total` (1, H, W) the sum of each pixel's weights.
+    /// Filters the image into `output`, (3, H, W). `total`, (1, H, W), receives the sum of each pixel's
+    /// weights.
     ///
     /// # Panics
     /// If lengths do not fit the size.
@@ -71,8 +74,8 @@ impl CrossBilateral<'_> {
         });
     }
 
-    /// Adds to `into` (2 + groups, H, W) what the output's gradient (3, H, W) sends back to the
-    /// precisions; `output` and `total` are those of [`CrossBilateral::apply`].
+    /// Backpropagates the output's gradient, (3, H, W), to the precisions and adds the result to `into`, (2 +
+    /// groups, H, W). `output` and `total` are those of [`CrossBilateral::apply`].
     ///
     /// # Panics
     /// If lengths do not fit the size.
@@ -146,7 +149,8 @@ impl CrossBilateral<'_> {
     }
 }
 
-/// The squared distance, summed over planes of `n`, of the pixels from `at` on to those from `from` on.
+/// Writes to `line` the squared distances of the pixels from `at` on to those from `from` on, summed over
+/// planes of `n` values.
 #[inline(always)]
 fn squared_distance(planes: &[f32], n: usize, at: usize, from: usize, line: &mut [f32]) {
     line.fill(0.0);

@@ -1,7 +1,7 @@
 //! `e^x` and the logistic function in the arithmetic that every tier repeats: the same operations in the same
 //! order.
 
-/// Exponents are kept within this of zero: `e^-40` is no weight beside 1.
+/// Exponents are kept within this distance of zero: a weight of `e^-40` does not count beside 1.
 pub(super) const LIMIT: f32 = 40.0;
 
 /// ln 2 in two parts, and the polynomial for `e^r` on +-0.5 ln 2, highest power first, without `r + 1`: the
@@ -10,8 +10,8 @@ pub(super) const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
 pub(super) const EXP: [f32; 6] =
     [1.987_569_1e-4, 1.398_199_9e-3, 8.333_452e-3, 4.166_579_6e-2, 1.666_666_5e-1, 0.5];
 
-/// `e^x` to 2e-7 relative within +-`LIMIT`, and as at that limit beyond: 2^n times a polynomial on +-0.5 ln
-/// 2.
+/// `e^x` to 2e-7 relative within +-`LIMIT`, and beyond these limits the value at the limit. It is 2^n times a
+/// polynomial on +-0.5 ln 2.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-LIMIT, LIMIT);
@@ -26,7 +26,7 @@ pub fn exp(x: f32) -> f32 {
     e * f32::from_bits(bits)
 }
 
-/// The slope of what has this slope as long as [`exp`] of `x` has one: beyond its limit it has none.
+/// `slope` where [`exp`] changes with `x`, and 0 beyond its limit, where it does not.
 #[inline(always)]
 pub(super) fn limited(x: f32, slope: f32) -> f32 {
     if x.abs() <= LIMIT { slope } else { 0.0 }

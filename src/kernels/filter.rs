@@ -1,10 +1,11 @@
 //! Applying predicted kernels to an image, and building its pyramid: planar f32, one image at a time.
 //!
 //! A pixel's filtered value is `sum_k w_k x_k / sum_k w_k` over its k x k neighbourhood with
-//! `w_k = exp(logit_k + confidence_k)`: the pixel says how much it wants each neighbour, the neighbour
-//! says how far it can be trusted (a firefly marks itself once, instead of in 25 kernels). Neighbours
-//! outside the image have no weight. Every pixel's largest exponent is subtracted from all of its own, which
-//! changes nothing but keeps the sum from overflowing, however large a network's logits have grown.
+//! `w_k = exp(logit_k + confidence_k)`. The logit is the pixel's and says how much it wants each neighbour;
+//! the confidence is the neighbour's and says how far it can be trusted, so that a firefly is marked once
+//! instead of in 25 kernels. Neighbours outside the image have no weight. The largest exponent of a pixel is
+//! subtracted from all exponents of that pixel. This does not change the result, but keeps the sum from
+//! overflowing, however large a network's logits have grown.
 
 use rayon::prelude::*;
 
@@ -36,7 +37,8 @@ impl Size {
 pub struct Filter<'a> {
     /// Rows and columns of the image.
     pub size: Size,
-    /// The rows to filter, R of them: all, or those of a band whose neighbours the image holds too.
+    /// The first row to filter and the row after the last, R rows in all. They are the whole image, or a band
+    /// whose neighbouring rows the image holds too.
     pub rows: (usize, usize),
     /// Kernel size, odd.
     pub k: usize,
@@ -48,7 +50,7 @@ pub struct Filter<'a> {
     pub confidence: Option<&'a [f32]>,
 }
 
-/// What flows back through a filter, each added to.
+/// Where the gradients of a filter are added.
 pub struct FilterGradient<'a> {
     /// To the image, (3, H, W), where it is wanted.
     pub image: Option<&'a mut [f32]>,
@@ -96,14 +98,14 @@ impl<'a> Filter<'a> {
         assert!(self.confidence.is_none_or(|c| c.len() == n));
     }
 
-    /// Pixels that are filtered.
+    /// Number of pixels that are filtered.
     fn filtered(&self) -> usize {
         (self.rows.1 - self.rows.0) * self.size.w
     }
 
-    /// Every tap of row `y` of those filtered whose row lies inside the image: its place in the kernel, the
-    /// row, and how far to the right it reads. A list, since closures may be compiled without the tier's
-    /// instructions.
+    /// The taps of row `y` of the filtered rows that read a row inside the image. Each is its place in the
+    /// kernel, the row it reads, and how far to the right it reads. They are a list, since closures may be
+    /// compiled without the tier's instructions.
     fn taps(&self, y: usize) -> Vec<(usize, usize, isize)> {
         let (k, r) = (self.k, (self.k / 2) as isize);
         // A kernel wider than the image has taps that meet no pixel at all.
@@ -116,8 +118,8 @@ impl<'a> Filter<'a> {
             .collect()
     }
 
-    /// Calls `put(pixel, exponent)` on the pixels of row `y` of those filtered that have a neighbour at this
-    /// tap.
+    /// Calls `put(pixel, exponent)` on those pixels of row `y` of the filtered rows that have a neighbour at
+    /// this tap.
     #[inline(always)]
     fn exponents(
         &self,
@@ -139,7 +141,7 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// The largest exponent of each pixel of row `y` of those filtered, whose taps these are.
+    /// Writes the largest exponent over `taps` of each pixel of row `y` of the filtered rows.
     #[inline(always)]
     fn largest(&self, y: usize, taps: &[(usize, usize, isize)], out: &mut [f32]) {
         out.fill(f32::NEG_INFINITY);
@@ -149,8 +151,8 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// The weights of one tap along row `y` of those filtered, columns `x0..x1`, beside that of the `largest`
-    /// exponent.
+    /// Writes the weights of one tap along row `y` of the filtered rows, relative to the weight of the
+    /// `largest` exponent. Returns the columns `x0..x1` that have such a weight.
     #[inline(always)]
     fn weights(
         &self,
@@ -165,8 +167,8 @@ impl<'a> Filter<'a> {
         (x0, x1)
     }
 
-    /// Filters the image: `output` (3, R, W), `total` (1, R, W) the sum of each pixel's weights, the largest
-    /// of which is 1.
+    /// Filters the image into `output`, (3, R, W). `total`, (1, R, W), receives the sum of each pixel's
+    /// weights, the largest of which is 1.
     ///
     /// # Panics
     /// If lengths do not fit the size.
@@ -174,7 +176,7 @@ impl<'a> Filter<'a> {
         self.apply_to_all(tier, [self.image], [output], total);
     }
 
-    /// [`Filter::apply`] to several images of the same size alike, of which [`Filter::image`] is but one.
+    /// [`Filter::apply`] to several `images` of the same size as [`Filter::image`], with the same kernels.
     ///
     /// # Panics
     /// As [`Filter::apply`].
@@ -190,7 +192,7 @@ impl<'a> Filter<'a> {
         assert_eq!(total.len(), n);
         assert!(images.iter().all(|image| image.len() == self.image.len()));
         assert!(outputs.iter().all(|output| output.len() == 3 * n));
-        // Equal trust is no change of any exponent.
+        // Equal trust adds nothing to any exponent.
         let equal = vec![0.0; if self.confidence.is_none() { w } else { 0 }];
         each_row(w, outputs, total, |y, output, total| {
             let line = |values: &'a [f32], row: usize| &values[row * w..][..w];
@@ -204,8 +206,8 @@ impl<'a> Filter<'a> {
         });
     }
 
-    /// Adds what the output's gradient (3, H, W) sends back; `output` and `total` are those of
-    /// [`Filter::apply`] to all rows.
+    /// Backpropagates the output's gradient, (3, H, W), and adds the results to what `into` holds. `output`
+    /// and `total` are those that [`Filter::apply`] made of all rows.
     ///
     /// # Panics
     /// If lengths do not fit the size, or not all rows are filtered.
@@ -261,7 +263,7 @@ impl<const N: usize> Kernel for Forward<'_, N> {
 }
 
 impl<const N: usize> Forward<'_, N> {
-    /// Filters 16 pixels of the row from column `x` on, or those there are.
+    /// Filters 16 pixels of the row from column `x` on, or as many as are left.
     ///
     /// # Safety
     /// As for [`some_columns`].
@@ -294,7 +296,8 @@ impl<const N: usize> Forward<'_, N> {
 }
 
 impl<const N: usize> Tap<'_, N> {
-    /// The exponents of 16 pixels from column `x` on; no weight where there is no neighbour.
+    /// The exponents of 16 pixels from column `x` on. Where there is no neighbour, the exponent is minus
+    /// infinity.
     ///
     /// # Safety
     /// As for [`some_columns`].
@@ -310,7 +313,7 @@ impl<const N: usize> Tap<'_, N> {
     }
 }
 
-/// Columns `x..x + 16` of a row, and `other` where it has none.
+/// Columns `x..x + 16` of a row, with `other` in place of those that the row does not have.
 ///
 /// # Safety
 /// If `INNER`, the row has all of them.
@@ -381,8 +384,9 @@ impl Kernel for Backward<'_, '_> {
     }
 }
 
-/// Halves (3, H, W): each quad weighted by `exp(confidence)`, where confidence beyond +-40 counts as
-/// that and has no gradient. `total` (1, H/2, W/2) gets the sums of weights.
+/// Halves an image, (3, H, W): each output pixel is the mean of a quad (2x2 pixels), weighted by
+/// `exp(confidence)`. Confidence beyond +-40 counts as +-40 and has no gradient. `total`, (1, H/2, W/2),
+/// receives the sum of each quad's weights.
 ///
 /// # Panics
 /// If lengths do not fit, or rows or columns are odd.
@@ -399,7 +403,7 @@ pub fn reduce(size: Size, image: &[f32], confidence: &[f32], output: &mut [f32],
     });
 }
 
-/// One row of what [`reduce`] makes.
+/// One row of the output of [`reduce`].
 struct Quads<'a> {
     size: Size,
     y: usize,
@@ -432,7 +436,8 @@ impl Vectorised for Quads<'_> {
     }
 }
 
-/// Adds what [`reduce`]'s output gradient sends back to image and confidence.
+/// Backpropagates the gradient of [`reduce`]'s output to image and confidence, and adds the results to
+/// theirs.
 ///
 /// # Panics
 /// As [`reduce`].
@@ -468,7 +473,8 @@ pub fn reduce_gradient(
 mod tests {
     use super::*;
 
-    /// Logits of a network that is sure of itself reach hundreds; the sum of their exponentials does not fit.
+    /// Logits of a network that is sure of itself reach hundreds, and the sum of their exponentials
+    /// overflows.
     #[test]
     fn large_logits_are_filtered_as_a_softmax_says() {
         let (size, k) = (Size { h: 3, w: 21 }, 5);

@@ -1,8 +1,8 @@
 //! A gain for every value, planar f32.
 //!
-//! `value * exp(LARGEST * tanh(logit / LARGEST))`: a network draws with it what no average of noisy
-//! neighbours holds, such as the edge of a shadow, and cannot blow a value up. A logit of 0 leaves a value as
-//! it is.
+//! `value * exp(LARGEST * tanh(logit / LARGEST))`: with it a network draws what no average of noisy
+//! neighbours holds, such as the edge of a shadow. The gain is bounded, so no value grows without limit. A
+//! logit of 0 leaves a value as it is.
 
 use rayon::prelude::*;
 
@@ -51,7 +51,8 @@ impl Vectorised for Amplify<'_> {
     }
 }
 
-/// Adds what [`amplify`]'s output gradient sends back to its values and logits.
+/// Backpropagates the gradient of [`amplify`]'s output to its values and logits, and adds the results to
+/// theirs.
 ///
 /// # Panics
 /// If lengths differ.

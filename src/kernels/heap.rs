@@ -1,8 +1,8 @@
 //! The C library's heap.
 
 /// Makes the heap keep the memory of images up to 32 MiB for the next ones, instead of giving it to the
-/// system and faulting it in page by page again: a tenth of the time that `demc-m` takes for 480x270 pixels.
-/// Larger ones still go back at once.
+/// system and faulting it in page by page again. That saves a tenth of the time that `demc-m` takes for
+/// 480x270 pixels. Larger ones still go back at once.
 pub fn keep_freed() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {

@@ -38,7 +38,7 @@ impl Map {
         self.first / LANES..(self.first + self.channels).div_ceil(LANES)
     }
 
-    /// The lanes of a blocked plane that hold them.
+    /// The lanes of a blocked plane that hold the channels.
     fn lanes(self, plane: usize) -> std::ops::Range<usize> {
         let start = plane * LANES;
         self.first.max(start) - start..(self.first + self.channels).min(start + LANES) - start
@@ -57,8 +57,8 @@ impl Map {
     }
 }
 
-/// From planes of `factor` times its size to all channels of an activation. The lanes beyond them become
-/// zero.
+/// Packs planes of `factor` times an activation's size into all channels of that activation. The lanes beyond
+/// its channels become zero.
 ///
 /// # Panics
 /// If `input` does not hold the output's shape.
@@ -68,7 +68,7 @@ pub fn to_blocked(input: &[f32], factor: usize, output: ViewMut) {
     pack(input, 0, factor, output, false);
 }
 
-/// From blocks to `(N, C, H, W)`.
+/// Unpacks blocks to planes, `(N, C, H, W)`.
 ///
 /// # Panics
 /// If `output` does not hold the input's shape.
@@ -78,7 +78,8 @@ pub fn from_blocked(input: View, output: &mut [f32]) {
     from_blocked_shuffled(input, 0, 1, output);
 }
 
-/// Channels `first..` of `input` as planes, (N, C / factor^2, factor H, factor W); `output` says how many.
+/// Unpacks C channels of `input`, from `first` on, to planes, (N, C / factor^2, factor H, factor W). The
+/// length of `output` says how many they are.
 ///
 /// # Panics
 /// If `output` does not hold whole channels of the input.
@@ -87,8 +88,8 @@ pub fn from_blocked_shuffled(input: View, first: usize, factor: usize, output: &
     each_band(to.map, |n, plane, rows| Tier::detect().run(Unpack { to, input, n, plane, rows }));
 }
 
-/// Adds planes to the channels that [`from_blocked_shuffled`] makes planes of; every other channel stays as
-/// it is.
+/// Adds planes to the channels from which [`from_blocked_shuffled`] unpacks them. Every other channel stays
+/// as it is.
 ///
 /// # Panics
 /// As [`from_blocked_shuffled`].
@@ -96,7 +97,8 @@ pub fn add_blocked_shuffled(input: &[f32], first: usize, factor: usize, output: 
     pack(input, first, factor, output, true);
 }
 
-/// What both of them do: `add` to what a block holds, or else lanes without a value become zero.
+/// What [`to_blocked`] and [`add_blocked_shuffled`] do. With `add`, values are added to what blocks hold.
+/// Without, they replace it, and lanes without a value become zero.
 fn pack(input: &[f32], first: usize, factor: usize, output: ViewMut, add: bool) {
     let map = Map::new(output.shape, first, factor, input.len());
     let blocks = Shared(output.data.as_mut_ptr());
@@ -117,7 +119,7 @@ fn each_band(map: Map, work: impl Fn(usize, usize, std::ops::Range<usize>) + Syn
     });
 }
 
-/// Planes that tasks share, to write what channels of an activation hold.
+/// Planes that tasks share, to which they write the values of an activation's channels.
 #[derive(Clone, Copy)]
 pub(super) struct Unpacked {
     map: Map,
@@ -138,8 +140,8 @@ impl Unpacked {
         Self { map: Map::new(shape, first, factor, output.len()), values: output.as_mut_ptr() }
     }
 
-    /// Writes up to 16 pixels of image `n`, those from column `x` of the activation's row `y` on, whose
-    /// channels of blocked plane `plane` are what `finish` makes of `blocks`.
+    /// Writes up to 16 pixels of image `n`, from column `x` of the activation's row `y` on. The channels of
+    /// blocked plane `plane` of these pixels are what `finish` makes of `blocks`.
     ///
     /// # Safety
     /// The pixels lie inside the row and nobody else writes them; the planes
@@ -199,8 +201,8 @@ trait Groups<S: Simd, const N: usize> {
     fn transpose(simd: S, vectors: [S::V; N]) -> [S::V; N];
 }
 
-/// The channels of a blocked plane: each for itself where it is a plane, two by two where those are
-/// neighbours in a row.
+/// The channels of a blocked plane: one by one where each is a plane, and two by two where two channels are
+/// neighbours in a row of a plane.
 struct Channels;
 
 impl<S: Simd> Groups<S, LANES> for Channels {
@@ -286,9 +288,9 @@ impl Kernel for Pack<'_> {
 }
 
 impl Map {
-    /// Fills the blocks of an activation's pixels, those from column `x` of its row `y` on, with what the
-    /// planes hold of its channels, other lanes with zeros; or does `add` it to what the blocks hold. Each of
-    /// the `N` groups of channels of a blocked plane is a run of values in its row.
+    /// Fills the blocks of an activation's pixels, from column `x` of its row `y` on, with what the planes
+    /// hold of its channels, and other lanes with zeros. With `add`, the values are added to what the blocks
+    /// hold instead. Each of the `N` groups of channels of a blocked plane is a run of values in its row.
     #[inline(always)]
     fn gather<S: Simd, const N: usize>(
         self,
@@ -321,9 +323,10 @@ impl Map {
     }
 }
 
-/// Row `y` of image `n` of an activation whose channels are the pixels of quads of planes, as
-/// [`to_blocked`] makes it: 16 pixels at a time, each as up to two blocked planes from `plane` on. `put`
-/// takes the pixels' first column and their blocks; there is no second plane where it has no channels.
+/// Row `y` of image `n` of an activation whose channels are the pixels of quads of planes, as [`to_blocked`]
+/// makes it. It is made 16 pixels at a time, for up to two blocked planes from `plane` on. `put` takes the
+/// first column of these pixels and their blocks; those of the second plane are absent where it has no
+/// channels.
 pub(super) struct HalvedRow<'a, F> {
     pub shape: Shape,
     pub values: &'a [f32],
@@ -349,7 +352,7 @@ impl<F: FnMut(usize, &[Block], Option<&[Block]>)> Kernel for HalvedRow<'_, F> {
     }
 }
 
-/// Up to `N` blocks, the last of them once more where there are fewer.
+/// `N` blocks after `finish`. Where there are fewer, the last one is repeated.
 #[inline(always)]
 fn load<S: Simd, const N: usize>(simd: S, blocks: &[Block], finish: &impl Finish<S>) -> [S::V; N] {
     let last = blocks.len() - 1;

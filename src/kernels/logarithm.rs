@@ -1,8 +1,8 @@
 //! The logarithms in which networks read radiance and the ratio of albedos: plain arithmetic, which the
 //! compiler vectorises where it is inlined.
 
-/// `ln(1 + steepness * v) / ln(1 + steepness)` of a value `v`: 0 of 0, 1 of 1, nearly linear below
-/// `1 / steepness`.
+/// The function `ln(1 + steepness * v) / ln(1 + steepness)` of a value `v`. It maps 0 to 0 and 1 to 1, and is
+/// nearly linear below `1 / steepness`.
 #[derive(Clone, Copy)]
 pub struct LogTransfer {
     steepness: f32,
@@ -10,21 +10,22 @@ pub struct LogTransfer {
 }
 
 impl LogTransfer {
-    /// Of that steepness, which is positive.
+    /// The transfer of that steepness, which must be positive.
     pub fn new(steepness: f32) -> Self {
         Self { steepness, scale: steepness.ln_1p().recip() }
     }
 
-    /// Of a value, finite and not negative.
+    /// Transfers a value, which must be finite and not negative.
     #[inline(always)]
     pub fn of(self, value: f32) -> f32 {
         ln(1.0 + self.steepness * value) * self.scale
     }
 }
 
-/// The polynomial `p` for `ln(1 + r) = r - r^2 / 2 + r^3 p(r)` between the roots of 1/2 and 2, highest power
-/// first, which keeps the largest relative error of the logarithm least: 6e-9 (by least squares, weighted
-/// anew until no point errs more than others).
+/// Coefficients, highest power first, of the polynomial `p` in `ln(1 + r) = r - r^2 / 2 + r^3 p(r)`, for
+/// `1 + r` between the square roots of 1/2 and 2. They make the largest relative error of the logarithm as
+/// small as possible: 6e-9. They were found by least squares, with weights changed until no point erred more
+/// than others.
 const LN: [f32; 8] = [
     -0.076_344_93,
     0.127_615_75,
@@ -37,7 +38,8 @@ const LN: [f32; 8] = [
 ];
 
 /// Natural logarithm of a normal positive number, to 2e-7 absolute and relative: `x = 2^n m` with m between
-/// the roots of 1/2 and 2, and a polynomial for `ln m`, since a division would take as long as all the rest.
+/// the square roots of 1/2 and 2. A polynomial gives `ln m`, since a division would take as long as all the
+/// rest.
 #[inline(always)]
 pub fn ln(x: f32) -> f32 {
     const ROOT_OF_HALF: u32 = 0x3f35_04f3;

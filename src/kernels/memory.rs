@@ -19,9 +19,9 @@ impl<T: Clone> Pool<T> {
         Self(Mutex::new(Vec::new()))
     }
 
-    /// The smallest free memory for `len` values, unless more than half of it would lie idle; else new
-    /// memory, filled with `value`. What is too small goes back to the system then: frames that grow leave
-    /// nothing behind.
+    /// The smallest free memory that holds `len` values, unless more than half of it would lie idle. Else it
+    /// is new memory, filled with `value`, and free memory that is too small goes back to the system, so that
+    /// frames that grow leave nothing behind.
     pub fn take(&'static self, len: usize, value: T) -> Pooled<T> {
         let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |(_, data): &(usize, &Vec<T>)| (len..=2 * len).contains(&data.len());
@@ -65,7 +65,7 @@ impl<T> Default for Pooled<T> {
     }
 }
 
-/// Of no pool: what others allocate would only pile up there.
+/// The memory belongs to no pool, since memory allocated elsewhere would only pile up there.
 impl<T> From<Vec<T>> for Pooled<T> {
     fn from(data: Vec<T>) -> Self {
         Self { len: data.len(), data, pool: None }

@@ -30,7 +30,7 @@ struct Chains<'a> {
 impl Kernel for Chains<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        // As many at once as a convolution's tile keeps in registers.
+        // Only as many chains run at once as a convolution's tile keeps in registers.
         let fit = S::TILE.0 * S::TILE.1 >= CHAINS;
         let sum = if fit {
             chains::<S, CHAINS>(simd, self.steps)
@@ -47,7 +47,8 @@ impl Kernel for Chains<'_> {
 /// Runs `steps` rounds of `N` chains and adds them up.
 #[inline(always)]
 fn chains<S: Simd, const N: usize>(simd: S, steps: usize) -> S::V {
-    // Values that the compiler cannot know, or it would find the chains alike, or their limit.
+    // The compiler must not know these values, or it could compute the chains' limit, or find that they are
+    // alike.
     let value = |v: f32| simd.splat(std::hint::black_box(v));
     let (a, b) = (value(0.999_999), value(1e-6));
     let mut acc: [S::V; N] = std::array::from_fn(|i| value(i as f32));

@@ -15,7 +15,7 @@ pub struct Plane {
 }
 
 impl Plane {
-    /// From one row to the next.
+    /// Positions from one row to the next.
     pub fn stride(self) -> usize {
         self.w + 2 * self.pad
     }
@@ -50,7 +50,8 @@ impl Plane {
     }
 
     /// Copies `count` rows of each plane of `source`, from its row `from` on, to row `to` on of `into`'s
-    /// planes. Rows -1 and H are those of the border, which then belong to a taller plane.
+    /// planes. Rows -1 and H lie in the border. They may be copied where the plane is a part of a taller one,
+    /// whose rows the border then holds.
     ///
     /// # Panics
     /// If widths or borders differ, or some row does not exist.

@@ -18,7 +18,7 @@ fn row_in_plane(shape: Shape, y: usize) -> usize {
     shape.row(0, 0, y)
 }
 
-/// All bits or none.
+/// All bits set if the condition holds, or none.
 #[inline(always)]
 fn mask(condition: bool) -> u32 {
     u32::from(condition).wrapping_neg()
@@ -87,7 +87,7 @@ pub fn relu_mask(output: View, gradient: ViewMut) {
     assert_eq!(output.shape, gradient.shape);
     gradient.data.par_chunks_mut(4096).zip(output.data.par_chunks(4096)).for_each(|(g, o)| {
         for (g, o) in g.iter_mut().zip(o) {
-            // On copies and by bits, or the compiler works lane by lane.
+            // Without copies and bit masks the compiler would work lane by lane.
             let (old, output) = (g.0, o.0);
             *g = Block(std::array::from_fn(|l| f32::from_bits(old[l].to_bits() & mask(output[l] > 0.0))));
         }

@@ -1,7 +1,9 @@
-//! Radiance that was divided by one albedo, divided by another as far as a network says, planar f32.
+//! Turns radiance divided by one albedo into radiance divided by another, as far as a network says; planar
+//! f32.
 //!
-//! `value * exp(ratio * logistic(logit))` with `ratio` the logarithm of the first albedo over the second: a
-//! logit far below 0 leaves a value as it is, one far above 0 makes it what the second albedo would have.
+//! `value * exp(ratio * logistic(logit))`, where `ratio` is the logarithm of the first albedo over the
+//! second. A logit far below 0 leaves a value as it is; one far above 0 gives what division by the second
+//! albedo would give.
 
 use rayon::prelude::*;
 
@@ -11,8 +13,8 @@ use super::{
     vectorised::{self, Vectorised},
 };
 
-/// Writes each value, (3, H, W), divided anew by the `ratio` of the albedos, (3, H, W); `logits` are (1, H,
-/// W).
+/// Writes `value * exp(ratio * logistic(logit))` for each value. `values`, `ratio` and `output` are
+/// (3, H, W), and `logits` (1, H, W).
 ///
 /// # Panics
 /// If lengths differ.
@@ -44,8 +46,8 @@ impl Vectorised for Redivide<'_> {
     }
 }
 
-/// Adds what the gradient of [`redivide`]'s `output` sends back to its logits. The values and the albedos are
-/// a network's inputs, whose gradient nobody asks for.
+/// Backpropagates the gradient of [`redivide`]'s `output` to its logits and adds the result to theirs. The
+/// values and the albedos are a network's inputs and need no gradient.
 ///
 /// # Panics
 /// If lengths differ.

@@ -12,7 +12,7 @@ use super::{
 /// Tasks that keep a workstation's threads busy.
 const TASKS: usize = 8;
 
-/// Rows that make a task of their own worth its sum.
+/// Fewest rows for which a task of their own is worth the sum that it needs.
 const PART_ROWS: usize = 32;
 
 /// Pixels of a band, whose input and output gradient stay in the first-level cache over all taps.
@@ -26,9 +26,9 @@ pub fn clear() {
     SLABS.clear();
 }
 
-/// Adds the weight gradient of one source to `gradient`, laid out like the layer's weights
-/// (`(O, I, k, k)`, transposed: `(I, O, 4, 4)`); `first` is the source's first input channel of
-/// `inputs` in all.
+/// Adds the weight gradient of one source to `gradient`, laid out like the layer's weights (`(O, I, k, k)`,
+/// transposed: `(I, O, 4, 4)`); `first` is the source's first channel among the layer's `inputs` input
+/// channels.
 ///
 /// Sums run in an order that depends on the shapes alone, so results do not change with the number
 /// of threads.
@@ -80,9 +80,9 @@ pub fn weight_gradient(
     });
 }
 
-/// Adds `sum(part, output plane, input of the source, tap)`, over all parts, to the weights that they are
-/// sums for: a block holds those of 16 outputs, which are spread over as many kernels. The source's
-/// `channels` are the inputs from `first` on of `inputs` in all.
+/// Adds `sum(part, output plane, input of the source, tap)`, over all parts, to the weights they belong to.
+/// Such a sum is a block, whose lanes belong to the kernels of 16 outputs. The source's `channels` are those
+/// from `first` on among the layer's `inputs` input channels.
 pub(super) fn add_sums<'a>(
     weights: &mut [f32],
     geometry: Geometry,
@@ -129,7 +129,7 @@ struct Pair<'a> {
     source: View<'a>,
     gradient: View<'a>,
     geometry: Geometry,
-    /// Of all images, one below another.
+    /// Rows of all images, as if these lay one below another.
     rows: (usize, usize),
     input: usize,
     outputs: (usize, usize),

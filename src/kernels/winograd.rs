@@ -2,8 +2,8 @@
 //!
 //! A cell `y` of outputs depends on a patch `d` of 6x6 inputs, and `y = A [(G g G') * (B d B')] A'` for a
 //! kernel `g`, where `*` multiplies number by number: 36 products in the place of 144 (Winograd 1980; Lavin
-//! and Gray 2016, F(4x4, 3x3); the points are 0, 1, -1, 2, -2 and infinity). Rows of `G` are taken times 24,
-//! 6, 6, 24, 24, 6 here, which leaves whole numbers, and what `A` then makes of sums is 9 x 2^k times the
+//! and Gray 2016, F(4x4, 3x3); the points are 0, 1, -1, 2, -2 and infinity). Here the rows of `G` are
+//! multiplied by 24, 6, 6, 24, 24 and 6, which makes them whole numbers; then `A` gives 9 x 2^k times the
 //! output.
 //!
 //! [`convolve`] does so in f32. Rounding then depends on where a cell begins, so it serves training, not
@@ -24,16 +24,16 @@ use super::{
 /// Outputs along a side of a cell.
 pub const SIDE: usize = 4;
 
-/// Inputs along a side of its patch.
+/// Inputs along a side of a cell's patch.
 pub const PATCH: usize = SIDE + 2;
 
-/// Numbers that stand for either between the two transforms.
+/// Numbers that represent a patch, and then a cell, between the two transforms.
 pub const POINTS: usize = PATCH * PATCH;
 
-/// What an output is multiplied by in either direction besides 3, as a power of two.
+/// Along either axis, output `i` of a cell comes out multiplied by 3 and by 2 to the power of `POWERS[i]`.
 pub const POWERS: [u32; SIDE] = [3, 2, 1, 1];
 
-/// What the transforms take.
+/// Numbers that the transforms can be computed with.
 pub trait Ring: Copy {
     /// `self + other`.
     fn plus(self, other: Self) -> Self;
@@ -136,7 +136,7 @@ pub fn evaluate_kernel<R: Ring>(kernel: [R; 9]) -> [R; POINTS] {
 /// Cells side by side that are transformed, multiplied and transformed back together.
 const CELLS: usize = 12;
 
-/// Cells, and output planes, whose products stay in registers at most.
+/// The most cells, and the most output planes, whose products stay in registers together.
 const STRIP: usize = 6;
 const OUTPUTS: usize = 2;
 
@@ -148,13 +148,13 @@ pub fn clear() {
     POINTS_FREE.clear();
 }
 
-/// Whether cells make a convolution of frames of so many columns faster: where there are few, weights are
-/// read for too few of them.
+/// Whether a convolution of frames of `width` columns is faster by cells. Where there are few columns,
+/// weights are read for too few cells.
 pub fn serves(width: usize) -> bool {
     width >= 32
 }
 
-/// The weights of a 3x3 convolution, packed as [`super::conv::pack`] does, at all points:
+/// Evaluates the weights of a 3x3 convolution, packed by [`super::conv::pack`], at all points:
 /// `[output plane][point][input plane][16 input lanes]`.
 pub fn transform(tier: Tier, packed: &[Block], planes: usize) -> Vec<Block> {
     let mut weights = vec![Block::default(); packed.len() / 9 * POINTS];
@@ -190,10 +190,10 @@ impl Kernel for Transform<'_> {
     }
 }
 
-/// [`super::conv::convolve`] of 3x3, whose weights come from [`transform`].
+/// [`super::conv::convolve`] for a 3x3 convolution whose weights come from [`transform`].
 ///
 /// # Panics
-/// As that.
+/// As for that function.
 pub fn convolve(
     tier: Tier,
     sources: &[View],
@@ -232,8 +232,8 @@ struct Rows<'a> {
     y: usize,
 }
 
-/// An input plane: where the rows of the patches begin, those beyond the border nowhere, and how many of its
-/// lanes are in use.
+/// An input plane: where the rows of the patches begin (`None` for rows beyond the border), and how many of
+/// its lanes are in use.
 struct Plane {
     rows: [Option<*const Block>; PATCH],
     lanes: usize,
@@ -294,7 +294,7 @@ impl Rows<'_> {
         // SAFETY: the caller's promise.
         unsafe {
             let nothing = Real(simd, simd.splat(0.0));
-            // Columns of a patch at the points, the last two of which are the next patch's first.
+            // Columns of a patch at the points. The last two are the first two of the next patch.
             let mut columns = [[nothing; PATCH]; PATCH];
             for cell in 0..cells {
                 for i in if cell == 0 { 0 } else { PATCH - SIDE }..PATCH {
@@ -405,8 +405,8 @@ impl Rows<'_> {
     }
 }
 
-/// The products of `COUNT` cells at a point for `OUT` output planes, where points, weights and products
-/// begin.
+/// Multiplies `COUNT` cells by the weights of `OUT` output planes at one point, and sums over the input
+/// `planes`. The pointers say where the point's values of the cells, its weights and its products begin.
 ///
 /// # Safety
 /// All of them can be read and written.

@@ -60,8 +60,8 @@ pub fn encode(radiance: f32, exposure: f64) -> f32 {
     (exposure * f64::from(radiance)).clamp(0.0, 1.0).powf(1.0 / GAMMA) as f32
 }
 
-/// The derivative of [`encode`] by radiance, no steeper in the dark than where 0.005 of white is: none at
-/// black is finite.
+/// The derivative of [`encode`] by radiance, and 0 from white on. Below 0.005 of white it stays what it is
+/// there, since at black it would be infinite.
 pub fn encode_slope(radiance: f32, exposure: f64) -> f32 {
     const DARK: f64 = 0.005;
     let exposed = exposure * f64::from(radiance);

@@ -1,9 +1,9 @@
 //! Pixel-wise errors on linear radiance.
 //!
-//! RelMSE: Rousselle, Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error
-//! Minimization" (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels; also trimmed of
-//! its worst 0.1% of pixels, so that a handful of fireflies in image or reference does not decide (this
-//! project's own). RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al.,
+//! RelMSE: Rousselle, Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error Minimization"
+//! (2011), with the epsilon of the DEMC paper's Eq. 5, averaged over channels. Its trimmed form, this
+//! project's own, leaves out the worst 0.1% of pixels, so that a handful of fireflies in image or reference
+//! does not decide it. RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al.,
 //! "Denoising with Kernel Prediction and Asymmetric Loss Functions" (2018), section 4.
 
 use rayon::prelude::*;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::mean;
 use crate::planes::Planes;
 
-/// Added to the squared reference under RelMSE's fraction: black pixels count, but finitely.
+/// Added to the squared reference in RelMSE's denominator, so that the error of black pixels is finite.
 pub const RELMSE_EPSILON: f64 = 1e-3;
 
 /// Share of pixels, the worst ones, that [`relmse_trimmed`] leaves out.
@@ -50,8 +50,8 @@ pub fn smape(image: &Planes, reference: &Planes) -> f64 {
     mean(image, reference, |x, r| (x - r).abs() / (x.abs() + r.abs() + SMAPE_EPSILON))
 }
 
-/// The sum of all values over the reference's: what becomes of the light. None where the reference's is not
-/// positive.
+/// The sum of all values divided by that of the reference: how much of the light is kept. None where the
+/// reference's sum is not positive.
 pub fn energy(image: &Planes, reference: &Planes) -> Option<f64> {
     let sum = |planes: &Planes| planes.data.iter().map(|v| f64::from(*v)).sum::<f64>();
     let whole = sum(reference);

@@ -1,10 +1,10 @@
-//! How much the error of a sequence changes from frame to frame where the picture does not: what an eye sees
-//! as boiling.
+//! Flicker: how much the error of a sequence changes from frame to frame where the picture itself does not
+//! change. An eye sees this as boiling.
 //!
-//! With e(t) the error of frame t and W the bilinear warp along the Vector pass from frame t - 1, it is the
-//! mean over pixels and channels of `(e(t) - W e(t-1))^2 / (r(t)^2 + 0.001)`, of pixels alone whose 3x3 mean
-//! of the reference changes along their motion by less than a tenth of it plus 0.003, in every channel:
-//! elsewhere light moves, or surfaces come and go.
+//! With e(t) the error of frame t, r(t) its reference, and W the bilinear warp along the Vector pass from
+//! frame t - 1, it is the mean over pixels and channels of `(e(t) - W e(t-1))^2 / (r(t)^2 + 0.001)`. A pixel
+//! counts only if, in every channel, the 3x3 mean of the reference changes along its motion by less than a
+//! tenth of that mean plus 0.003. Elsewhere light moves, or surfaces come and go.
 
 use super::error::RELMSE_EPSILON;
 use crate::{
@@ -12,7 +12,7 @@ use crate::{
     planes::Planes,
 };
 
-/// What the reference's 3x3 mean may change by: a share of it, and radiance besides.
+/// How much the reference's 3x3 mean may change: by this share of it, plus this much radiance.
 const CHANGE: f32 = 0.1;
 const DARK_CHANGE: f32 = 0.003;
 
@@ -48,7 +48,7 @@ pub fn flicker(pair: &Pair) -> Option<f64> {
         })
     };
     let (mut sum, mut count) = (0.0, 0usize);
-    // What lies outside of the frame before is NaN, and the same as nothing.
+    // Pixels that lie outside of the frame before are NaN there, so `is_same` is false for them.
     for at in (0..image.pixels()).filter(|at| is_same(*at)) {
         for c in 0..3 {
             let [error, before, reference] =
@@ -70,7 +70,7 @@ fn subtract(image: &Planes, reference: &Planes) -> Planes {
     })
 }
 
-/// The mean of the 3x3 pixels around each, beyond the frame those at its border again.
+/// The mean of the 3x3 pixels around each pixel. Beyond the frame, the pixels at its border are repeated.
 fn mean_3x3(planes: &Planes) -> Planes {
     let (width, height) = (planes.width, planes.height);
     Planes::from_rows(planes.channels, (width, height), |c, y, out| {

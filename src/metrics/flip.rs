@@ -13,9 +13,10 @@ use crate::planes::Planes;
 const PIXELS_PER_DEGREE: f32 = 67.020_64;
 /// Exponent of the colour difference.
 const QC: f32 = 0.7;
-/// Colour differences below this share of the largest ...
+/// Colour differences below this share of the largest one are spread over the share [`PT`] of the output
+/// range.
 const PC: f32 = 0.4;
-/// ... are spread over this share of the output range.
+/// Share of the output range for colour differences below the share [`PC`] of the largest one.
 const PT: f32 = 0.95;
 /// Exponent of the feature difference.
 const QF: f32 = 0.5;
@@ -24,7 +25,8 @@ const FEATURE_WIDTH: f32 = 0.082;
 /// Contrast sensitivity of the achromatic, red-green and blue-yellow channels:
 /// amplitudes and widths of up to two Gaussians.
 const CSF: [&[(f32, f32)]; 3] = [&[(1.0, 0.0047)], &[(1.0, 0.0053)], &[(34.1, 0.04), (13.5, 0.025)]];
-/// Tone mapped brightness that the extreme exposures bring maximum and median to (2021).
+/// Tone mapped brightness to which the darkest exposure brings the reference's maximum, and the brightest
+/// exposure its median (2021).
 const TONE_TARGET: f32 = 0.85;
 /// Narkowicz' fit of the ACES curve with the 2021 paper's factor of 0.6 on radiance:
 /// `(k0 x^2 + k1 x) / (k2 x^2 + k3 x + k4)`.
@@ -35,7 +37,7 @@ const RGB_TO_XYZ: [[f32; 3]; 3] = [
     [0.212_636_82, 0.715_183, 0.072_180_2],
     [0.019_330_62, 0.119_197_16, 0.950_372_6],
 ];
-/// Its inverse.
+/// The inverse of [`RGB_TO_XYZ`].
 const XYZ_TO_RGB: [[f32; 3]; 3] = [
     [3.241_003_3, -1.537_399, -0.498_615_9],
     [-0.969_224_3, 1.875_93, 0.041_554_226],
@@ -67,9 +69,9 @@ pub fn hdr_flip_map(image: &Planes, reference: &Planes) -> Option<Vec<f32>> {
     Some(worst)
 }
 
-/// The factors on radiance, darkest first (2021): from the one that brings the reference's brightest
-/// pixel to 0.85 after tone mapping to the one that does so for its median, evenly spaced in stops, as
-/// many as there are stops between them, rounded up, and at least two.
+/// The exposures, which are factors on radiance, darkest first (2021). The first brings the reference's
+/// brightest pixel to 0.85 after tone mapping, and the last its median. They are evenly spaced in stops.
+/// There are as many as there are stops between the first and the last, rounded up, and at least two.
 fn exposures(reference: &Planes) -> Option<Vec<f32>> {
     let [r, g, b] = [0, 1, 2].map(|c| reference.channel(c));
     let y = RGB_TO_XYZ[1];
@@ -119,7 +121,7 @@ struct Percept {
 /// A one-dimensional kernel of odd length.
 type Kernel = Vec<f32>;
 
-/// The separable kernels of both pipelines.
+/// The separable kernels of the colour pipeline and of the feature pipeline.
 struct Filters {
     /// Per opponent channel: weight and Gaussian.
     csf: [Vec<(f32, Kernel)>; 3],
@@ -166,7 +168,7 @@ impl Filters {
         }
     }
 
-    /// Both pipelines over linear RGB in 0..1.
+    /// Runs the colour and the feature pipeline over linear RGB in 0..1.
     fn perceive(&self, rgb: &Planes) -> Percept {
         let (width, height) = (rgb.width, rgb.height);
         let opponent = map_pixels(rgb, |rgb| opponent(multiply(&RGB_TO_XYZ, rgb)));

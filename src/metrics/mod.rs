@@ -1,10 +1,10 @@
 //! How far an image is from its reference: pure functions on linear radiance, (3, H, W).
 //!
-//! One file a family, each with its formula, constants and source: [`error`] (RelMSE, RMSE, maximum
-//! error, SMAPE), [`ssim`] on the display image of [`display`], [`flip`] for what an eye notices; and
-//! [`pairing`], which tells whether the two belong together. [`score`] computes all of these. [`flicker`] is
-//! of a sequence: two frames and the motion between them. Sums run in f64 row by row in a fixed order: the
-//! number of threads does not change a digit.
+//! Each family of metrics is one file with its formulas, constants and sources: [`error`]
+//! (RelMSE, RMSE, maximum error, SMAPE), [`ssim`] on the display image of [`display`], and [`flip`] for what
+//! an eye notices. [`score`] computes all of these. [`flicker`] is measured on a sequence, from two frames
+//! and the motion between them. [`pairing`] tells whether an image and its reference belong together. Sums
+//! run in f64 row by row in a fixed order, so the number of threads does not change a digit.
 
 use std::fmt;
 
@@ -67,7 +67,7 @@ pub enum Incomparable {
         /// Of the reference.
         reference: (usize, usize, usize),
     },
-    /// An image holds NaN or infinity; none is dropped in silence.
+    /// An image holds NaN or infinity. Such values are never left out in silence.
     NonFinite {
         /// Such values in the image.
         image: usize,

@@ -1,11 +1,13 @@
-//! Whether a render and its reference show the same scene: textures that Blender gave to other materials, or
-//! an object that moved between the two, are charged to every method, and teach a network to blur.
+//! Whether a render and its reference show the same scene. If Blender gave textures to other materials, or an
+//! object moved between the two, the difference counts as an error of every method, and teaches a network to
+//! blur.
 //!
-//! In squares of 16x16 pixels the mean luminance of a render differs from its reference's by noise alone.
-//! Noise with few bright samples leaves some squares too dark and hardly one too bright; another texture or
-//! place makes some brighter and others darker, another exposure nearly all of them. So the smaller share of
-//! the two tells, or the larger where it is most of the picture (this project's own test; on 300 pairs that
-//! belong together they are at most 0.5% and 17%).
+//! If they do, the mean luminances of their squares of 16x16 pixels differ by noise alone. Noise with few
+//! bright samples leaves some squares too dark and hardly one too bright. Another texture or place makes some
+//! squares brighter and others darker, and another exposure changes nearly all of them in one direction. So
+//! two shares of the squares are tested: the smaller one of those too bright and those too dark, and the
+//! larger one, which has to be most of the picture. This is the project's own test; on 300 pairs that belong
+//! together the two are at most 0.5% and 17%.
 
 use std::fmt::Display;
 
@@ -15,22 +17,23 @@ use crate::planes::Planes;
 /// Rows and columns of a square.
 const SQUARE: usize = 16;
 
-/// A square differs when its mean is off by more than as many standard errors, and by more than this share of
-/// the reference's, with an offset that keeps black squares out.
+/// A square differs when its mean is off by more than [`STANDARD_ERRORS`] standard errors, and by more than
+/// the share [`LEAST_CHANGE`] of the reference's mean plus [`OFFSET`], which keeps black squares out.
 const STANDARD_ERRORS: f64 = 6.0;
 const LEAST_CHANGE: f64 = 0.04;
 const OFFSET: f64 = 1e-4;
 
-/// Beyond these shares of the squares, too bright and too dark alike or all of one kind, a render and its
-/// reference are said to differ.
+/// A render and its reference are said to differ if more than the share [`BOTH_WAYS`] of the squares are too
+/// bright and more than that share too dark, or if more than the share [`ONE_WAY`] differ in the same
+/// direction.
 const BOTH_WAYS: f64 = 0.02;
 const ONE_WAY: f64 = 0.5;
 
-/// The share of the squares of an image that differ from those of `reference` by more than noise explains,
-/// where that is so large that the two do not show the same scene. Both are radiance, (3, H, W).
+/// The share of the squares of an image that differ from those of `reference` by more than noise explains;
+/// none if the two show the same scene. Both are radiance, (3, H, W).
 ///
 /// # Panics
-/// If sizes differ, or are not those of RGB.
+/// If the sizes differ, or the images have not three channels.
 fn mismatch(image: &Planes, reference: &Planes) -> Option<f64> {
     let size = |p: &Planes| (p.channels, p.width, p.height);
     assert!(image.channels == 3 && size(image) == size(reference), "both are RGB of one size");
@@ -61,11 +64,11 @@ fn mismatch(image: &Planes, reference: &Planes) -> Option<f64> {
     differs.then(|| share(brighter + darker))
 }
 
-/// What the user should know of the pair `name` if its two renders, radiance, (3, H, W), do not show the same
-/// scene.
+/// The warning for the user if the two renders of the pair `name` do not show the same scene. Both are
+/// radiance, (3, H, W).
 ///
 /// # Panics
-/// If sizes differ, or are not those of RGB.
+/// If the sizes differ, or the images have not three channels.
 pub fn warning(name: impl Display, image: &Planes, reference: &Planes) -> Option<String> {
     let percent = 100.0 * mismatch(image, reference)?;
     Some(format!(

@@ -63,7 +63,7 @@ pub fn slope(image: &[f32], reference: &[f32], width: usize) -> (f64, Vec<f32>) 
     let (mut uxx, urr, mut uxr) = (moment(|x, _| x * x), moment(|_, r| r * r), moment(|x, r| x * r));
     let (c1, c2) = (C1 as f32, C2 as f32);
     let mut sum = 0.0;
-    // Each moment of x gives way to the derivative by it.
+    // Each moment that depends on x is replaced by the derivative of SSIM by that moment.
     for ((((ux, uxx), uxr), ur), urr) in ux.iter_mut().zip(&mut uxx).zip(&mut uxr).zip(&ur).zip(&urr) {
         let (vx, vr, vxr) = (*uxx - *ux * *ux, urr - ur * ur, *uxr - *ux * ur);
         let (a1, a2) = (2.0 * *ux * ur + c1, 2.0 * vxr + c2);
@@ -80,7 +80,7 @@ pub fn slope(image: &[f32], reference: &[f32], width: usize) -> (f64, Vec<f32>) 
     (sum, pixels.map(|((((x, r), ux), uxx), uxr)| ux + 2.0 * x * uxx + r * uxr).collect())
 }
 
-/// The weighted sums of all windows of a plane, 10 fewer in either direction.
+/// The weighted sum of each window of a plane. There are 10 fewer rows and columns of windows than of pixels.
 fn windows(plane: &[f32], width: usize, weights: &[f32; WINDOW]) -> Vec<f32> {
     let (height, inner) = (plane.len() / width, width - 2 * RADIUS);
     let mut sums = vec![0.0; inner * (height - 2 * RADIUS)];

@@ -1,4 +1,4 @@
-//! The catalogue of methods: a new one is its file and its row in [`METHODS`].
+//! The catalogue of methods. A new method takes a file of its own and a row in [`METHODS`].
 
 use std::path::{Path, PathBuf};
 
@@ -56,7 +56,7 @@ pub enum Kind {
 pub enum Weights {
     /// In the program.
     BuiltIn(&'static [u8]),
-    /// In a file of this folder's: see [`find`].
+    /// In a file that is no part of the program: see [`Method::weights_file`].
     File,
     /// Nowhere: `demc train` makes them.
     None,
@@ -93,7 +93,8 @@ const fn learned(name: &'static str, family: Family, config: fn() -> Config, wei
     Method { name, family, kind: Kind::Learned { config, weights } }
 }
 
-/// Widths of the paper's networks unless told otherwise: a quarter of the published at full resolution.
+/// Widths of the paper's networks unless told otherwise. At full resolution they are a quarter of the
+/// published width.
 const PAPER_NARROW: [usize; demc::PAPER_WIDTHS.len()] = [16, 32, 32, 48, 48];
 
 fn paper(architecture: Architecture) -> Config {
@@ -105,7 +106,7 @@ pub fn find(name: &str) -> Option<&'static Method> {
     METHODS.iter().find(|method| method.name == name)
 }
 
-/// The environment's variable that names the folder of weights which are no part of the program.
+/// The environment variable that names the folder of weights that are no part of the program.
 pub const WEIGHTS_FOLDER: &str = "DEMC_WEIGHTS";
 
 /// Where that folder lies in this repository.

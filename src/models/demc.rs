@@ -1,4 +1,4 @@
-//! The network of the paper and its two variants, width a parameter.
+//! The network of the paper and its two variants, with the width as a parameter.
 //!
 //! "DEMC: A Deep Dual-Encoder Network for Denoising Monte Carlo Rendering" (Yang et al.), Section
 //! 3.2. In: colour `c^(1/2.2)` (3 channels) and 12 z-scored feature channels; out: radiance.
@@ -25,12 +25,12 @@ pub const PAPER_WIDTHS: [usize; 5] = [64, 128, 256, 512, 512];
 /// Channels of the detail map.
 const DETAIL: usize = 3;
 
-/// The bias of the last layer at the start, and its weights in units of Xavier's: the first outputs are dark
-/// grey. Xavier's own begin so bright that RelMSE's first steps overshoot to black.
+/// The bias of the last layer at the start, and the factor on its Xavier weights. They make the first outputs
+/// dark grey; unscaled weights make them so bright that RelMSE's first steps overshoot to black.
 const OUTPUT_BIAS: f32 = 0.2;
 const OUTPUT_GAIN: f32 = 0.1;
 
-/// How sharply the last activation bends: it is within `ln 2` of this part of a ReLU.
+/// How sharply the last activation bends: it differs from a ReLU by at most `ln 2` divided by this.
 const SHARPNESS: f32 = 16.0;
 
 /// The trained parameters of a network of these widths.
@@ -59,15 +59,16 @@ pub fn parameters(architecture: Architecture, widths: &[usize]) -> usize {
     encoders + widths.iter().enumerate().map(level).sum::<usize>() + conv(1, first, 3)
 }
 
-/// The widths at which `semc` has as many parameters as `demc` of `widths`, within 1% (Section 4.4): all
-/// of them times one factor, rounded, then moved by single channels where rounding left too much or little.
+/// The widths at which `semc` has as many parameters as `demc` of `widths`, within 1% (Section 4.4): all of
+/// them are multiplied by one factor and rounded, then changed by single channels where rounding left too
+/// many or too few parameters.
 pub fn semc_widths(widths: &[usize]) -> Vec<usize> {
     let wanted = parameters(Architecture::Demc, widths) as f64;
     let scaled = |factor: f64| -> Vec<usize> {
         widths.iter().map(|w| ((*w as f64 * factor).round() as usize).max(1)).collect()
     };
     let count = |widths: &[usize]| parameters(Architecture::Semc, widths) as f64;
-    // One encoder in place of two: between as wide and twice as wide.
+    // One encoder stands in place of two, so the factor lies between 1 and 2.
     let (mut low, mut high) = (1.0, 2.0);
     for _ in 0..30 {
         let factor = 0.5 * (low + high);
@@ -76,7 +77,7 @@ pub fn semc_widths(widths: &[usize]) -> Vec<usize> {
     let mut best = scaled(high);
     let off = |widths: &[usize]| (count(widths) / wanted - 1.0).abs();
     loop {
-        // One or two levels wider or narrower by a channel.
+        // One or two levels become wider or narrower by a channel.
         let steps = || (0..best.len()).flat_map(|level| [(level, 1), (level, -1)]);
         let changed = steps().flat_map(|one| steps().map(move |two| [one, two])).map(|steps| {
             let mut changed = best.clone();
@@ -140,7 +141,8 @@ struct Level {
 }
 
 impl Fusion {
-    /// Channels between the blocks, which the paper leaves open: those of the first level.
+    /// `width` is the number of channels between the blocks. The paper leaves it open; it is that of the
+    /// first level.
     fn new(rng: &mut Rng, width: usize) -> Self {
         let mut conv = |name: &str, i: usize, o: usize| Conv::new(rng, name, &[i], o, 3, Init::Xavier);
         Self {
@@ -181,7 +183,7 @@ impl Encoder {
         Self { units: units.collect() }
     }
 
-    /// The activations before each pool, finest first, and the latent after the last.
+    /// The activations before each pool, finest first, and the latent after the last pool.
     fn forward<T: Tape<f32, Cpu> + Merge<T>>(
         &self,
         input: Vec<Activation<T>>,
@@ -304,7 +306,8 @@ impl Demc {
     }
 }
 
-/// `ln(1 + e^(S x)) / S`: a ReLU that a step too far does not leave without a gradient.
+/// `ln(1 + e^(S x)) / S`: like a ReLU, but with a gradient on either side, so that a step too far can be
+/// undone.
 fn softplus<T: Tape<f32, Cpu> + Merge<T>>(x: Images<T>) -> Images<T> {
     let bend = ln(exp(abs(x.with_empty_tape()) * -SHARPNESS) + 1.0) / SHARPNESS;
     relu(x) + bend

@@ -1,4 +1,4 @@
-//! What every denoising method is to those that use it.
+//! The interface of every denoising method.
 
 use std::time::Instant;
 
@@ -19,7 +19,7 @@ pub trait Denoiser: Send + Sync {
     /// The passes it needs.
     fn passes(&self) -> &[Pass];
 
-    /// Those of them that it can do without, at a price that [`Denoiser::notes`] tells.
+    /// Those of [`Denoiser::passes`] that it can do without, at a price that [`Denoiser::notes`] tells.
     fn dispensable(&self) -> &[Pass] {
         &[]
     }
@@ -43,7 +43,8 @@ pub trait Denoiser: Send + Sync {
         false
     }
 
-    /// How many frames of its sequence before and after one it makes use of, see [`Shot::neighbours`].
+    /// How many frames of the sequence before a frame, and as many after it, it makes use of. See
+    /// [`Shot::neighbours`].
     fn reach(&self) -> usize {
         0
     }
@@ -75,8 +76,8 @@ pub trait Denoiser: Send + Sync {
         false
     }
 
-    /// As [`Denoiser::denoise_tiled`], and each of the companions, layers of the same frame, denoised along
-    /// with the beauty, in its place.
+    /// As [`Denoiser::denoise_tiled`]. Each of the companions, which are layers of the same frame, is
+    /// denoised along with the beauty, in place.
     ///
     /// # Errors
     /// As [`Denoiser::denoise`], or there are companions and the method takes none.
@@ -104,7 +105,7 @@ pub trait Denoiser: Send + Sync {
         Ok((self.denoise_along(shot, companions, tile)?, None))
     }
 
-    /// Whether it tells that.
+    /// Whether [`Denoiser::denoise_expecting`] tells how far off the result is expected to be.
     fn expects_errors(&self) -> bool {
         false
     }
@@ -120,14 +121,14 @@ pub trait Denoiser: Send + Sync {
         Ok(Run { image, seconds: start.elapsed().as_secs_f64(), peak_mib: None })
     }
 
-    /// Whether [`Denoiser::denoise_timed`] times the same however long cores were idle before: it warms up by
-    /// itself, or takes seconds.
+    /// Whether the time that [`Denoiser::denoise_timed`] tells does not depend on how long cores were idle
+    /// before, as the method warms up by itself or takes seconds.
     fn is_warm(&self) -> bool {
         false
     }
 }
 
-/// Stops a method that takes no companions where there are some.
+/// Fails if there are companions. For methods that take none.
 pub(super) fn refuse_companions(name: &str, companions: &[Companion]) -> Result<()> {
     if companions.is_empty() {
         return Ok(());
@@ -137,10 +138,10 @@ pub(super) fn refuse_companions(name: &str, companions: &[Companion]) -> Result<
     )))
 }
 
-/// Stops a method that does not tell how far off its results are where an `option` asks for that.
+/// Fails if a method does not tell how far off its results are, which `option` asks for.
 ///
 /// # Errors
-/// It does not.
+/// The method does not tell.
 pub fn check_expects(model: &dyn Denoiser, option: &str) -> Result<()> {
     if model.expects_errors() {
         return Ok(());

@@ -5,37 +5,37 @@ use crate::{
     planes::Planes,
 };
 
-/// The squared error to be expected of each pixel of a denoised frame, relative to the squared light there:
-/// what RelMSE ([`crate::metrics::error::relmse`]) is the mean of.
+/// The squared error to be expected of each pixel of a denoised frame, relative to the squared light there.
+/// RelMSE ([`crate::metrics::error::relmse`]) is the mean of such errors.
 #[derive(Clone, Debug)]
 pub struct ExpectedError {
-    /// Of each 4x4 square of pixels, (1, H / 4, W / 4) rounded up.
+    /// The error of each 4x4 square of pixels, (1, H / 4, W / 4) rounded up.
     squares: Planes,
     /// Columns and rows of pixels.
     size: (usize, usize),
-    /// What they are a part of, by width and height, and where they begin in it; elsewhere no error is
-    /// expected.
+    /// Width and height of the frame that they are a part of, and the column and row at which they begin in
+    /// it. No error is expected elsewhere.
     whole: (usize, usize),
     place: (usize, usize),
 }
 
 impl ExpectedError {
-    /// By squares of a frame of so many columns and rows.
+    /// The errors `squares` of a frame of `size` columns and rows.
     pub(crate) fn new(squares: Planes, size: (usize, usize)) -> Self {
         Self { squares, size, whole: size, place: (0, 0) }
     }
 
-    /// Of a frame that is kept as it is.
+    /// The errors of a frame that is kept as it is, which are zero.
     pub(crate) fn none(size: (usize, usize)) -> Self {
         Self::new(Planes::new(1, size.0.div_ceil(SQUARE), size.1.div_ceil(SQUARE)), size)
     }
 
-    /// As part of a larger frame in which nothing else was denoised.
+    /// These errors as part of a larger frame in which nothing else was denoised.
     pub(crate) fn placed_in(self, whole: (usize, usize), place: (usize, usize)) -> Self {
         Self { whole, place, ..self }
     }
 
-    /// Without so many columns at either edge, whole squares on the left.
+    /// These errors without `columns` columns at either edge, which on the left must be whole squares.
     pub(crate) fn without_margins(self, columns: usize) -> Self {
         let width = self.size.0 - 2 * columns;
         let at = (columns / SQUARE, 0);
@@ -56,7 +56,7 @@ impl ExpectedError {
         sum / (self.whole.0 * self.whole.1).max(1) as f64
     }
 
-    /// Of every pixel, (1, H, W).
+    /// The error of every pixel, (1, H, W).
     pub fn plane(&self) -> Planes {
         let Self { squares, size: (width, height), whole, place } = self;
         let part = Planes::from_rows(1, (*width, *height), |_, y, row| {

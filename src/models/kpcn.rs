@@ -6,12 +6,12 @@
 //! pixel, a softmax kernel over 21x21 pixels; diffuse light is filtered without its albedo, specular light
 //! as a logarithm.
 //!
-//! Departures: (1) variance comes from neighbouring pixels, since Cycles writes none of its samples;
-//! (2) exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
+//! Departures: (1) variance comes from neighbouring pixels, since Cycles writes none of its samples; (2)
+//! exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
 //! networks knew one studio's exposure; (3) both streams are trained at once, end to end, with any of
-//! `demc train`'s losses; (4) without light passes one stream filters Combined over Denoising Albedo,
-//! with a larger floor; (5) emission and environment are added back unfiltered, volumes count as
-//! specular; (6) the default width is 32; `--widths 100` is the published one.
+//! `demc train`'s losses; (4) without light passes one stream filters Combined over Denoising Albedo, with a
+//! larger floor; (5) emission and environment are added back unfiltered, and volumes count as specular; (6)
+//! the default width is 32; `--widths 100` is the published one.
 
 use dfdx::{
     tensor::{Cpu, Merge, NoneTape, Tape},
@@ -46,10 +46,11 @@ const TAPS: usize = 5;
 /// Rows and columns of the kernels.
 const KERNEL: usize = 21;
 
-/// The last layer begins this much smaller than Xavier: kernels start nearly flat.
+/// Factor on the last layer's Xavier weights at the start, so that kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
-/// A frame is worked on in tiles beyond this many pixels: each has 441 kernel weights, held twice.
+/// A frame of more pixels than this is worked on in tiles, since each pixel has 441 kernel weights, which are
+/// held twice.
 const WHOLE_FRAME_PIXELS: usize = 1 << 18;
 
 /// KPCN with its two streams.
@@ -61,7 +62,7 @@ pub static DESIGN: Design = Design {
     build: |config, seed| Box::new(Kpcn::new(config, seed)),
 };
 
-/// KPCN with one.
+/// KPCN with a single stream over Combined.
 pub static COMBINED: Design = Design {
     inputs: "kpcn-combined/logarithm/1",
     least_parameters: |config| stream_parameters(1, config),

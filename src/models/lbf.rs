@@ -28,7 +28,7 @@ use crate::{
     rng::Rng,
 };
 
-/// Hidden units as published.
+/// Number of hidden units as published.
 pub const PUBLISHED_WIDTH: usize = 10;
 
 /// The network as published.
@@ -42,7 +42,7 @@ const RADIUS: usize = 10;
 /// Parameters of the filter: position, colour, each group of features.
 const PRECISIONS: usize = 2 + LBF_GROUPS.len();
 
-/// The last layer's bias at the start: precisions near 0.2, a wide filter.
+/// The last layer's bias at the start: it makes precisions near 0.2 and so a wide filter.
 const START: f32 = -1.5;
 
 /// Softplus is linear beyond; `exp` must not overflow.

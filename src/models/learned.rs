@@ -22,9 +22,9 @@ use crate::{
 };
 
 /// The built-in model that looks at a frame twice, the second time upside down and with its quads of 2x2
-/// pixels one pixel further on, and answers with the mean: what a network gets wrong depends on how its quads
-/// and levels happen to lie on the picture, and half of that averages out (Lim et al. 2017 call it a
-/// geometric self-ensemble). It has the weights of `demc-m`.
+/// pixels one pixel further on, and answers with the mean. A network's errors depend on how its quads and
+/// levels happen to lie on the picture, and half of them average out (Lim et al. 2017 call this a geometric
+/// self-ensemble). It has the weights of `demc-m`.
 pub const TURNED: &str = "demc-l";
 
 /// What [`TURNED`] does to a frame of odd width and height.
@@ -84,16 +84,16 @@ impl Learned {
         Ok(self)
     }
 
-    /// The network. What changes its layers or their parameters, or may, thaws them, and those of 8 bits
-    /// compute only while they are frozen: [`Network::freeze`] follows.
+    /// The network. Whatever changes its layers or their parameters, or may change them, unfreezes them.
+    /// Layers of 8 bits compute only while they are frozen, so [`Network::freeze`] has to be called
+    /// afterwards.
     pub fn network(&mut self) -> &mut dyn Network {
         &mut *self.network
     }
 
-    /// The denoised frame, looked at upside down. Of an even width or height, the same pixels would share a
-    /// quad as before, so a column or row is added at what becomes the beginning; fireflies are tamed
-    /// before it mirrors them, since two would be company for each other. The clean guides are those of the
-    /// first look.
+    /// Denoises the frame upside down. If its width or height is even, the same pixels would share a quad as
+    /// before, so a column or row is added, which becomes the first. It mirrors pixels, so fireflies are
+    /// tamed before: two side by side would not count as such. The clean guides are those of the first look.
     fn second_look(
         &self,
         passes: &PassSet,
@@ -154,7 +154,7 @@ impl Denoiser for Learned {
             return Some(format!("{}: {note}", self.name));
         }
         let PassSet { view_layer, renderer, .. } = &shot.passes;
-        // What is there and blank, `demc inspect` tells.
+        // Passes that are there but blank are left to `demc inspect`.
         let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none();
         let missed: Vec<Pass> = self.dispensable().iter().copied().filter(is_missing).collect();
         let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
@@ -203,8 +203,8 @@ impl Denoiser for Learned {
 }
 
 impl Learned {
-    /// The part of a frame that was rendered, denoised in its place; with the error to be expected if it
-    /// `expects` one.
+    /// Denoises the part of a frame that was rendered, in its place. If the caller `expects` it, the error to
+    /// be expected is returned as well.
     fn denoise_rendered(
         &self,
         shot: &Shot,
@@ -230,7 +230,7 @@ impl Learned {
         Ok((part.placed_in(whole, place), error.map(|error| error.placed_in(whole, place))))
     }
 
-    /// What the network makes of a frame, and no more of it than there was noise.
+    /// What the network makes of a frame, after [`Shrinkage`] took back what it changed beyond the noise.
     fn restrained(
         &self,
         passes: &PassSet,
@@ -244,7 +244,7 @@ impl Learned {
         let (exposure, samples) = (exposure(radiance), passes.samples);
         let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
         let size = (passes.width, passes.height);
-        // A clear sky, a black frame: all would be taken back that a network made of it.
+        // Of such a frame, as a clear sky or a black frame, all that a network made would be taken back.
         let shrinkage = Shrinkage::of(&render);
         if shrinkage.keeps_whole() {
             let mut image = radiance.clone();
@@ -266,7 +266,7 @@ impl Learned {
         Ok((image, error))
     }
 
-    /// What the network makes of a frame, all of it: see [`Shrinkage`].
+    /// What the network makes of a frame, of which [`Shrinkage`] has taken nothing back.
     ///
     /// # Errors
     /// A pass is missing.
@@ -291,18 +291,19 @@ impl Learned {
     }
 }
 
-/// Makes planes the mean of two.
+/// Replaces planes by the mean of two.
 fn average(first: &mut Planes, second: &Planes) {
     first.data.iter_mut().zip(&second.data).for_each(|(first, second)| *first = 0.5 * (*first + second));
 }
 
-/// Of the pixels around a region that was rendered of a frame, the share that holds something.
+/// Least share of the pixels along the edge of a part of a frame that must hold something for the part to be
+/// a rendered region.
 const FILLED: f64 = 0.9;
 
-/// Column and row, width and height of the part of a frame that was rendered. Where that was a region, all
-/// else is zero in every pass, which is no black wall: what lies beyond a region is unknown. Things before a
-/// transparent background fill a part of the frame as well, but not to its edges; such a frame is taken
-/// whole.
+/// Column and row, width and height of the part of a frame that was rendered. Where only a region was
+/// rendered, all else is zero in every pass. That is no black wall, since what lies beyond a region is
+/// unknown. Things before a transparent background also fill a part of the frame, but not all along the edges
+/// of that part; such a frame is taken whole.
 fn rendered(passes: &PassSet) -> ((usize, usize), (usize, usize)) {
     let (width, height) = (passes.width, passes.height);
     let whole = ((0, 0), (width, height));

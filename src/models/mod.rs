@@ -39,9 +39,9 @@ impl Denoiser for Noisy {
     }
 }
 
-/// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32`,
-/// `:bf16` or `:int8`, which chooses its arithmetic; without it, the fastest one that network and processor
-/// have.
+/// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32`, `:bf16`
+/// or `:int8`, which chooses its arithmetic; without that, it is the fastest that both the network and the
+/// processor have.
 ///
 /// # Errors
 /// No built-in method or readable weights file goes by that name, or it has no such arithmetic.
@@ -72,8 +72,8 @@ pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
     }
 }
 
-/// The widths of a network for those asked for: `semc` gets what makes it as large as `demc` of them,
-/// every other network gets them as they are.
+/// The widths of a network when the widths `asked` are wanted. `semc` gets those at which it is as large as a
+/// `demc` of the widths asked for, and every other network gets the latter as they are.
 pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {
     match architecture {
         Architecture::Semc if asked.len() == demc::PAPER_WIDTHS.len() => demc::semc_widths(asked),
@@ -107,8 +107,8 @@ pub fn check(config: &Config) -> Result<(), String> {
     Ok(())
 }
 
-/// Fewer parameters than the network of a configuration has, but not by far: a file that holds fewer is not
-/// asked for memory to build it in.
+/// A lower bound of the number of parameters of a configuration's network, and at least a 48th of it. For a
+/// file that holds fewer, no network is built, so that it cannot make demc take much memory.
 ///
 /// # Panics
 /// If [`check`] finds the configuration wrong.
@@ -131,7 +131,7 @@ mod tests {
     #[test]
     fn parameters_are_told_before_they_are_built() {
         let mut configs: Vec<Config> = trainable().map(|(_, config)| config).collect();
-        // The least and the most that levels of other widths need between them.
+        // The extremes of what the connections between levels of different widths need.
         configs.push(Config::new(Architecture::Prefilter, &[64, 8, 8, 8]));
         configs.push(Config::new(Architecture::Prefilter, &[8, 8, 8, 96]));
         configs.push(Config::new(Architecture::Demc, &[8, 8, 8, 8, 96]));

@@ -18,15 +18,15 @@ use crate::{
 /// The tape of a training step.
 pub type Taped = OwnedTape<f32, Cpu>;
 
-/// Which network, and how wide: with the parameters, all there is to know of one.
+/// Which network it is, and how wide. Together with its parameters, this describes a network fully.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Config {
     /// The design.
     pub architecture: Architecture,
     /// Channels at each level, finest first.
     pub widths: Vec<usize>,
-    /// Those of a built-in network's prefilter, which denoises albedo and normal first; other networks have
-    /// none.
+    /// Channels at each level of a built-in network's prefilter, which denoises albedo and normal first.
+    /// Other networks have no prefilter.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub prefilter: Vec<usize>,
 }
@@ -61,7 +61,7 @@ pub enum Architecture {
     Semc,
     /// The built-in kernel-predicting dual encoder.
     Pyramid,
-    /// The same design, which denoises albedo and normal for it.
+    /// The prefilter: the same design, which denoises albedo and normal for [`Architecture::Pyramid`].
     Prefilter,
     /// KPCN with its two streams, diffuse and specular.
     Kpcn,
@@ -75,8 +75,8 @@ pub enum Architecture {
 pub struct Design {
     /// Feature set and transfer of radiance, as weights files record them. The number goes up whenever a
     /// value that the network reads or writes comes to mean something else, as by another constant in
-    /// `features`: weights from before are then refused, where they would be run on what they were not
-    /// trained on.
+    /// `features`: weights from before are then refused, instead of run on inputs that they were not trained
+    /// on.
     pub inputs: &'static str,
     /// How many widths it takes.
     pub levels: usize,
@@ -108,7 +108,8 @@ impl Architecture {
     }
 }
 
-/// Parameters of as many 3x3 convolutions between as many channels as each level has.
+/// Number of weights of `convolutions` 3x3 convolutions at each level, each from as many channels as the
+/// level has to as many.
 pub fn convolution_weights(convolutions: usize, widths: &[usize]) -> usize {
     convolutions * 9 * widths.iter().map(|width| width * width).sum::<usize>()
 }
@@ -175,7 +176,8 @@ pub trait Network: Send + Sync {
         self.targets() == [Pass::Combined]
     }
 
-    /// What it should make of a frame, by its reference: radiance, (3, H, W), if [`Network::makes_radiance`].
+    /// What it should make of a frame, taken from the frame's reference: radiance, (3, H, W), if
+    /// [`Network::makes_radiance`].
     ///
     /// # Errors
     /// A pass is missing.
@@ -223,11 +225,11 @@ pub trait Network: Send + Sync {
     /// Multiply-accumulates for one pixel of the frame.
     fn macs_per_pixel(&self) -> f64;
 
-    /// How far, in pixels, an output pixel can see to either side.
+    /// How far, in pixels, the inputs that an output pixel depends on reach to either side.
     fn reach(&self) -> usize;
 
-    /// Denoised radiance of a frame, (3, H, W), worked on in parts of `tile` rows (and columns, where the
-    /// network is cut both ways), whatever their size to the same bits.
+    /// Denoised radiance of a frame, (3, H, W). The frame is worked on in parts of `tile` rows (and columns,
+    /// where the network is cut both ways), and the result is the same to the bit for parts of any size.
     ///
     /// # Errors
     /// A pass is missing.
@@ -235,7 +237,7 @@ pub trait Network: Send + Sync {
         run_tiled(self, passes, tile)
     }
 
-    /// The passes of a frame that it denoises before radiance, denoised; none if there are none.
+    /// The denoised versions of those passes of a frame that it denoises before radiance, if there are any.
     ///
     /// # Errors
     /// A pass is missing.
@@ -246,7 +248,7 @@ pub trait Network: Send + Sync {
     /// [`Network::infer`] and [`Network::infer_along`] where [`Network::clean_guides`] are known.
     ///
     /// # Errors
-    /// As theirs.
+    /// As for these functions.
     fn infer_with(
         &self,
         passes: &PassSet,
@@ -284,8 +286,8 @@ pub(super) fn duplicate(network: &(impl Network + Clone + 'static)) -> Box<dyn N
     Box::new(copy)
 }
 
-/// What [`Network::whole_frame_pixels`] is for most: activations of an 8K frame would take more memory
-/// than a workstation has.
+/// [`Network::whole_frame_pixels`] of most networks: activations of an 8K frame would take more memory than a
+/// workstation has.
 const WHOLE_FRAME_PIXELS: usize = 8 << 20;
 
 /// [`Network::infer`] for any network: radiance, (3, H, W), at once or in tiles of `tile` rows and columns.
@@ -298,7 +300,8 @@ fn run_tiled<N: Network + ?Sized>(network: &N, passes: &PassSet, tile: Option<us
     let mut inputs = network.inputs(passes)?.padded(multiple);
     let (width, height) = (inputs.planes[0].width, inputs.planes[0].height);
     let most = network.whole_frame_pixels();
-    // A tile is a square of half of what may be worked on at once: it sees beyond its edge as well.
+    // A tile is a square of half as many pixels as may be worked on at once, because it reads pixels beyond
+    // its edge as well.
     let default = if width * height > most { (most / 2).isqrt() } else { width.max(height) };
     let tile = tile.unwrap_or(default).next_multiple_of(multiple);
     let reach = network.reach().next_multiple_of(multiple);
@@ -306,7 +309,7 @@ fn run_tiled<N: Network + ?Sized>(network: &N, passes: &PassSet, tile: Option<us
     let mut last_seen = None;
     for y in (0..height).step_by(tile) {
         for x in (0..width).step_by(tile) {
-            // The tile, and what it sees: both clipped to the frame.
+            // The tile, and the pixels that it reads; both are clipped to the frame.
             let size = (tile.min(width - x), tile.min(height - y));
             let (x0, y0) = (x.saturating_sub(reach), y.saturating_sub(reach));
             let seen = ((x + size.0 + reach).min(width) - x0, (y + size.1 + reach).min(height) - y0);

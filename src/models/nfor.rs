@@ -2,8 +2,8 @@
 //! Weighted First-order Regression for Denoising Monte Carlo Renderings" (Computer Graphics Forum 35:4).
 //!
 //! In: Combined, Denoising Albedo, Denoising Normal, and a depth where there is one. Where the shot has half
-//! buffers, they alone are used, as published; else noise is estimated from neighbouring pixels, and the
-//! method says so.
+//! buffers, only they are used, as published. Else noise is estimated from neighbouring pixels, and the
+//! method says so in a note.
 //!
 //! Departures: (1) with half buffers variance comes from their difference, averaged over 7x7 pixels, not
 //! from the renderer's sample variance; (2) without them nothing is cross-buffered: variance is the
@@ -38,7 +38,7 @@ const SELECTION: Comparison = Comparison { window: 9, patch: 1, k: 1.0, variance
 const LAST_FEATURES: Comparison = Comparison { window: 2, patch: 3, k: 0.5, variance_scale: 1.0 };
 /// Section 5.3: the bandwidths to select from.
 const BANDWIDTHS: [f32; 2] = [0.5, 1.0];
-/// The variance of half a buffer in that of the whole.
+/// The variance of a half buffer, in units of the variance of the whole.
 const HALF: f32 = 2.0;
 /// Radius over which estimates of variance are averaged.
 const VARIANCE_RADIUS: usize = 3;
@@ -151,7 +151,7 @@ fn from_halves([mut a, mut b]: [Buffer; 2]) -> Planes {
     let wide = selection(&narrow_error, &wide_error, &guide, &noise);
     let (result_a, result_b) = (blend(&narrow_a, &wide_a, &wide), blend(&narrow_b, &wide_b, &wide));
 
-    // Section 5.4: the second pass over the mean of both, with what noise they still show.
+    // Section 5.4: the second pass over the mean of both, with the noise that their difference still shows.
     let features: Vec<Planes> = mean_features
         .iter()
         .zip(&feature_noise)
@@ -187,7 +187,7 @@ fn from_one(mut buffer: Buffer) -> Planes {
     let [(narrow, narrow_influence, narrow_error), (wide, wide_influence, wide_error)] = candidates;
     let selected = selection(&narrow_error, &wide_error, colour, &noise);
     let result = blend(&narrow, &wide, &selected);
-    // A mean of n pixels leaves 1/n of their variance, and follows its own pixel by as much.
+    // A mean of n pixels has 1/n of their variance, and follows its own pixel by as much.
     let influence = blend(&narrow_influence, &wide_influence, &selected);
     let mut left = noise;
     let n = result.pixels();
@@ -203,8 +203,8 @@ fn second_pass(result: &Planes, features: &Planes, noise: &Planes, scale: f32) -
     out
 }
 
-/// Section 5.3: how far each pixel takes the wide bandwidth, 0 to 1, (1, H, W): the one with the smaller
-/// smoothed error, then smoothed itself.
+/// Section 5.3: how far each pixel takes the wide bandwidth, 0 to 1, (1, H, W). First the bandwidth with the
+/// smaller smoothed error is chosen, then this choice is smoothed itself.
 fn selection(narrow_error: &Planes, wide_error: &Planes, guide: &Planes, noise: &Planes) -> Planes {
     let weights = Weights::new(guide, noise, SELECTION);
     // Smoothing is linear: the sign of the smoothed difference says which smoothed error is smaller.

@@ -34,14 +34,15 @@ pub struct Oidn {
 }
 
 impl Oidn {
-    /// The method by its name. `program` is the path of `oidnDenoise`; by default that of the
-    /// environment variable `OIDN_DENOISE`, else the one on the search path. None for other names.
+    /// The method by its name. `program` is the path of `oidnDenoise`; by default that of the environment
+    /// variable `OIDN_DENOISE`, else the one on the search path. For a name that is not in [`NAMES`] there is
+    /// no method.
     pub fn new(name: &str, program: Option<PathBuf>) -> Option<Self> {
         let name = NAMES.into_iter().find(|n| *n == name)?;
         let program: PathBuf =
             program.or_else(|| std::env::var_os(VARIABLE).map(Into::into)).unwrap_or_else(|| PROGRAM.into());
-        // It runs in another folder, to which a path must not refer; a bare name is looked for on the search
-        // path.
+        // The program runs in another folder, so a relative path is made absolute. A bare name is looked for
+        // on the search path.
         let is_bare = program.components().count() == 1;
         let absolute = (!is_bare).then(|| std::path::absolute(&program).ok()).flatten();
         Some(Self { name, program: absolute.unwrap_or(program) })
@@ -55,7 +56,7 @@ impl Oidn {
         Box::new(Self::new(name, None).expect("the catalogue's names are those of the qualities"))
     }
 
-    /// Where the program lies: for a bare name, the first on the search path.
+    /// Where the program lies. For a bare name it is the first on the search path.
     pub fn program(&self) -> PathBuf {
         let path = std::env::var_os("PATH").unwrap_or_default();
         let mut found = std::env::split_paths(&path).map(|folder| folder.join(&self.program));

@@ -2,22 +2,22 @@
 //!
 //! As in DEMC, guides and radiance are encoded apart and fused at every level of the decoder. The rest
 //! follows what measurement favoured: the trunk works on quads, 2x2 pixels (space to depth), and each level
-//! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et
-//! al. 2018), after it was blended with what filtering made of the level below: a level's own kernels
-//! come last, and smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied
-//! by it last, so texture is never blurred with the noise. A confidence for every pixel and level lets a
-//! firefly take itself out of all kernels at once.
+//! predicts softmax kernels that filter that level of a radiance pyramid (Bako et al. 2017; Vogels et al.
+//! 2018). Before it is filtered, a level is blended with the filtered level below, so that its own kernels
+//! smooth what upsampling left uneven. Radiance is divided by albedo first and multiplied by it last, so
+//! texture is never blurred with the noise. A confidence for every pixel and level takes a firefly out of all
+//! kernels at once.
 //!
-//! Kernels cannot invent a colour, and scale with their input exactly; nor can they draw an edge finer than
-//! the noise that they average. So each colour of each pixel gets a bounded gain last, which scales with the
-//! input as well.
+//! Kernels cannot invent a colour, and their output scales with their input exactly. But neither can they
+//! draw an edge finer than the noise that they average. So each colour of each pixel is multiplied by a
+//! bounded gain last, which keeps this scaling.
 //!
-//! Noise in the albedo (depth of field, 4 spp edges) is removed before: the built-in networks read it from a
-//! prefilter, a small network of the same kind, which was trained by itself and is not trained any further.
-//! Its kernels filter the normal alike, for the [refit](crate::filters::refit) that comes last. The samples
-//! that made an albedo noisy made the radiance noisy alike, though, and their quotient is free of that noise:
-//! so each pixel says how far it is to be divided by the noisy albedo, not by the clean one. Normals are read
-//! as noisy as they are for the same reason.
+//! Noise in the albedo (depth of field, 4 spp edges) is removed before the network reads it, by a prefilter:
+//! a small network of the same kind, which was trained by itself and is not trained any further. Its kernels
+//! filter the normal as well, for the [refit](crate::filters::refit) that comes last. But the samples that
+//! made an albedo noisy made the radiance noisy in the same way, and their quotient is free of that noise. So
+//! each pixel says how far it is to be divided by the noisy albedo instead of the clean one. For the same
+//! reason the network reads normals as noisy as they are.
 //!
 //! What normals alone show, such as a moulding, is often thinner than any kernel that is wide enough to
 //! average its noise. A fit of light over normals ([`Shading`]) finds it; each pixel says how far its gain is
@@ -72,22 +72,23 @@ pub fn prefilter() -> Config {
     Config::new(Architecture::Prefilter, &PREFILTER_OF_M)
 }
 
-/// Rows and columns of the radiance kernels at full resolution: what is as thin as a pixel there, texture and
-/// edges, was divided away with the guides, whose own kernels need more than nine pixels to average along it.
+/// Rows and columns of the radiance kernels at full resolution. They can be small, since division by the
+/// albedo removes texture and edges as thin as a pixel. The prefilter's own kernels must average along these
+/// and need more than nine pixels.
 const FULL_KERNEL: usize = 3;
 
 /// What the names of a prefilter's layers begin with.
 pub const PREFILTER: &str = "prefilter.";
 
-/// Who asks for passes, in messages.
+/// What needs the passes, in error messages.
 const NEEDED_BY: &str = "this model";
 
-/// The trunk that reads albedo, normal, and how noisy the albedo was.
+/// The trunk of the network, whose guides are albedo, normal, and how noisy the albedo was.
 const TRUNK: Variant = Variant { prefix: "", guides: 7, full_kernel: FULL_KERNEL, refines: true };
 
 /// The kernel-predicting dual encoder with its prefilter.
 pub static DESIGN: Design = Design {
-    // Those of a prefilter as well, since it may be part of a pyramid, and come out of one.
+    // A prefilter has the same inputs, since its weights may go into a pyramid or be taken from one.
     inputs: "guides/logarithm/1",
     levels: LEVELS,
     prefilter_levels: LEVELS,
@@ -145,7 +146,7 @@ fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &Stacked) -> Field<T> {
     Field::input((shape.n, shape.c, shape.h, shape.w), values)
 }
 
-/// What a refit multiplies denoised images by, (N, 3, H, W).
+/// The factors by which a refit multiplies denoised images, (N, 3, H, W).
 fn factors(image: &[f32], light: &Stacked, normal: &Stacked, albedo: &Stacked) -> Stacked {
     let (shape, pixels) = (light.0, light.0.h * light.0.w);
     let size = (shape.w, shape.h);

@@ -58,8 +58,8 @@ pub struct Facts {
     /// The weights file whose prefilter it got, if not the built-in one or that of `init`.
     #[serde(default)]
     pub prefilter: Option<String>,
-    /// The names of the parameters that alone were trained, `*` for any part of one; if there are none, all
-    /// were.
+    /// If not all parameters were trained, the names of those that were, with `*` for any part of a name;
+    /// else empty.
     #[serde(default)]
     pub only: Vec<String>,
     /// Seconds of training.
@@ -81,8 +81,8 @@ fn adam() -> String {
 pub struct Metadata {
     /// The network.
     pub network: Config,
-    /// What it was trained to read, see [`Architecture::inputs`]; files without it hold the first that there
-    /// were.
+    /// What it was trained to read, see [`Architecture::inputs`]. Files that do not say were trained on
+    /// version 1.
     #[serde(default)]
     pub inputs: Option<String>,
     /// How it was trained.
@@ -120,8 +120,9 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
     parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
 }
 
-/// Reads the network `config` from a weights file that holds it, or a narrower one of the same design:
-/// the wider network then begins as the same function, with what `seed` draws (see `Conv::widen_from`).
+/// Reads the network `config` from a weights file that holds it, or a narrower one of the same design. In the
+/// latter case the wider network begins as the same function; `seed` draws how weights are divided (see
+/// `Conv::widen_from`).
 ///
 /// # Errors
 /// As [`read`], or the file holds another network.
@@ -130,7 +131,7 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
     let (metadata, tensors) = metadata(&bytes, path)?;
     let held = &metadata.network;
     let mut network = super::build(config, seed);
-    // The same widths may be another version's, with smaller kernels.
+    // A file of the same widths may be of another version, with smaller kernels.
     let mut misfit = None;
     if held == config {
         match fill(&mut *network, &tensors, path) {
@@ -160,7 +161,8 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
     }))
 }
 
-/// The widths of the prefilter that a weights file can give: that of its network, or its network itself.
+/// The widths of the prefilter that a weights file can give: its network's prefilter, or its network if that
+/// is a prefilter itself.
 ///
 /// # Errors
 /// As [`read`], or it is no network that can prefilter.
@@ -182,7 +184,7 @@ pub fn prefilter_widths(path: &Path) -> Result<Vec<usize>> {
 /// As [`read`], or it is not what [`prefilter_widths`] says.
 pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Result<()> {
     let (_, tensors) = metadata(bytes, path)?;
-    // A prefilter by itself has no prefix to its names.
+    // In a file of a prefilter alone, names have no prefix.
     let within = tensors.iter().any(|t| t.name.starts_with(PREFILTER));
     for param in network.params() {
         let Some(name) = param.name.strip_prefix(PREFILTER) else { continue };
@@ -220,7 +222,7 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
     super::check(&metadata.network).map_err(|reason| Error::invalid(path, reason))?;
     check_inputs(metadata.inputs.as_deref(), metadata.network.architecture.inputs())
         .map_err(|reason| Error::invalid(path, reason))?;
-    // Before a network is built for them.
+    // Checked before a network is built, which takes memory.
     let held: usize = tensors.iter().map(|tensor| tensor.values.len()).sum();
     if held < super::least_parameters(&metadata.network) {
         let why = format!("holds {held} values, too few for {}; the file is damaged", metadata.network);
@@ -233,8 +235,8 @@ fn metadata(bytes: &[u8], path: &Path) -> Result<(Metadata, Vec<Tensor>)> {
     Ok((metadata, tensors))
 }
 
-/// Whether a network that was trained on the inputs `held` reads those that are made `now`; why not, if it
-/// does not. Files that do not say hold the first of their kind.
+/// Checks whether a network that was trained on the inputs `held` can read those that are made `now`; the
+/// error says why not. Files that do not say count as version 1 of their kind.
 fn check_inputs(held: Option<&str>, now: &str) -> Result<(), String> {
     let (kind, _) = now.rsplit_once('/').expect("inputs end in a number");
     let first = format!("{kind}/1");
@@ -319,7 +321,7 @@ mod tests {
         let error = read(&path).err().unwrap().to_string();
         let named = ["weights.safetensors", "guides/logarithm/0", "guides/logarithm/1", "train it anew"];
         assert!(named.iter().all(|part| error.contains(part)), "{error}");
-        // Those from before they were recorded are read as ever.
+        // Files from before inputs were recorded can still be read.
         let (_, path) = changed(folder.path(), |metadata, _| {
             metadata.as_object_mut().unwrap().remove("inputs");
         });

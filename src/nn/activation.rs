@@ -11,8 +11,8 @@ use crate::kernels::{
     narrow::Operand,
 };
 
-/// The gradient of one activation or field while the tape runs backward; `None` until something flows in.
-/// Nobody waits for the lock: it lets what has no tape go to another thread.
+/// The gradient of one activation or field while the tape runs backward; `None` until something is added. No
+/// thread ever waits for the lock; it is there so that activations without a tape can move to another thread.
 #[derive(Debug)]
 pub(super) struct Gradient<B>(Arc<Mutex<Option<B>>>);
 
@@ -29,12 +29,13 @@ impl<B> Default for Gradient<B> {
 }
 
 impl<B> Gradient<B> {
-    /// What has flowed in, if anything.
+    /// Takes the gradient that was added so far, if any.
     pub fn take(&self) -> Option<B> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    /// Lets `write` add to it, or to what `fresh` makes, and tells it which.
+    /// Lets `write` add to the gradient, or to what `fresh` makes if there is none yet. It tells `write`
+    /// whether the gradient is fresh.
     pub fn accumulate(&self, fresh: impl FnOnce() -> B, write: impl FnOnce(&mut B, bool)) {
         let mut slot = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let is_fresh = slot.is_none();
@@ -75,7 +76,7 @@ impl Data {
 #[derive(Clone, Debug)]
 pub(super) struct Saved {
     pub data: Arc<Data>,
-    /// `None` for network inputs and what untrained layers make of them, whose gradient nobody asks for.
+    /// `None` for network inputs and what untrained layers make of them, whose gradient is not needed.
     pub gradient: Option<Gradient<Buffer>>,
 }
 
@@ -194,8 +195,8 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         values.saved.data.view().data().iter().flat_map(|block| block.0).fold(0.0, f32::max)
     }
 
-    /// Wraps the output of an operation; whether it `learns`: it has trained parameters, or reads what has a
-    /// gradient.
+    /// Wraps the output of an operation. The operation `learns` if it has trained parameters, or reads
+    /// something that has a gradient.
     pub(super) fn output(data: Data, tape: T, learns: bool) -> (Self, Saved) {
         let saved = Saved { data: Arc::new(data), gradient: learns.then(Gradient::default) };
         (Self { saved: saved.clone(), tape }, saved)

@@ -85,8 +85,8 @@ impl Arithmetic {
         }
     }
 
-    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for, of narrow weights rounded to a
-    /// format or not. `taped` is for training.
+    /// `relu(bias + conv(sources, weights))`, the ReLU only where asked for. With narrow weights, the output
+    /// is rounded to the `format`, if there is one. `taped` is for training.
     pub(super) fn forward(
         &self,
         sources: &[&Data],
@@ -150,7 +150,8 @@ impl Arithmetic {
         values
     }
 
-    /// Those of a layer's sources that are not narrow, rounded to what its weights are to be multiplied with.
+    /// For each of a layer's sources that is not narrow, a copy rounded to the format that the weights are to
+    /// be multiplied with.
     fn narrowed(&self, sources: &[&Data], weights: &narrow::conv::Weights) -> Vec<Option<Operand>> {
         let narrow = |(source, format): (&&Data, Format)| match (source, format) {
             (Data::Narrow(_), _) => None,
@@ -223,8 +224,8 @@ impl Arithmetic {
     }
 }
 
-/// [`conv::convolve`] in training: by cells of outputs where that is faster, though sums are then rounded
-/// otherwise where a frame is cut otherwise.
+/// [`conv::convolve`] in training: by cells of outputs where that is faster. How sums are rounded then
+/// depends on how a frame is cut.
 fn convolve_taped(
     tier: Tier,
     sources: &[View],
@@ -243,7 +244,7 @@ fn convolve_taped(
     }
 }
 
-/// The sources of a layer, all narrow; `narrowed` are those that were not.
+/// The sources of a layer, all narrow. `narrowed` holds copies of those that were not.
 fn operands<'a>(sources: &[&'a Data], narrowed: &'a [Option<Operand>]) -> Vec<&'a Operand> {
     let operand = |(source, narrowed): (&&'a Data, &'a Option<Operand>)| match source {
         Data::Narrow(operand) => operand,

@@ -1,4 +1,4 @@
-//! Planar images on the tape: where predicted kernels meet the radiance they filter.
+//! Planar images on the tape, among them the radiance that predicted kernels filter.
 
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ pub type Extent = (usize, usize, usize, usize);
 struct Values {
     extent: Extent,
     data: Arc<PlaneBuffer>,
-    /// Where they begin.
+    /// Index in `data` at which the values begin.
     first: usize,
 }
 
@@ -57,7 +57,7 @@ impl Values {
 #[derive(Clone, Debug)]
 struct Saved {
     values: Values,
-    /// `None` for inputs, whose gradient nobody asks for.
+    /// `None` for inputs, whose gradient is not needed.
     gradient: Option<Gradient<PlaneBuffer>>,
 }
 
@@ -67,7 +67,7 @@ impl Saved {
         self.gradient.as_ref().and_then(Gradient::take)
     }
 
-    /// Lets `add` add to the gradient, zeros at first; hands it nothing for an input.
+    /// Lets `add` add to the gradient, which is zero at first. For an input, `add` receives `None`.
     fn accumulate(&self, add: impl FnOnce(Option<&mut [f32]>)) {
         match &self.gradient {
             Some(gradient) => {
@@ -397,8 +397,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Radiance over one albedo, an input (N, 3, H, W), divided by another as far as `logits`, (N, 1, H, W),
-    /// say; `ratio` is the logarithm of the first albedo over the second. See [`crate::kernels::redivide`].
+    /// Turns this field, an input of radiance over one albedo, (N, 3, H, W), into radiance over another, as
+    /// far as `logits`, (N, 1, H, W), say. `ratio` is the logarithm of the first albedo over the second. See
+    /// [`crate::kernels::redivide`].
     ///
     /// # Panics
     /// If extents differ.
@@ -429,9 +430,9 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
         field
     }
 
-    /// Blends this level, (N, 3, H, W), with the one below, (N, 3, H/2, W/2): whose share before the logistic
-    /// is `alpha`, (N, 1, H, W), and whose upsampling has the logits `corners`, (N, 4, H, W). See
-    /// [`crate::kernels::blend`].
+    /// Blends this level, (N, 3, H, W), with the coarse one below, (N, 3, H/2, W/2). `alpha`, (N, 1, H, W),
+    /// is the share of the coarse level before the logistic, and `corners`, (N, 4, H, W), are the logits of
+    /// its upsampling. See [`crate::kernels::blend`].
     ///
     /// # Panics
     /// If extents do not fit together.
@@ -453,7 +454,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
             field.tape.add_backward_op(move |_| {
                 let Some(gradient) = out.take() else { return Ok(()) };
                 let levels = (&fine.values, &below.values);
-                // A fine level that is the network's input gets no gradient; the kernel's goes nowhere.
+                // A fine level that is the network's input has no gradient; what the kernel adds to it is
+                // dropped.
                 let mut nowhere = plane_buffer(0);
                 let run = |fine: &mut [f32], coarse: &mut [f32], alpha: &mut [f32], corners: &mut [f32]| {
                     fine.par_chunks_mut(3 * pixels)
@@ -526,8 +528,9 @@ impl Field<NoneTape> {
         Self { saved: Saved { values, gradient: None }, tape: NoneTape }
     }
 
-    /// [`Field::filter`], all alike, of some rows of fields that hold more rows of one image each: `logits`
-    /// are of those rows only, `confidence` of all. (1, 3, H, W) -> (1, 3, R, W)
+    /// [`Field::filter`] of some rows of several fields by the same kernels. Each field holds one image, and
+    /// may hold more rows of it. `logits` are of the filtered rows only, `confidence` of all rows that the
+    /// fields hold. (1, 3, H, W) -> (1, 3, R, W)
     ///
     /// # Panics
     /// As [`Field::filter`], or if there are not as many rows.
@@ -573,7 +576,7 @@ fn masks_of((alpha, corners): &(Values, Values), n: usize) -> Masks<'_> {
     Masks { alpha: alpha.image(n), corners: corners.image(n) }
 }
 
-/// The forward problem of image `n`.
+/// The filter of image `n`.
 fn filter_of(
     (image, logits, confidence): &(Values, Values, Option<Values>),
     n: usize,

@@ -32,19 +32,19 @@ pub struct Conv {
     pub weight: Param,
     /// `(O)`.
     pub bias: Param,
-    /// The largest value that its ReLU left, as far as was observed; 8 bits reach from zero to some way
-    /// beyond.
+    /// The largest output of its ReLU that was observed. In 8 bits, values reach from zero to some way beyond
+    /// this.
     pub range: Option<f32>,
     arithmetic: Arithmetic,
     relu: bool,
     /// The packed weights of a frozen layer.
     frozen: Option<Arc<Packed>>,
-    /// The bits of the largest value so far, while it is observed.
+    /// The bits of the largest output so far, while outputs are observed.
     observed: Option<Arc<AtomicU32>>,
 }
 
-/// How far beyond the range that was observed 8 bits reach: a brighter frame must not be cut off, and
-/// coarser steps were found to cost nothing.
+/// In 8 bits, values reach to this many times the range that was observed: a brighter frame must not be cut
+/// off, and coarser steps were found to cost nothing.
 const RANGE_MARGIN: f32 = 2.0;
 
 impl Conv {
@@ -104,11 +104,11 @@ impl Conv {
         self
     }
 
-    /// [`Activation::input_halved`] for this layer alone, frozen or not: already rounded if it would do so
-    /// first.
+    /// [`Activation::input_halved`], for this layer alone. If the layer is frozen and would round its input
+    /// first, the input comes already rounded.
     ///
     /// # Panics
-    /// As that.
+    /// As for that function.
     pub fn input_halved(&self, planes: Shape, values: &[f32]) -> Activation<NoneTape> {
         match self.frozen.as_deref() {
             Some(Packed::Narrow(weights)) => {
@@ -120,12 +120,12 @@ impl Conv {
         }
     }
 
-    /// Takes over the weights of a narrower layer of the same kind so that it computes the same, and every
-    /// channel counts: further channels copy the old ones in turn, and what reads a channel and its copies
-    /// divides its weight among them, at random (after Chen et al. 2016, Net2Net, where shares are equal).
-    /// Their gradients then differ from the first step on. Channels that begin without effect hardly learn
-    /// one. Further outputs of a layer without ReLU, which are no features, begin at zero. Returns whether
-    /// the layers fit.
+    /// Takes over the weights of a narrower layer of the same kind, so that it computes the same and every
+    /// channel has an effect: channels that begin without one hardly learn one. Additional channels copy the
+    /// old ones in turn. The weight with which a channel was read is divided at random among the channel and
+    /// its copies (after Chen et al. 2016, Net2Net, where shares are equal), so that their gradients differ
+    /// from the first step on. Additional outputs of a layer without ReLU, which are no features, begin at
+    /// zero. Returns whether the layers fit.
     pub fn widen_from(&mut self, narrow: &Arithmetic, weight: &[f32], bias: &[f32], rng: &mut Rng) -> bool {
         let wide = &self.arithmetic;
         let fits = wide.geometry == narrow.geometry
@@ -180,8 +180,8 @@ impl Conv {
         self.frozen = None;
     }
 
-    /// Takes in the batch norm that follows, with its running statistics and its ReLU: one layer computes
-    /// what the two did.
+    /// Folds the batch norm that follows, with its running statistics and its ReLU, into this layer, which
+    /// then computes what the two did.
     ///
     /// # Panics
     /// If the layer has a ReLU of its own, or is transposed.
@@ -218,7 +218,8 @@ impl Conv {
         Steps::to((RANGE_MARGIN * range).max(f32::MIN_POSITIVE.sqrt()))
     }
 
-    /// Whether it can compute in 8 bits, if its sources can: they are to know their ranges.
+    /// Whether it can compute in 8 bits if its sources can. If it has a ReLU, its range has to be known for
+    /// that.
     pub fn is_quantizable(&self) -> bool {
         !self.relu || self.range.is_some()
     }
@@ -550,7 +551,7 @@ impl BatchNorm {
     }
 }
 
-/// What divides by the standard deviation of a channel of this variance.
+/// The inverse of the standard deviation of a channel of this variance.
 fn inverse(variance: f32) -> f32 {
     (variance + BatchNorm::EPSILON).sqrt().recip()
 }

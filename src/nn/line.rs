@@ -14,14 +14,14 @@ use crate::kernels::narrow::Operand;
 
 /// Consecutive rows of one image: an activation or a field, without a tape.
 pub trait Rows: Sized {
-    /// How many.
+    /// Number of rows.
     fn height(&self) -> usize;
 
     /// A second handle on the same rows.
     fn fork(&self) -> Self;
 
-    /// Some rows of each of `parts`, one below another. With `above` the first of them, with `below` the
-    /// last, goes into the border, where a convolution sees it but makes nothing of its own of it.
+    /// Some rows of each of `parts`, one below another. With `above` the first row goes into the border, and
+    /// with `below` the last. A convolution reads rows in the border, but computes no output for them.
     fn stack(parts: &[(&Self, Range<usize>)], above: bool, below: bool) -> Self;
 }
 
@@ -94,7 +94,7 @@ impl Rows for Field<NoneTape> {
 pub struct Line<V> {
     total: usize,
     end: usize,
-    /// What is kept, each with its first row.
+    /// The bands that are kept, each with the number of its first row.
     bands: VecDeque<(usize, V)>,
 }
 
@@ -107,7 +107,7 @@ impl<V: Rows> Line<V> {
     /// Adds the next rows.
     ///
     /// # Panics
-    /// If they are more than there are.
+    /// If there are then more rows than the total.
     pub fn push(&mut self, band: V) {
         let first = self.end;
         self.end += band.height();
@@ -115,7 +115,7 @@ impl<V: Rows> Line<V> {
         self.bands.push_back((first, band));
     }
 
-    /// Rows made.
+    /// Number of rows made so far.
     pub fn end(&self) -> usize {
         self.end
     }
@@ -125,7 +125,7 @@ impl<V: Rows> Line<V> {
         self.total
     }
 
-    /// The rows from the top whose neighbours up to `reach` rows below are made too.
+    /// How many rows from the top have been made together with their neighbours up to `reach` rows below.
     pub fn settled(&self, reach: usize) -> usize {
         if self.end == self.total { self.total } else { self.end.saturating_sub(reach) }
     }
@@ -171,7 +171,7 @@ impl<V: Rows> Line<V> {
         }
     }
 
-    /// Lets go of the bands that lie wholly above row `row`.
+    /// Drops the bands that lie wholly above row `row`.
     pub fn forget(&mut self, row: usize) {
         while self.bands.front().is_some_and(|(first, band)| first + band.height() <= row) {
             self.bands.pop_front();

@@ -31,7 +31,8 @@ impl Buffer {
     }
 
     /// Copies `count` rows of another activation of the same width and channels, from its row `from` on, to
-    /// row `to` on. Rows -1 and H are those of the border, which then belong to a taller activation.
+    /// row `to` on. Rows -1 and H lie in the border. They may be copied where the activation is a part of a
+    /// taller one, whose rows the border then holds.
     ///
     /// # Panics
     /// If the two do not fit together, or hold several images.
@@ -41,12 +42,12 @@ impl Buffer {
         shape.plane().copy_rows((self, to), other.plane(), (source, from), count);
     }
 
-    /// To read.
+    /// The values, to read.
     pub fn view(&self) -> View<'_> {
         View::new(self.shape, self)
     }
 
-    /// To write.
+    /// The values, to write.
     pub fn view_mut(&mut self) -> ViewMut<'_> {
         ViewMut::new(self.shape, self)
     }

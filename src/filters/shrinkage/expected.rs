@@ -1,6 +1,6 @@
 //! How far off a result is expected to be, learned from results and their references.
 //!
-//! In: the sums over squares of pixels that the share of the render was told by, and what is left of the
+//! In: the sums over squares of pixels from which the share of the render was found, and what is left of the
 //! difference to the render. Out: the squared error to be expected in each square, relative to the squared
 //! light there. The perceptron was trained by `eval/training/expected_error.py` on results of the built-in
 //! models for frames of 1 to 256 samples.
@@ -21,7 +21,8 @@ use crate::{
     planes::Planes,
 };
 
-/// What is read besides: the logarithm of the mean squared change that is left, of a square and around it.
+/// Besides the features, the perceptron reads the logarithm of the mean squared change that is left, in the
+/// square itself and around it.
 const INPUTS: usize = FEATURES + 2;
 
 /// Relative squared changes are cut at this.
@@ -34,8 +35,8 @@ const MOST: f32 = 4.0;
 static PERCEPTRON: LazyLock<Perceptron> =
     LazyLock::new(|| Perceptron::read(include_bytes!("expected.safetensors"), INPUTS, 1));
 
-/// The squared error to be expected in each square of pixels, (1, H / 4, W / 4) rounded up: what RelMSE is
-/// the mean of.
+/// The squared error to be expected in each square of pixels, (1, H / 4, W / 4) rounded up. RelMSE is the
+/// mean of such errors.
 pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
     let squares = result.width.div_ceil(SQUARE);
     if result.pixels() == 0 {
@@ -64,9 +65,10 @@ pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
     Planes::from_vec(1, squares, rows.len(), errors)
 }
 
-/// Three lines of each row of squares: the mean squared change that is left between render and result,
-/// relative; ones; and what an error is multiplied by to be what RelMSE is the mean of. The perceptron knows
-/// the frame's exposure and not its brightness, and dark frames err relative to less light.
+/// Three lines of each row of squares: the mean squared relative change that is left between render and
+/// result; ones; and the factor that turns the perceptron's error into one that RelMSE is the mean of. The
+/// perceptron sees a frame as exposed and does not know its brightness, so in dark frames its errors are
+/// relative to less light than those of RelMSE.
 fn changes(result: &Planes, render: &Render) -> Vec<f32> {
     let (width, height) = (result.width, result.height);
     let squares = width.div_ceil(SQUARE);

@@ -1,5 +1,5 @@
-//! What is read of the sums over squares of pixels, for the [perceptrons](super::perceptron) that judge by
-//! it: logarithms of mean squares and correlations, over three neighbourhoods of the square.
+//! Features that the [perceptrons](super::perceptron) read, made of the sums over squares of pixels:
+//! logarithms of mean squares and correlations, over three neighbourhoods of each square.
 
 use rayon::prelude::*;
 
@@ -19,19 +19,19 @@ use crate::{
 pub const WINDOWS: [&[f32]; 3] =
     [&[1.0, 2.0, 1.0], &[1.0, 4.0, 6.0, 4.0, 1.0], &[1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]];
 
-/// What is read of each neighbourhood, and in all: besides these the brightness of the place, the logarithm
-/// to base 2 of the number of samples, and whether it is known.
+/// Number of features of each neighbourhood, and of all features. The last three are the brightness of the
+/// place, the logarithm to base 2 of the number of samples, and whether that number is known.
 const OF_WINDOW: usize = 11;
 pub const FEATURES: usize = WINDOWS.len() * OF_WINDOW + 3;
 
-/// Added before logarithms, and to what is divided by.
+/// Added to values before their logarithm is taken, and to divisors.
 pub const TINY: f32 = 1e-8;
 
 /// Exposed radiance that is added before the brightness's logarithm.
 const BLACK: f32 = 0.02;
 
-/// What `make` makes of every row of squares, given its number and its features, [`FEATURES`] lines: so many
-/// lines each.
+/// What `make` writes for every row of squares, `lines` lines each. It is given the row's number, its
+/// features as [`FEATURES`] lines, and where to write.
 pub fn each_row(
     sums: &[f32],
     squares: usize,

@@ -7,17 +7,16 @@
 //! - Cycles draws every pixel by itself, so noise has no direction, while edges and texture have. Of the
 //!   second differences along four directions, the smallest holds next to nothing but noise. They are taken
 //!   of the light, and of the light over the albedo as rendered, which divides texture away.
-//! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise, and correlated if it is blurred
-//!   detail: with
-//!   its neighbours, with the detail that is left, and with that of the albedo.
+//! - The residual `c - d` is uncorrelated from pixel to pixel if it is noise. If it is blurred detail, it is
+//!   correlated with its neighbours, with the detail that is left, and with that of the albedo.
 //!
-//! These are summed up over squares of pixels (`sums`), from which a small perceptron tells the share
-//! (`restraint`). Of a noisy frame all of `d` is taken. By the same sums another one tells how far off the
-//! result is (`expected`).
+//! These are summed up over squares of pixels (`sums`). From the sums a small perceptron finds the share
+//! (`restraint`); in a noisy frame it is zero, and all of `d` is taken. From the same sums another perceptron
+//! finds how far off the result is (`expected`).
 //!
 //! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing,
-//! and is kept. Of few samples, though, antialiasing is noise like any other: a gap of a blind before a
-//! bright sky is a quarter of the sky, or nothing.
+//! and is kept. Of few samples, though, antialiasing is noise like any other: at 4 samples, a pixel in the
+//! gap of a blind before a bright sky may show a quarter of the sky, or nothing.
 
 mod expected;
 mod features;
@@ -39,38 +38,39 @@ use crate::{
     planes::Planes,
 };
 
-/// Exposed radiance that is added to what is denoised before residuals are divided by it: relative errors of
-/// what is darker count less and less.
+/// Exposed radiance that is added to denoised light before residuals are divided by it, so that relative
+/// errors of darker light count less and less.
 const FLOOR: f32 = 0.02;
 
-/// Added to a pixel's own squared residual before its logarithm is compared with that of the mean near by, of
-/// which it may be so many times as large or as small: `e` to this power.
+/// [`OWN_FLOOR`] is added to a pixel's own squared residual before its logarithm is compared with that of the
+/// mean near by. The two logarithms count as at most [`OWN_RANGE`] apart.
 const OWN_FLOOR: f32 = 1e-6;
 const OWN_RANGE: f32 = 3.0;
 
 /// Shares nearer than this to none or to all of the render are none or all.
 const SNAP: f32 = 1.0 / 64.0;
 
-/// Of one sample, as far as files tell, no share below the first counts; of `n` samples, none below the
-/// second over `n`. What looks like a picture in a frame of few samples is noise more often than not.
+/// Where a file tells the number of samples `n`, shares below the second value over `n` count as none, but
+/// never those above the first value. What looks like a picture in a frame of few samples is noise more often
+/// than not.
 const DOUBT: (f32, f32) = (0.5, 2.0);
 
-/// From this many samples on, the more of the render is kept the more samples there are, by this power of
-/// their number: few frames that were learned from had more.
+/// Beyond [`FINAL_SAMPLES`] samples, what is taken of the denoised frame falls with the number of samples to
+/// the power of [`FINAL_POWER`], because few frames that were learned from had more.
 const FINAL_SAMPLES: f32 = 192.0;
 const FINAL_POWER: f32 = 0.75;
 
-/// By how much a pixel's light may change, relative to what is denoised, where its share is next to nothing;
-/// the larger the share, the more. What is rendered brighter than that by far is noise as long as most around
-/// it is.
+/// By how much the render's light may differ from the denoised light, relative to the latter, before a
+/// pixel's share is reduced. This holds for shares near zero; the larger the share, the more it may differ. A
+/// pixel that was rendered far brighter than that is noise as long as most pixels around it are.
 const LARGEST_CHANGE: f32 = 1.5;
 
-/// What a frame is taken for that does not tell its number of samples, where it comes to light that is seen
-/// directly.
+/// The number of samples that a frame is taken to have if it does not tell. It decides how much is kept of
+/// light that is seen directly.
 const UNKNOWN_SAMPLES: u32 = 16;
 
-/// Of no more than the first number of samples, no light is kept because the albedo shows it: its
-/// antialiasing is noise, as all of it is through glass. From the second on, all is.
+/// Up to the first number of samples, no light is kept for being in the albedo as well: its antialiasing is
+/// noise, and through glass all of it is. From the second number on, all such light is kept.
 const KEPT_SAMPLES: (f32, f32) = (16.0, 64.0);
 
 /// What is known of a frame besides what was denoised.
@@ -83,8 +83,8 @@ pub struct Render<'a> {
     pub exposure: f32,
     /// Samples of a pixel, where the file tells.
     pub samples: Option<u32>,
-    /// How many times brighter than all others of the 5x5 around it a pixel is a firefly, which is not taken
-    /// back.
+    /// A pixel more than this many times as bright as all others of the 5x5 around it is a firefly, of which
+    /// nothing is taken back.
     pub firefly: f32,
 }
 
@@ -95,7 +95,7 @@ pub struct Shrinkage<'a> {
 }
 
 impl<'a> Shrinkage<'a> {
-    /// Of a frame.
+    /// Prepares to shrink a frame.
     pub fn of(render: &'a Render<'a>) -> Self {
         Self { render, seen: Seen::of(render) }
     }
@@ -125,7 +125,7 @@ impl<'a> Shrinkage<'a> {
         expected::errors(image, self.render, &sums)
     }
 
-    /// Shrinks; returns the sums that it was done by.
+    /// Shrinks, and returns the sums from which the shares were found.
     fn shrink_by_sums(&self, image: &mut Planes, shares: Option<&mut Planes>) -> Vec<f32> {
         let Self { render, seen } = self;
         check(image, render);
@@ -139,7 +139,7 @@ impl<'a> Shrinkage<'a> {
     }
 }
 
-/// [`Shrinkage::shrink`] of a frame of which nothing else is asked.
+/// [`Shrinkage::shrink`] of a frame, for callers that need nothing else of it.
 ///
 /// # Panics
 /// If sizes differ.
@@ -147,8 +147,8 @@ pub fn shrink(image: &mut Planes, render: &Render, shares: Option<&mut Planes>) 
     Shrinkage::of(render).shrink(image, shares);
 }
 
-/// What the share of the render is decided by: a plane of each feature with a value for each 4x4 square of
-/// pixels, (36, H / 4, W / 4) rounded up. For training.
+/// The features from which the share of the render is found, for training: a plane for each, with a value for
+/// each 4x4 square of pixels, (36, H / 4, W / 4) rounded up.
 ///
 /// # Panics
 /// If sizes differ.
@@ -253,8 +253,8 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
     );
 }
 
-/// The share of the render in a pixel whose light changes by so much if all of it is taken, by what was
-/// [judged](restraint::judge) of the place; shares below `doubt` are none.
+/// The share of the render in a pixel, by what was [judged](restraint::judge) of the place. `change` is the
+/// relative change of the pixel's light if all of the render were taken. Shares below `doubt` are none.
 fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32, doubt: f32) -> f32 {
     let own = change.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
     let unusual = (ln(own * own + OWN_FLOOR) - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE;

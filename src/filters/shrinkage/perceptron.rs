@@ -22,10 +22,10 @@ pub struct Perceptron {
 struct Weights(Vec<f32>, Vec<f32>);
 
 impl Perceptron {
-    /// The one of a weights file that is part of the program.
+    /// Reads the perceptron of a weights file that is part of the program.
     ///
     /// # Panics
-    /// If the file holds another.
+    /// If the file holds a perceptron of other sizes.
     pub fn read(file: &[u8], inputs: usize, outputs: usize) -> Self {
         let file = SafeTensors::deserialize(file).expect("a test reads it");
         let tensor = |name: String, len: usize| -> Vec<f32> {
@@ -48,7 +48,8 @@ impl Perceptron {
         }
     }
 
-    /// Its outputs for a row of squares: a line of each input and of each output.
+    /// Computes its outputs for a row of squares. `input` and `output` hold a line for each input and each
+    /// output.
     pub fn apply(&self, input: &[f32], squares: usize, output: &mut [f32]) {
         let mut hidden = [(); 2].map(|()| vec![0.0; HIDDEN * squares]);
         let [one, two] = &mut hidden;

@@ -12,14 +12,15 @@ use super::{
     perceptron::Perceptron,
 };
 
-/// What comes out of a square: the share's logit, its slope over the logarithm of a pixel's own squared
-/// residual, and the logarithm of the mean squared residual near by, which that is compared with.
+/// Values of a square: the logit of the share; the slope of that logit over the logarithm of a pixel's own
+/// squared residual; and the logarithm of the mean squared residual near by, with which the pixel's own is
+/// compared.
 pub const OUTPUTS: usize = 3;
 
 static PERCEPTRON: LazyLock<Perceptron> =
     LazyLock::new(|| Perceptron::read(include_bytes!("restraint.safetensors"), FEATURES, OUTPUTS - 1));
 
-/// [`OUTPUTS`] lines of every row of squares.
+/// Judges every square: [`OUTPUTS`] lines for each row of squares.
 pub fn judge(sums: &[f32], squares: usize, render: &Render) -> Vec<f32> {
     each_row(sums, squares, OUTPUTS, render, |_, features, output| {
         let (mixture, residual) = output.split_at_mut((OUTPUTS - 1) * squares);

@@ -7,38 +7,38 @@
 use super::Render;
 use crate::{kernels::logarithm::ln, planes::Planes};
 
-/// A frame whose pixels are all their albedo but for this share is no picture of light on surfaces: all of it
-/// is kept.
+/// A frame in which no more than this share of the pixels differ from their albedo is no picture of light on
+/// surfaces, and all of it is kept.
 const UNLIKE: f64 = 1e-3;
 
-/// Such light may be this many times as bright as in the brightest of the 8 pixels around; what is brighter
-/// counts less.
+/// Beyond white, such light may be this many times as bright as in the brightest of the 8 pixels around. What
+/// is brighter counts less.
 const ALONE: f32 = 4.0;
 
-/// By how much radiance may differ from the albedo and still be light that is seen directly: a few steps of a
-/// half float, and next to nothing besides.
+/// By how much radiance may differ from the albedo and still be light that is seen directly: a share of the
+/// albedo, which is a few steps of a half float, and next to nothing in absolute terms.
 pub const SAME: (f32, f32) = (0.004, 1e-6);
 
 /// Light that is seen directly is its albedo times the film's exposure, which Cycles applies to light alone.
-/// It is told from the quotients of light and albedo, counted by these steps of an octave over so many
-/// octaves up and down.
+/// The exposure is found from the quotients of light and albedo, which are counted in [`STEPS`] steps an
+/// octave over [`OCTAVES`] octaves up and down.
 const STEPS: usize = 128;
 const OCTAVES: usize = 20;
 
-/// An exposure needs at least this many pixels, and this many times more of them than its second and third
-/// neighbours have on the average: quotients of what is only lit are spread by noise and by shape.
+/// An exposure needs at least [`LEAST_EXPOSED`] pixels, and [`PEAK`] times as many as its second and third
+/// neighbours have on average. Quotients of surfaces that are only lit are spread by noise and by shape.
 const LEAST_EXPOSED: u32 = 16;
 const PEAK: f32 = 8.0;
 
-/// About as many pixels as are counted.
+/// About how many pixels of a frame are counted.
 const COUNTED: usize = 1 << 17;
 
-/// Pixels of the 3x3 around one, itself included, that must be seen directly for it to be: any pixel may be
-/// as bright as its albedo by chance.
+/// For a pixel to be seen directly, this many of the 3x3 around it, itself included, must be as bright as
+/// their albedo, because any pixel may be so by chance.
 const SEEN_TOGETHER: usize = 6;
 
-/// What light that is seen directly was multiplied by, as most such light of the frame has it; 1 if there is
-/// any such.
+/// The film's exposure, by which light that is seen directly was multiplied. It is 1 if enough pixels equal
+/// their albedo, else what most such light of the frame agrees on, and 1 if there is none.
 pub fn film_exposure(render: &Render) -> f32 {
     let Render { radiance, albedo, .. } = render;
     let pixels = radiance.pixels();
@@ -71,7 +71,7 @@ pub fn film_exposure(render: &Render) -> f32 {
     (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
 }
 
-/// Whether light is white times `film` but for rounding.
+/// Whether `light` equals `white` times `film`, up to rounding.
 #[inline(always)]
 fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
     let (relative, absolute) = SAME;
@@ -90,12 +90,12 @@ fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item
 pub struct Seen<'a> {
     pub radiance: &'a Planes,
     pub albedo: &'a Planes,
-    /// What the film's exposure multiplied light by, and not the albedo.
+    /// The film's exposure, by which light was multiplied and the albedo was not.
     pub film: f32,
 }
 
 impl<'a> Seen<'a> {
-    /// In a frame.
+    /// Finds the film's exposure of a frame.
     pub fn of(render: &Render<'a>) -> Self {
         Self { radiance: render.radiance, albedo: render.albedo, film: film_exposure(render) }
     }
@@ -109,18 +109,18 @@ impl Seen<'_> {
         equals(light, white, self.film)
     }
 
-    /// Whether a frame is nothing but such light.
+    /// Whether a frame is nothing but light that is seen directly.
     pub fn is_all(&self) -> bool {
         let pixels = self.radiance.pixels();
         let most = (UNLIKE * pixels as f64) as usize;
         (0..pixels).filter(|at| !self.equals_albedo(*at)).take(most + 1).count() <= most
     }
 
-    /// Whether the light of a pixel is such, as that of its neighbours is.
+    /// Whether the light of a pixel is seen directly, as that of its neighbours is.
     pub fn is_at(&self, x: usize, y: usize) -> bool {
         let width = self.radiance.width;
         let equals_albedo = |x: usize, y: usize| self.equals_albedo(y * width + x);
-        // Black is no light, but where a lamp or a star ends it is as good company as any.
+        // A black pixel is no light itself. As a neighbour it counts, because lamps and stars end in black.
         let is_lit = (0..3).any(|c| self.albedo.channel(c)[y * width + x] > 0.0);
         is_lit && equals_albedo(x, y) && {
             let beyond = 9 - near(self.radiance, x, y, 1).count();
@@ -129,8 +129,9 @@ impl Seen<'_> {
         }
     }
 
-    /// The share of a pixel's light that is such, or comes by way of mirrors, as far as the albedo shows it
-    /// beyond white. One pixel alone, as a rough mirror throws it, is as likely to be noise.
+    /// The share of a pixel's light that is seen directly or by way of mirrors, as far as the albedo shows it
+    /// beyond white. One such pixel alone, as in a rough mirror, is as likely to be noise, and its share is
+    /// less.
     pub fn beyond_white(&self, x: usize, y: usize) -> f32 {
         let Self { radiance, albedo, film } = self;
         let beyond = |x: usize, y: usize| {

@@ -1,5 +1,5 @@
-//! What is summed up over squares of pixels: the noise, what the denoiser changed, and how alike that is to
-//! detail.
+//! What is summed up over squares of pixels: the noise, what the denoiser changed, and how that correlates
+//! with detail.
 
 use rayon::prelude::*;
 
@@ -13,31 +13,32 @@ use crate::{
     planes::{Planes, mirrored},
 };
 
-/// Lines of a row of squares, see below.
+/// Number of sums of a square; the constants below are their indices. A row of squares has a line of each.
 pub const SUMS: usize = 13;
 /// The number of pixels.
 pub const COUNT: usize = 0;
-/// The square of the residual: of what the denoiser changed, relative.
+/// The squared residual. A residual is the difference from the denoised light to the render, relative to the
+/// former.
 pub const RESIDUAL: usize = 1;
 /// Two measures of noise, of the light and of the light over the albedo.
 pub const NOISE: [usize; 2] = [2, 3];
-/// The square of what the residual was cut by.
+/// What cutting the residual took from its square.
 pub const CUT: usize = 4;
-/// The products of residuals with those to the right and below: noise has none.
+/// The products of each residual with those to the right and below, whose mean is zero for noise.
 pub const NEXT: [usize; 2] = [5, 6];
-/// The squares of the detail of what is denoised and of the albedo, each the difference to the four pixels
-/// around.
+/// The squares of the detail of the denoised light and of the albedo. Detail is the difference of a pixel to
+/// the mean of the four around it.
 pub const DETAIL: [usize; 2] = [7, 8];
-/// The products of the residual with the detail of what is denoised, of the albedo, and of the render.
+/// The products of the residual with the detail of the denoised light, of the albedo, and of the render.
 pub const BY_DETAIL: [usize; 3] = [9, 10, 11];
-/// What is denoised.
+/// The denoised light.
 pub const LIGHT: usize = 12;
 
 /// Added to the albedo before light is divided by it.
 const ALBEDO_FLOOR: f32 = 0.02;
 
-/// Relative residuals are cut at this: a firefly would decide on all around it. The square of what is cut off
-/// is at most the last.
+/// Relative residuals are cut at [`LARGEST_RESIDUAL`], since a firefly would decide on all around it. Their
+/// squares before that count as at most [`LARGEST_CUT`].
 pub const LARGEST_RESIDUAL: f32 = 1.0;
 const LARGEST_CUT: f32 = 100.0;
 
@@ -45,9 +46,9 @@ const LARGEST_CUT: f32 = 100.0;
 const LARGEST_DIFFERENCE: f32 = 6.0;
 const LARGEST_DETAIL: f32 = 1.0;
 
-/// The variance of noise over the mean of the smallest squared second difference of four directions: a sixth
-/// for one direction, the rest for taking the smallest (of independent normal values, by drawing 360,000 of
-/// them).
+/// The variance of noise divided by the mean of its smallest squared second difference along four directions.
+/// For a single direction this is a sixth; the rest makes up for taking the smallest, and was found by
+/// drawing 360,000 independent normal values.
 const VARIANCE_OF_SMALLEST: f32 = 3.5706 / 6.0;
 
 /// Rows of squares that a thread gathers at once: the rows of pixels just above and below are computed twice.
@@ -86,15 +87,15 @@ pub fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
 struct PixelRow {
     /// The mean of the colours of the render.
     light: Vec<f32>,
-    /// The same over the albedo.
+    /// The mean of the colours of the render over the albedo.
     ratio: Vec<f32>,
-    /// The mean of the colours of what is denoised.
+    /// The mean of the colours of the denoised frame.
     denoised: Vec<f32>,
     /// The mean of the colours of the albedo.
     albedo: Vec<f32>,
     /// What differences of light and of ratios are multiplied by to be relative.
     scales: [Vec<f32>; 2],
-    /// The relative residual, cut, and the square of what it was cut by.
+    /// The relative residual after cutting, and what cutting took from its square.
     residual: Vec<f32>,
     cut: Vec<f32>,
 }
@@ -138,11 +139,12 @@ impl Vectorised for Read<'_> {
         let [light, ratio, denoised, white, of_light, of_ratio, residual, cut] =
             [light, ratio, denoised, white, of_light, of_ratio, residual, cut]
                 .map(|line| &mut line[1..][..width]);
-        // Until it is needed, `cut` holds by how much more than a rounding error the light differs from the
-        // albedo: 0 where it is seen directly.
+        // At first `cut` holds by how much more than a rounding error the light differs from the albedo,
+        // which is 0 where the light is seen directly.
         for c in 0..3 {
             for x in 0..width {
-                // No surface reflects more light than it gets: what is beyond white is light that is seen.
+                // No surface reflects more light than it gets, so what the albedo holds beyond white is light
+                // that is seen.
                 let surface = albedo[c][x].clamp(0.0, 1.0);
                 let over = 1.0 / (3.0 * (surface + ALBEDO_FLOOR));
                 let (noisy, clean) = (radiance[c][x].max(0.0), image[c][x].max(0.0));
@@ -171,12 +173,12 @@ impl Vectorised for Read<'_> {
     }
 }
 
-/// Adds what a row of pixels has to the sums over columns.
+/// Adds a row of pixels to the sums over columns.
 struct Add<'a> {
     above: &'a PixelRow,
     row: &'a PixelRow,
     below: &'a PixelRow,
-    /// [`SUMS`] lines of a value a column.
+    /// [`SUMS`] lines with a value for each column.
     columns: &'a mut [f32],
 }
 
@@ -223,7 +225,7 @@ fn detail([above, row, below]: [&[f32]; 3], x: usize) -> f32 {
     row[x + 1] - 0.25 * (row[x] + row[x + 2] + above[x + 1] + below[x + 1])
 }
 
-/// Adds the variance that the smallest of four second differences tells of, relative by `scale`.
+/// Adds the variance of noise that follows from the smallest of four second differences, each times `scale`.
 #[inline(always)]
 fn add_differences([above, row, below]: [&[f32]; 3], scale: &[f32], sums: &mut [f32]) {
     let width = sums.len();

@@ -29,19 +29,20 @@ pub enum Target {
 pub struct Band<'a> {
     pub engine: Engine,
     pub grid: Grid,
-    /// Packed, `[output plane][phase][term][16 rows]`, or as cells want them.
+    /// Packed, `[output plane][phase][term][16 rows]`, or as `winograd::pack` lays them out.
     pub weights: &'a [Wide],
     /// How many groups of rows of its weights each term needs.
     pub groups: &'a [u8],
-    /// Of the sources.
+    /// Format of the sources.
     pub format: Format,
     /// Output phases along each axis.
     pub spread: usize,
-    /// Of sums, a block an output plane.
+    /// What sums are multiplied by, and what is added then: a block an output plane each.
     pub scale: &'a [Block],
     pub bias: &'a [Block],
     pub epilogue: Epilogue,
-    /// The terms of each phase; those of the planes as they are where cells are computed.
+    /// The terms of each phase. Where cells are computed, there is one list, with a term for each plane of
+    /// the sources.
     pub phases: &'a [Vec<Term>],
     pub out: Shape,
     pub target: Target,
@@ -143,7 +144,7 @@ impl Band<'_> {
                     }
                 }
                 Target::Narrow(wides, grid, format) => {
-                    // 32 channels are all of a value in bfloat16, and one half or the other in 8 bits.
+                    // 32 channels fill a [`Wide`] in bfloat16, and one half of it in 8 bits.
                     let blocks = format.channels() / LANES;
                     let wide = self.n * self.out.c.div_ceil(format.channels()) + plane / blocks;
                     let start = wide * grid.positions() + grid.row(row) + phase % spread;
@@ -157,7 +158,8 @@ impl Band<'_> {
                                 for i in 0..run {
                                     let at = at.add(i * spread * size_of::<Wide>()).cast::<[u8; LANES]>();
                                     at.write(simd.bytes(finish[0].of(simd, simd.get(&sums[0][i]))));
-                                    // The upper half of a pair of planes is zero where there is none.
+                                    // Where there is no second plane of the pair, its 16 channels become
+                                    // zero.
                                     let upper = if outputs == 2 {
                                         simd.bytes(finish[1].of(simd, simd.get(&sums[1][i])))
                                     } else {
@@ -200,7 +202,8 @@ impl Band<'_> {
     }
 }
 
-/// What makes values of a plane's sums: `relu(sum * scale + bias)`, the ReLU only where asked for.
+/// What makes values of a plane's sums: `relu(sum * scale + bias)`, or without the ReLU where none is asked
+/// for.
 #[derive(Clone, Copy)]
 struct Scaled<S: Simd> {
     scale: S::V,

@@ -1,8 +1,8 @@
 //! Convolutions and input gradients of narrow factors, the geometries of [`crate::kernels::conv`].
 //!
 //! Packed weights are `[output plane][phase][term][16 rows]`, each row holding the weights of 16 outputs for
-//! a pair (bfloat16) or four (8 bits) of input channels side by side; terms follow the planes of the
-//! operands, then taps. Where cells of outputs are computed together, they are as `winograd::pack` says.
+//! two (bfloat16) or four (8 bits) input channels side by side. Terms are ordered by plane of the operands,
+//! then by tap. Where cells of outputs are computed together, weights are packed as `winograd::pack` says.
 
 use std::ops::Range;
 
@@ -34,7 +34,7 @@ struct Tap {
 
 /// The taps of an output phase, those of the first input phase first.
 fn taps_of(geometry: Geometry, phase: usize) -> Vec<Tap> {
-    // Of steps of two, the input at 2m + d is pixel d mod 2 of the quad at m + d div 2.
+    // With steps of two, the input at 2m + d is pixel d mod 2 of the quad at m + d div 2.
     let step = if geometry == Geometry::Strided { 2 } else { 1 };
     let of_phase = |tap: conv::Tap| Tap {
         phase: (step * tap.dy.rem_euclid(step) + tap.dx.rem_euclid(step)).unsigned_abs(),
@@ -59,7 +59,8 @@ pub struct Weights {
     pub(super) rows: Vec<Wide>,
     /// Groups of rows that each term of a phase, or each part, needs; the same for every phase.
     pub(super) groups: Vec<u8>,
-    /// The parts of the sources where cells of outputs are computed together; none where it is tap by tap.
+    /// The parts of the sources where cells of outputs are computed together; empty where outputs are
+    /// computed tap by tap.
     parts: Vec<Part>,
     /// Whether sums of four products in 8 bits fit into 16.
     fit_16_bits: bool,
@@ -69,7 +70,8 @@ pub struct Weights {
     outputs: usize,
     /// What sums are multiplied by, a block an output plane.
     scale: Vec<Block>,
-    /// What is added to them then: sums are too large by what activations count as steps where they are zero.
+    /// What is added to sums after that. An activation of zero counts [`Steps::zero`] steps, which make sums
+    /// too large, and this makes up for it.
     shift: Vec<Block>,
 }
 
@@ -115,12 +117,13 @@ impl Weights {
         }
     }
 
-    /// Rounds the weights of a layer to 8 bits and packs them for an engine, where each source has channels
-    /// in 8 bits of some step, of which one is zero. Steps of sources become part of the weights; each output
-    /// then has a step of its own, as fine as its largest weights allow.
+    /// Rounds the weights of a layer to 8 bits and packs them for an engine. Of each source the number of
+    /// channels and the [`Steps`] of its values are given. The size of these steps becomes part of the
+    /// weights. Each output then has a step of its own for its weights, as fine as the largest of them allow.
     ///
     /// # Panics
-    /// If `weights` has the wrong length, or a phase of a transposed layer would need a shift of its own.
+    /// If `weights` has the wrong length, or a source of a transposed layer has negative values: each phase
+    /// would then need a shift of its own.
     pub fn quantize(
         engine: Engine,
         weights: &[f32],
@@ -189,8 +192,7 @@ impl Weights {
         Self { fit_16_bits: in_16_bits, scale, shift, ..packed }
     }
 
-    /// Fills the rows from `weight(output, input, tap)`, which counts steps, whole ones, where the format has
-    /// them.
+    /// Fills the rows from `weight(output, input, tap)`, which in 8 bits is a whole number of steps.
     fn build(
         geometry: Geometry,
         inputs: Vec<(usize, Format)>,
@@ -244,7 +246,7 @@ impl Weights {
     }
 }
 
-/// The channels of every two rows of weights, none of which has channels of two sources.
+/// The channels of each pair of rows of weights. No pair has channels of two sources.
 fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     let mut end = 0;
     let mut pairs = Vec::new();
@@ -256,11 +258,11 @@ fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     pairs
 }
 
-/// The finest step for the weights of the channels of two rows, or of fewer, where products are first added
-/// up in 16 bits or not.
+/// The finest step that the weights of the channels of two rows, or of fewer, allow. `in_16_bits` says
+/// whether products are first added up in 16 bits.
 fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     let mut largest = 0.0f32;
-    // Of the first two channels of either row and of the others, of either sign.
+    // One sum for the first two channels of each row and one for the other two, and each for either sign.
     let mut sums = [[0.0f32; 2]; WORD / 2];
     for (i, weight) in channels.enumerate() {
         largest = largest.max(weight.abs());
@@ -270,8 +272,8 @@ fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
     sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
 }
 
-/// Rounds some taps of a channel's weights, which count steps. What one tap loses the next makes good, as
-/// neighbouring pixels differ little.
+/// Rounds a channel's weights at some taps to whole steps. The rounding error of a tap is added to the next
+/// one, since neighbouring pixels differ little.
 fn round(taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
@@ -286,13 +288,13 @@ fn round(taps: &[Tap], weights: &mut [f32]) {
 pub enum Output<'a> {
     /// To an f32 activation.
     F32(ViewMut<'a>),
-    /// To a narrow one, without adding to it; the upper 16 of 32 channels become zero where it has none. Only
-    /// a ReLU's output goes into 8 bits.
+    /// To a narrow one, without adding to it. Where it has only the lower 16 of 32 channels, the upper 16
+    /// become zero. Only a ReLU's output goes into 8 bits.
     Narrow(&'a mut Operand),
     /// To planes, without adding to them: those of all channels of an activation of this shape, at `factor`
     /// times its size (see [`crate::kernels::layout`]).
     Planes {
-        /// Of the activation.
+        /// Shape of the activation.
         shape: Shape,
         /// 1, or 2 where four channels are the pixels of a quad.
         factor: usize,
@@ -395,7 +397,7 @@ pub fn convolve(
             (Target::Planes(Unpacked::new(shape, 0, factor, values)), 1.0)
         }
     };
-    // What is stored counts steps.
+    // What is stored is a number of steps.
     let in_steps =
         |blocks: &[Block]| -> Vec<Block> { blocks.iter().map(|b| Block(b.0.map(|v| v / step))).collect() };
     let bias: Vec<Block> = (bias.iter().zip(&weights.shift))

@@ -1,11 +1,12 @@
-//! Convolutions whose factors are narrower than f32 ([`Format`]), and whose sums are not: half or a quarter
-//! of the memory traffic, twice or four times the arithmetic rate, and sixteen times where the processor
-//! multiplies matrix tiles (AMX).
+//! Convolutions whose factors are narrower than f32 ([`Format`]) and whose sums are not. Memory traffic is a
+//! half or a quarter of that in f32, and the arithmetic rate twice or four times that in f32, or sixteen
+//! times where the processor multiplies matrix tiles (AMX).
 //!
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
-//! row: what it computes for border positions is dropped. That keeps narrow levels as fast as wide ones.
-//! Where products are dear, 3x3 convolutions go by cells of outputs, with fewer of them (`winograd.rs`).
+//! row. What a chunk computes for border positions is dropped. So levels with few columns are as fast as
+//! those with many. Where products are slow, 3x3 convolutions are computed by cells of outputs, which need
+//! fewer products (`winograd.rs`).
 //!
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.
@@ -38,8 +39,8 @@ use super::{
 pub enum Format {
     /// bfloat16: f32 with 8 bits of mantissa.
     Bf16,
-    /// Eight bits: activations in as many steps; weights in steps of their own for every output, with a sign.
-    /// Sums are exact.
+    /// Eight bits. Activations count the given steps; weights have a sign and count steps whose size differs
+    /// from output to output. Sums are exact.
     Int8(Steps),
 }
 
@@ -48,7 +49,7 @@ pub enum Format {
 pub struct Steps {
     /// The difference between neighbouring values.
     pub step: f32,
-    /// Which of them is zero: the first where nothing is negative.
+    /// Which of the 256 values is zero. It is the first where no activation is negative.
     pub zero: u8,
 }
 
@@ -73,7 +74,7 @@ impl Format {
         }
     }
 
-    /// What borders hold.
+    /// What borders hold: zero in this format.
     fn nothing(self) -> Wide {
         match self {
             Format::Bf16 => Wide::ZERO,
@@ -82,29 +83,29 @@ impl Format {
     }
 }
 
-/// Channels of a [`Wide`] in bfloat16; as many are computed at once, in whatever format.
+/// Channels of a [`Wide`] in bfloat16. As many are computed at once in either format.
 const WIDE: usize = 2 * LANES;
 
 /// Bytes of a [`Wide`].
 const BYTES: usize = 64;
 
-/// Bytes of input channels that go with one row of weights, and rows that a product takes or leaves out
-/// together where a plane does not use all its channels.
+/// Bytes of input channels that go with one row of weights (`WORD`). Where a plane does not use all its
+/// channels, a product leaves out rows of weights in groups of `GROUP`.
 const WORD: usize = 4;
 const GROUP: usize = 4;
 
 /// Largest weight in steps.
 const WEIGHT_STEPS: f32 = 127.0;
 
-/// What the weights of four channels may add up to at most, in steps, those of either sign for themselves,
-/// before rounding them adds up to one step each: 128 times the largest activation is the most that 16 bits
-/// hold.
+/// The most that the weights of one sign of four channels may add up to, in steps, before they are rounded.
+/// Rounding adds at most one step to each weight, and 128 times the largest activation is the most that 16
+/// bits hold.
 const FITTING_STEPS: f32 = 124.0 - 1e-4;
 
 /// Largest activation in steps.
 pub const ACTIVATION_STEPS: f32 = 255.0;
 
-/// Positions that one product serves.
+/// Positions for which one product computes the sums.
 const CHUNK: usize = 32;
 
 /// Sixty-four bytes, a row of a matrix tile: the channels of one pixel, or the weights of 16 outputs for the
@@ -132,8 +133,8 @@ impl Wide {
     }
 }
 
-/// One contribution to a sum: the input at position 0, and where its weights lie, in bytes from the output
-/// plane's.
+/// One contribution to a sum: the input at position 0, and where its weights lie, in bytes from the first
+/// weights of the output plane.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 struct Term {
@@ -169,8 +170,8 @@ pub fn clear() {
     FREE.clear();
 }
 
-/// A plane of positions, and how the four pixels of a quad are dealt to four planes where a convolution
-/// takes steps of two.
+/// A plane of positions. It is `split` where a convolution takes steps of two: then the four pixels of each
+/// quad lie in four planes (phases), each half as wide and half as high.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Grid {
     plane: Plane,
@@ -209,7 +210,7 @@ impl Deref for Grid {
     }
 }
 
-/// A narrow activation: the left factor of [`conv::convolve`], and what it can write.
+/// A narrow activation, which [`conv::convolve`] reads as its left factor, and can write.
 #[derive(Debug)]
 pub struct Operand {
     /// `[image][plane of 32 or 64 channels][phase][position]`, then slack.
@@ -262,8 +263,8 @@ impl Operand {
         operand
     }
 
-    /// Planes in a format, whose pixels in 2x2 quads become channels of one pixel (space to depth):
-    /// (N, C, H, W) -> (N, 4C, H/2, W/2)
+    /// Planes rounded to a format. The four pixels of each 2x2 quad become channels of one pixel (space to
+    /// depth): (N, C, H, W) -> (N, 4C, H/2, W/2)
     ///
     /// # Panics
     /// If rows or columns are odd, or there are not as many values as `planes` demands.
@@ -308,7 +309,7 @@ impl Operand {
         operand
     }
 
-    /// The values as f32, into an activation of the same shape. Borders are written too.
+    /// Writes the values as f32 into an activation of the same shape. Borders are written too.
     ///
     /// # Panics
     /// If shapes differ.
@@ -332,7 +333,8 @@ impl Operand {
     }
 
     /// Copies `count` rows of another activation of the same width and channels, from its row `from` on, to
-    /// row `to` on. Rows -1 and H are those of the border, which then belong to a taller activation.
+    /// row `to` on. Rows -1 and H lie in the border. They may be copied where the activation is a part of a
+    /// taller one, whose rows the border then holds.
     ///
     /// # Panics
     /// If the two do not fit together, or hold several images.
@@ -348,7 +350,7 @@ impl Operand {
         &self.data[..self.shape.n * self.planes() * self.grid.positions()]
     }
 
-    /// [`Operand::body`], to write.
+    /// [`Operand::body`], writable.
     fn body_mut(&mut self) -> &mut [Wide] {
         let len = self.body().len();
         &mut self.data[..len]
@@ -384,7 +386,7 @@ impl Operand {
 }
 
 impl Format {
-    /// The larger of each two values, none negative.
+    /// The larger of each two values, none of which is negative.
     #[inline(always)]
     fn max(self, a: &Wide, b: &Wide) -> Wide {
         match self {
@@ -402,7 +404,7 @@ impl Format {
     }
 }
 
-/// Writes blocks in steps to the bytes from `lane` on of as many values.
+/// Writes each block, counted in steps, to the 16 bytes from `lane` on of one value of `out`.
 fn quantize(steps: Steps, blocks: &[Block], out: &mut [Wide], lane: usize) {
     Tier::detect().run(Quantize { blocks, steps, out, lane });
 }

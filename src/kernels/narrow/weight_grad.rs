@@ -1,8 +1,8 @@
 //! Weight gradients in bfloat16: a matrix product whose inner dimension runs over pixels.
 //!
-//! The input is laid out channel by channel ([`Channels`]), so that a tap is a shift along the row; the
-//! output gradient in interleaved pairs of positions ([`Pairs`]), zero on every border, so that rows need
-//! not be told apart.
+//! The input is laid out channel by channel ([`Channels`]), so that a tap is a shift along the row. The
+//! output gradient is laid out in interleaved pairs of positions ([`Pairs`]), and is zero on every border, so
+//! that rows need not be told apart.
 
 use half::bf16;
 use rayon::prelude::*;
@@ -13,7 +13,8 @@ use super::{
 };
 use crate::kernels::weight_grad::add_sums;
 
-/// Products of 32 positions that keep both factors in the first-level cache over all taps.
+/// How many products of 32 positions are made for one tap before the next tap: so few that both factors stay
+/// in the first-level cache over all taps.
 const STEPS: usize = 8;
 
 /// An activation, channel by channel.
@@ -59,11 +60,11 @@ impl Channels {
     }
 }
 
-/// An output gradient, positions interleaved two by two.
+/// An output gradient whose positions are interleaved two by two.
 #[derive(Debug)]
 pub struct Pairs {
-    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions from the first pixel of row 0 on, so
-    /// that no tap reaches beyond the first position of the input.
+    /// `[image][plane of 16][phase]`, each of `rows` pairs of positions. They begin at the first pixel of row
+    /// 0, so that no tap reaches before the first position of the input.
     data: Pooled<Wide>,
     rows: usize,
     grid: Grid,

@@ -1,11 +1,11 @@
-//! 3x3 convolutions in 8 bits by cells of 4x4 outputs ([`crate::kernels::winograd`]), to the same bits as
-//! tap by tap.
+//! 3x3 convolutions in 8 bits by cells of 4x4 outputs ([`crate::kernels::winograd`]). Results are the same to
+//! the bit as those of convolutions tap by tap.
 //!
-//! Fractions would be rounded, and what comes out would depend on where a cell begins. Whole numbers modulo
-//! 2^32 do without: weights at the points take 16 bits, and sums of their products make 9 x 2^k times the
-//! output. Nine has an inverse modulo 2^32, and a shift takes the rest away. So nothing but an output times
-//! 2^k has to fit into 32 bits ([`FITTING_SUM`]), and what lies beyond a plane's last row or column may be
-//! anything.
+//! Fractions would be rounded, and results would depend on where a cell begins. Whole numbers modulo 2^32
+//! need no rounding: weights at the points take 16 bits, and sums of their products give 9 x 2^k times the
+//! output. Multiplying by the inverse of 9 modulo 2^32 removes the 9, and a shift removes the 2^k. So nothing
+//! but an output times 2^k has to fit into 32 bits ([`FITTING_SUM`]). Pixels beyond a plane's last row or
+//! column may hold anything.
 
 use std::num::Wrapping;
 
@@ -17,23 +17,24 @@ use crate::kernels::{
     winograd::{PATCH, POINTS, SIDE, evaluate_kernel},
 };
 
-/// What the weights of an output may add up to at most, in steps, those of either sign for themselves, before
-/// rounding them adds one step to each at most: 2^6 times that times the largest activation fits into 32
+/// The most that an output's weights of one sign may add up to, in steps, before they are rounded. Rounding
+/// adds at most one step to each weight. Then 2^6 times the sum times the largest activation fits into 32
 /// bits.
 pub const FITTING_SUM: f32 = 130_000.0;
 
-/// Up to 32 channels of a source, half a [`Wide`] of it, which take all of one between the transforms.
+/// Up to 32 channels of a source. They are half a [`Wide`] of the source, and a whole one between the
+/// transforms.
 #[derive(Clone, Copy, Debug)]
 pub struct Part {
-    /// Which plane of all sources', and which half of its channels.
+    /// Index of the plane among those of all sources, and which half of its channels.
     plane: usize,
     half: usize,
-    /// Its first channel, and how many there are.
+    /// First channel among those of all sources, and number of channels.
     first: usize,
     count: usize,
 }
 
-/// The parts of sources of so many channels.
+/// The parts of `sources`, of each of which the number of channels is given.
 pub fn parts(sources: impl Iterator<Item = usize>) -> Vec<Part> {
     let (mut plane, mut first) = (0, 0);
     let mut parts = Vec::new();
@@ -94,7 +95,8 @@ impl Kernel for Cells<'_> {
         let mut products = allocate(POINTS * product);
         let mut sums: [Sums; SIDE] = std::array::from_fn(|_| Sums::default());
         for y in (band.rows.0..band.rows.1).step_by(SIDE) {
-            // The row above a cell, as counted from the border's; rows below the border's may be any.
+            // A patch begins one row above and one column left of its cell. Rows below the border may hold
+            // anything, so the border's row is read in their place.
             let starts: [usize; PATCH] =
                 std::array::from_fn(|i| grid.row((y + i).min(grid.h + 1)) - grid.stride() - 1);
             for x in (0..grid.w).step_by(SIDE * CELLS) {

@@ -183,8 +183,8 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn bytes(self, v: Self::V) -> [u8; LANES] {
-        // SAFETY: the token's promise; both are 16 bytes. What no whole number of 32 bits holds would come
-        // out negative.
+        // SAFETY: the token's promise; both are 16 bytes. Values too large for whole numbers of 32 bits would
+        // come out negative.
         unsafe {
             let most = _mm256_set1_ps(255.0);
             let low = _mm256_cvtps_epi32(_mm256_min_ps(v.0, most));
@@ -206,7 +206,7 @@ const IN_ORDER: i32 = 0xd8;
 const LOW: i32 = 0x20;
 const HIGH: i32 = 0x31;
 
-/// All bits of those of eight lanes, the first of them lane `first`, that come before lane `end`.
+/// A mask for eight lanes, of which the first is lane `first`: all bits of those that come before lane `end`.
 ///
 /// # Safety
 /// The processor has AVX2.
@@ -277,7 +277,7 @@ unsafe fn transpose_four_pairs(r: [__m256; 4]) -> [__m256; 4] {
     }
 }
 
-/// The first pairs of 128-bit lanes of two vectors, and the second.
+/// The first pairs of lanes of the 128-bit parts of two vectors, and the second pairs.
 ///
 /// # Safety
 /// The processor has AVX2.
@@ -299,7 +299,7 @@ unsafe fn exp_eight(x: __m256) -> __m256 {
     // SAFETY: the caller's promise.
     unsafe {
         let limit = _mm256_set1_ps(LIMIT);
-        // Of a NaN and a number, both return the second.
+        // Where one operand is NaN, `max` and `min` return the second operand.
         let x = _mm256_max_ps(_mm256_sub_ps(_mm256_setzero_ps(), limit), x);
         let x = _mm256_min_ps(limit, x);
         let n = _mm256_mul_ps(x, _mm256_set1_ps(std::f32::consts::LOG2_E));

@@ -164,7 +164,7 @@ impl Simd for Avx512 {
         // SAFETY: the token's promise.
         unsafe {
             let limit = _mm512_set1_ps(LIMIT);
-            // Of a NaN and a number, both return the second.
+            // Where one operand is NaN, `max` and `min` return the second operand.
             let x = _mm512_max_ps(_mm512_sub_ps(_mm512_setzero_ps(), limit), x);
             let x = _mm512_min_ps(limit, x);
             let log2_e = _mm512_set1_ps(std::f32::consts::LOG2_E);

@@ -24,7 +24,7 @@ use portable::Portable;
 /// Sixteen f32 lanes. A value proves that the processor has the instructions: only [`Simd::detect`] makes
 /// one.
 pub trait Simd: Copy {
-    /// What `DEMC_TIER` calls it, but for its capital.
+    /// Its name in the environment variable `DEMC_TIER`, in which capitals do not matter.
     const NAME: &str;
     /// The lanes.
     type V: Copy;
@@ -122,11 +122,12 @@ pub trait Simd: Copy {
     fn transpose_pairs(self, rows: [Self::V; PAIRS]) -> [Self::V; PAIRS] {
         exchange(self, rows)
     }
-    /// Doubles a line of which `p` is one value before the first: each value twice, and the value on the
-    /// other side of each of the two halves of it. From `a b c d ..`: `b b c c ..` and `a c b d ..`.
+    /// Doubles the line of values that begins one value after `p`. The first vector holds each value twice,
+    /// and the second the neighbour on the left, then the one on the right, of each. From `a b c d ..` come
+    /// `b b c c ..` and `a c b d ..`.
     ///
     /// # Safety
-    /// `p` is valid for reads of 16 values; ten count.
+    /// `p` is valid for reads of 16 values, of which ten are used.
     #[inline(always)]
     unsafe fn double(self, p: *const f32) -> [Self::V; 2] {
         let (mut own, mut near) = (Block::default(), Block::default());
@@ -139,7 +140,7 @@ pub trait Simd: Copy {
             [self.load(&own), self.load(&near)]
         }
     }
-    /// `e^x` to 2e-7 relative within +-40, and as at that limit beyond; NaN of NaN. See
+    /// `e^x` to 2e-7 relative within +-40, and beyond these limits the value at the limit. NaN gives NaN. See
     /// [`exp`](super::exponential::exp).
     #[inline(always)]
     fn exp(self, x: Self::V) -> Self::V {
@@ -153,7 +154,7 @@ pub trait Simd: Copy {
     }
     /// Lane-wise maximum; 0 where `a` is NaN and `b` is 0.
     fn max(self, a: Self::V, b: Self::V) -> Self::V;
-    /// Rounds values, none negative, to the nearest whole number that a byte holds.
+    /// Rounds values, none of which is negative, to the nearest whole number that a byte holds.
     #[inline(always)]
     fn bytes(self, v: Self::V) -> [u8; LANES] {
         let mut values = Block::default();
@@ -166,7 +167,8 @@ pub trait Simd: Copy {
 /// Pairs of lanes.
 pub const PAIRS: usize = LANES / 2;
 
-/// Of `N` groups of neighbouring lanes, group `j` of vector `i` becomes group `i` of vector `j`.
+/// Divides each of `N` vectors into `N` groups of neighbouring lanes; group `j` of vector `i` becomes group
+/// `i` of vector `j`.
 #[inline(always)]
 fn exchange<S: Simd, const N: usize>(simd: S, rows: [S::V; N]) -> [S::V; N] {
     let group = LANES / N;
@@ -206,7 +208,7 @@ enum Isa {
     Avx512(Avx512),
 }
 
-/// `work` with the lanes of a tier: the one place that tells them apart.
+/// Evaluates `work` with the lanes of a tier. Only this macro tells the tiers apart.
 macro_rules! with_lanes {
     ($tier:expr, $lanes:ident => $work:expr) => {
         match $tier.0 {
@@ -264,10 +266,10 @@ impl Tier {
     }
 }
 
-/// The one of `choices` that an environment variable names, or the last where it names nothing.
+/// The one of `choices` that the environment variable names, or the last one where it is empty.
 ///
 /// # Panics
-/// If it names another.
+/// If it names none of them.
 pub(super) fn choose<T: Copy + fmt::Debug>(variable: &str, wanted: &str, choices: &[T]) -> T {
     if let Some(names) = unknown_choice(wanted, choices) {
         panic!("{variable} is \"{wanted}\"; this processor has {names}");
@@ -276,7 +278,7 @@ pub(super) fn choose<T: Copy + fmt::Debug>(variable: &str, wanted: &str, choices
     *named.unwrap_or(&choices[choices.len() - 1])
 }
 
-/// The names of `choices`, where an environment variable names another.
+/// The names of all `choices`, if what an environment variable names is none of them.
 pub fn unknown_choice<T: fmt::Debug>(wanted: &str, choices: &[T]) -> Option<String> {
     let names: Vec<String> = choices.iter().map(name_of).collect();
     let is_known = wanted.is_empty() || names.contains(&wanted.to_lowercase());
@@ -364,7 +366,7 @@ mod tests {
         choose("DEMC_TIER", "avx1024", &Tier::available());
     }
 
-    /// Beyond the limit it stays as it is there; what is no number stays none, so that it is seen.
+    /// Beyond the limit the result stays as it is there. NaN stays NaN, so that it is noticed.
     #[test]
     fn exponentials_end_at_the_limit() {
         struct Exponentials<'a>(&'a mut [f32; LANES]);

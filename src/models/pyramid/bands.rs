@@ -1,9 +1,9 @@
-//! A network's layers from top to bottom of a frame, band by band, to the same bits as
-//! [`Network::forward`](super::super::network::Network::forward) on the whole of it.
+//! Runs a network's layers from top to bottom of a frame, band by band. Results are the same to the bit as
+//! those of [`Network::forward`](super::super::network::Network::forward) on the whole frame.
 //!
-//! Every layer goes as far down as the rows above it allow and no row is computed twice; rows are kept only
-//! while something below needs them. Memory so grows with the width of a frame, not with its height, and
-//! a pixel costs the same in a frame of any size.
+//! Every layer goes as far down the frame as the rows that it reads allow, and no row is computed twice. Rows
+//! are kept only while something needs them. So memory grows with the width of a frame, not with its height,
+//! and a pixel costs the same in a frame of any size.
 
 use std::{collections::VecDeque, ops::Range};
 
@@ -22,22 +22,24 @@ pub type Field = crate::nn::Field<NoneTape>;
 
 /// Images that a trunk's kernels filter: light, or guides.
 pub trait Subject {
-    /// What is read of some rows.
+    /// The inputs for some rows.
     type Inputs;
 
     /// How many images there are.
     fn images(&self) -> usize;
 
-    /// Takes in the next rows, and returns the encoders' inputs; `images` are those of full resolution.
+    /// Takes in the next rows, and returns the encoders' inputs. What is to be filtered goes into `images`,
+    /// which are those of full resolution, here or in [`Subject::predicted`].
     fn push(&mut self, inputs: Self::Inputs, images: &mut [Filtered]) -> [Planes; 2];
 
-    /// Takes in what the head of full resolution says of `rows`, and returns the logits of the gains.
+    /// Takes in what the head of full resolution predicted for `rows`, and returns the logits of the gains.
     fn predicted(&mut self, rows: Range<usize>, finish: Finish<NoneTape>, images: &mut [Filtered]) -> Field;
 
-    /// What becomes of `rows` once their images are filtered, each (3, R, W).
+    /// The results for `rows` whose images are `filtered`, each (3, R, W).
     fn finish(&self, rows: Range<usize>, filtered: Vec<Field>, gain: Field) -> Vec<Field>;
 
-    /// Lets go of the rows of which everything is `predicted`, and of those that are `finished`.
+    /// Drops rows that are no longer needed: everything is predicted for the first `predicted` rows, and the
+    /// first `finished` rows are done.
     fn forget(&mut self, predicted: usize, finished: usize);
 }
 
@@ -54,14 +56,14 @@ pub struct Feed<'a, S> {
 }
 
 impl<'a, S: Subject> Feed<'a, S> {
-    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` is made
-    /// for as many rows as [`padded`] has.
+    /// A frame of `size` columns and rows, of which no step takes more than `band` rows. `subject` must be
+    /// made for as many rows as [`padded`] gives.
     pub fn new(trunk: &'a Trunk, subject: S, size: (usize, usize), band: usize) -> Self {
         Self { frame: Progress::new(trunk, subject, padded(size.1), band), size }
     }
 
-    /// Takes in the next rows, grown to what the network can halve, and hands out what is denoised with them,
-    /// times `scale`, and its first row.
+    /// Takes in the next rows, grown to what the network can halve. Calls `done` with the rows that this
+    /// completes: the number of the first, and the denoised images times `scale`.
     pub fn push(
         &mut self,
         inputs: S::Inputs,
@@ -99,11 +101,12 @@ pub fn padded(rows: usize) -> usize {
     rows.next_multiple_of(MULTIPLE)
 }
 
-/// All that is under way in a frame.
+/// The state of a frame that is under way.
 struct Progress<'a, S> {
     trunk: &'a Trunk,
     subject: S,
-    /// Rows that one step may take: without it, the last step would take all that is behind.
+    /// The most rows that one step may take. Without this limit, the last step would take all rows that are
+    /// left.
     band: usize,
     /// What each layer makes.
     lines: Vec<Line<Maps>>,
@@ -128,9 +131,9 @@ struct Scale {
 /// A level of an image.
 pub struct Filtered {
     pub image: Line<Field>,
-    /// That blended with the level below.
+    /// The image blended with the level below.
     blended: Line<Field>,
-    /// What the level above takes in.
+    /// The filtered image, which is blended into the level above.
     smooth: Line<Field>,
 }
 
@@ -178,8 +181,8 @@ impl<'a, S: Subject> Progress<'a, S> {
         self.scales[0].filtered == self.scales[0].confidence.total()
     }
 
-    /// Computes the next rows of everything, as far as they can be, and hands out those that are done: the
-    /// first row, and see [`Feed::push`].
+    /// Computes the next rows of everything as far as possible, and calls `done` with the rows that are
+    /// completed: the number of the first, and their images.
     fn advance(&mut self, done: &mut impl FnMut(usize, &[Field])) {
         self.encode();
         self.decode();
@@ -268,7 +271,7 @@ impl<'a, S: Subject> Progress<'a, S> {
         }
     }
 
-    /// Filters the images; at full resolution, hands out what becomes of them.
+    /// Filters the images. At full resolution, the results go to `done`.
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
         let reach = self.trunk.kernel(scale) / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
@@ -282,7 +285,7 @@ impl<'a, S: Subject> Progress<'a, S> {
             let trust = confidence.rows(near.clone());
             let sources: Vec<Field> =
                 images.iter().map(|image| image.source(scale).rows(near.clone())).collect();
-            // Of images that are filtered together, each weight is computed once.
+            // For images that are filtered together, each weight is computed only once.
             let filtered_together = |images: &[Field]| match images {
                 [a, b, c] => Field::filter_rows([a, b, c], inside, &kernel, &trust).into(),
                 [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
@@ -299,7 +302,7 @@ impl<'a, S: Subject> Progress<'a, S> {
         }
     }
 
-    /// Lets go of every row that nothing needs any more.
+    /// Drops every row that nothing needs any more.
     fn forget(&mut self) {
         let mut needed = vec![usize::MAX; self.lines.len()];
         for (layer, line) in self.trunk.layers.iter().zip(&self.lines) {
@@ -309,7 +312,7 @@ impl<'a, S: Subject> Progress<'a, S> {
         }
         self.lines.iter_mut().zip(needed).for_each(|(line, row)| line.forget(row));
         for scale in 0..=LEVELS {
-            // Of several images all are as far on.
+            // All images have progressed to the same row.
             let reduced =
                 self.scales.get(scale + 1).map_or(usize::MAX, |below| 2 * below.images[0].image.end());
             let above =
@@ -329,7 +332,8 @@ impl<'a, S: Subject> Progress<'a, S> {
 }
 
 impl Filtered {
-    /// What the kernels of a scale filter: the coarsest has nothing to be blended with.
+    /// What the kernels of a scale filter. It is the blended image, but for the coarsest scale, which has no
+    /// level below to be blended with.
     fn source(&self, scale: usize) -> &Line<Field> {
         if scale == LEVELS { &self.image } else { &self.blended }
     }
@@ -339,7 +343,8 @@ impl Scale {
     /// Takes in what a head predicted for `rows`.
     fn predicted(&mut self, rows: Range<usize>, prediction: Prediction<NoneTape>) {
         let Prediction { kernel, confidence, mask, corners } = prediction;
-        // A copy, since it is kept for longer than all the head's planes, whose memory it would keep.
+        // The confidence is copied, since it is kept for longer than the head's other planes, and would keep
+        // the memory of them all.
         self.confidence.push(Field::input(confidence.extent(), confidence.values()));
         self.masks.push_back((rows.clone(), mask, corners));
         self.kernels.push_back((rows, kernel));
@@ -359,7 +364,7 @@ impl Layer {
             return;
         };
         match conv.arithmetic().geometry {
-            // A band of the first source at a time, which so needs no copy.
+            // One band of the first source at a time, so that its rows need no copy.
             Geometry::Same(1) => {
                 while let Some(to) = first.band_end(line.end()) {
                     let sources = || self.sources.iter().map(|i| source(*i));
@@ -391,7 +396,8 @@ impl Layer {
     }
 }
 
-/// Rows `rows` of `total` with `reach` rows more on either side, and where `rows` lie among those.
+/// `rows` with `reach` more rows on either side, as far as there are any in `total`, and where `rows` lie
+/// among those.
 fn around(rows: &Range<usize>, reach: usize, total: usize) -> (Range<usize>, (usize, usize)) {
     let near = rows.start.saturating_sub(reach)..(rows.end + reach).min(total);
     let inside = (rows.start - near.start, rows.end - near.start);

@@ -1,5 +1,5 @@
-//! Light on its way through the built-in network: radiance that is divided by an albedo, filtered and
-//! multiplied again, with whatever is denoised along with it.
+//! Light on its way through the built-in network: radiance is divided by an albedo, filtered and multiplied
+//! by the albedo again, and so are the layers that are denoised along with it.
 
 use std::ops::Range;
 
@@ -11,24 +11,24 @@ use super::{
 };
 use crate::{companion::Kind, features::LightInputs, nn::Line, planes::Planes};
 
-/// Rows of radiance and its companions. They are handed out in this order, each (3, R, W): radiance, exposed,
+/// Rows of radiance and its companions. Results are returned in this order, each (3, R, W): exposed radiance,
 /// the normal, what radiance was divided by, and the companions.
 pub struct LightImages {
-    /// What is divided by the clean albedo, and the logarithm of that over the noisy one, until the network
-    /// says which is to divide.
+    /// Radiance over the divisor of the clean albedo, and the logarithm of that divisor over the one of the
+    /// noisy albedo. They are kept until the network says how far to divide by either.
     quotient: Line<Field>,
     ratio: Line<Field>,
-    /// Companions wait for the same. They are the images of each scale after the first.
+    /// Companions, kept until then as well. They are the images of each scale after the first.
     companions: Vec<(Kind, Line<Field>)>,
-    /// What normals tell of the light, until the network says how far to follow it.
+    /// What normals tell of the light, kept until the network says how far to follow it.
     shading: Line<Field>,
     divisor: Line<Field>,
-    /// For a refit.
+    /// The denoised normal, for a refit.
     normal: Line<Field>,
 }
 
 impl LightImages {
-    /// Of a frame of so many rows.
+    /// For a frame of `height` rows.
     pub fn new(height: usize, companions: &[Kind]) -> Self {
         let line = || Line::new(height);
         Self {

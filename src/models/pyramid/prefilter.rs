@@ -32,12 +32,12 @@ impl Prefilter {
     /// A network with fresh weights drawn from `seed`; see [`Trunk::new`].
     ///
     /// # Panics
-    /// As that.
+    /// As for that function.
     pub fn new(config: &Config, seed: u64) -> Self {
         Self::named("", &config.widths, &mut Rng::new(seed, 0))
     }
 
-    /// One whose layers' names begin with `prefix`.
+    /// A prefilter whose layers' names begin with `prefix`.
     pub(super) fn named(prefix: &str, widths: &[usize], rng: &mut Rng) -> Self {
         let variant = Variant { prefix, guides: 3, full_kernel: KERNEL, refines: false };
         Self { widths: widths.into(), trunk: Trunk::new(widths, &variant, rng) }
@@ -129,7 +129,7 @@ impl Network for Prefilter {
     }
 }
 
-/// Albedo and normal on their way through a prefilter, which hands them out in this order, in its scale.
+/// Albedo and normal on their way through a prefilter, which returns them in this order and in its own scale.
 pub(super) struct GuideImages;
 
 impl Subject for GuideImages {

@@ -1,10 +1,11 @@
-//! Inference on a frame, to the same bits as [`Network::forward`] on the whole of it: strip by strip from
-//! left to right, each [band by band](super::bands) from top to bottom, refitted and written once its rows
-//! are through.
+//! Inference on a frame, with the same bits as [`Network::forward`] on the whole frame. It goes strip by
+//! strip from left to right, and in each strip [band by band](super::bands) from top to bottom. Rows are
+//! refitted and written once they are denoised.
 //!
-//! What bands keep under way grows with their width. So frames that are wider than most are denoised in
-//! vertical strips, each with as many columns beside its own as they depend on. A strip begins where quads
-//! of pixels do at every level. What depends on the whole frame, exposures and shading, is computed once.
+//! The memory that bands need grows with their width. So frames that are wider than most are denoised in
+//! vertical strips, each of which reads as many columns beside its own as these depend on. A strip begins
+//! where quads of pixels do at every level. What depends on the whole frame, which is exposures and shading,
+//! is computed once.
 
 use std::ops::Range;
 
@@ -30,8 +31,8 @@ use crate::{
     planes::Planes,
 };
 
-/// Pixels of a band, all strips together: enough to keep threads busy, few enough for an 8K frame to fit in 3
-/// GiB.
+/// Pixels of a band across all strips: enough to keep threads busy, and few enough for an 8K frame to fit in
+/// 3 GiB.
 const BAND_PIXELS: usize = 9 << 14;
 
 /// Columns of the widest strip: few enough for bands of few rows to fit in little memory, while strips, which
@@ -39,7 +40,7 @@ const BAND_PIXELS: usize = 9 << 14;
 const WIDEST: usize = 6144;
 
 /// Denoised radiance of a frame, (3, H, W), and its companions denoised along with it. `guides` are its clean
-/// albedo and normal, where they are known; `rows` those of a band, if the user has an opinion.
+/// albedo and normal, where they are known. `rows` are those of a band, if the user chose a number.
 ///
 /// # Errors
 /// A pass is missing.
@@ -85,7 +86,7 @@ fn infer_in(
     for (companion, mut planes) in companions.iter_mut().zip(written) {
         match companion.kind {
             Kind::Light => keep_black(&mut planes, radiance, albedo),
-            // What is nothing all around stays nothing.
+            // What is zero all around stays zero.
             Kind::Share => keep_black(&mut planes, &companion.planes, &companion.planes),
             Kind::Colour => {}
         }
@@ -124,14 +125,14 @@ fn infer_guides_in(
     Ok(guides)
 }
 
-/// What a prefilter exposes a frame's guides by.
+/// The factor by which a frame's guides are exposed for a prefilter.
 fn exposure_of_guides(passes: &PassSet) -> Result<f32> {
     passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
     Ok(albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?))
 }
 
-/// Denoises the guides in the columns of `cut`, exposed by `exposure`, and hands out what is done of them, as
-/// [`Feed::push`] does: albedo and normal.
+/// Denoises the guides in the columns of `cut`, exposed by `exposure`. Completed rows of albedo and normal
+/// are passed on as [`Feed::push`] does.
 fn prefilter_bands(
     prefilter: &Prefilter,
     passes: &PassSet,
@@ -150,17 +151,17 @@ fn prefilter_bands(
 
 /// Some columns of a frame.
 struct Strip {
-    /// Those that are written.
+    /// Columns that are written.
     own: Range<usize>,
-    /// Those that the network sees, so that the former are right.
+    /// Columns that the network reads, so that `own` are right.
     seen: Range<usize>,
-    /// Those that its prefilter sees, so that the guides of the former are right.
+    /// Columns that its prefilter reads, so that the guides in `seen` are right.
     prefiltered: Range<usize>,
 }
 
 impl Strip {
-    /// As few of a width as make up a frame, none wider than `widest`. They see as far beyond their own
-    /// columns as `reach` says, and what prefilters those as far again as its second number.
+    /// Cuts `width` columns into as few strips as possible, none of which writes more than `widest` columns.
+    /// The network reads `reach[0]` columns beyond those that are written, and the prefilter `reach[1]` more.
     fn all(width: usize, widest: usize, reach: [usize; 2]) -> impl Iterator<Item = Self> {
         let beside = move |columns: &Range<usize>, reach: usize| {
             let reach = reach.next_multiple_of(MULTIPLE);
@@ -185,7 +186,7 @@ impl Pyramid {
 /// How some columns of a frame are cut into bands.
 struct Cut {
     columns: Range<usize>,
-    /// Columns and rows of the frame once padded, and rows before.
+    /// Columns and rows of the padded frame, and rows of the frame before it is padded.
     width: usize,
     height: usize,
     unpadded: usize,
@@ -194,25 +195,25 @@ struct Cut {
 }
 
 impl Cut {
-    /// That of a strip; `rows` are those of a band, if the user has an opinion.
+    /// Cuts the columns of a strip. `rows` are those of a band, if the user chose a number.
     fn new(passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
         let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(MULTIPLE));
         let rows = (rows.unwrap_or(BAND_PIXELS / width) / MULTIPLE * MULTIPLE).max(MULTIPLE);
         Self { columns, width, height, unpadded: passes.height, rows }
     }
 
-    /// Columns and rows that there are.
+    /// Columns and rows before padding.
     fn size(&self) -> (usize, usize) {
         (self.columns.len(), self.unpadded)
     }
 
-    /// The columns and those to which they are padded: only where the frame ends is there anything to pad.
+    /// The columns after padding, which adds some only at the frame's right edge.
     fn padded_columns(&self) -> Range<usize> {
         self.columns.start..self.columns.end.next_multiple_of(MULTIPLE)
     }
 
-    /// Whether a band that ends before row `end` must reach to the last row: the last rows are mirrored below
-    /// themselves, so as many come at once as that may take.
+    /// Whether a band that ends before row `end` must reach to the last row instead. Padding mirrors the last
+    /// rows below themselves, so as many as it may need must be in the last band.
     fn is_last(&self, end: usize) -> bool {
         self.unpadded < end + MULTIPLE
     }
@@ -233,7 +234,7 @@ impl Cut {
 enum CleanGuides<'a> {
     /// They are known.
     Given(&'a Planes, &'a Planes),
-    /// From the prefilter, which is given the noisy ones at this exposure.
+    /// They come from the prefilter, which reads the noisy ones at this exposure.
     Prefiltered(f32),
 }
 
@@ -259,7 +260,7 @@ impl Whole<'_> {
         let mut beauty = Feed::new(&network.trunk, light, cut.size(), cut.rows);
         let mut last = Last::new(self, strip, written);
         let mut feed = |rows: Range<usize>, guides: [Planes; 2]| {
-            // A refit takes exposed radiance, and scales it last.
+            // A refit reads exposed radiance, so the result is scaled after it.
             beauty.push(self.inputs(&cut, rows, guides)?, 1.0, &mut |first, parts| {
                 last.push(first, parts);
                 Ok(())
@@ -280,7 +281,7 @@ impl Whole<'_> {
         let from = strip.seen.start - strip.prefiltered.start;
         let seen = from..from + strip.seen.len();
         let mut held: Option<[Planes; 2]> = None;
-        // What of the guides is done goes on its way at once, so that nobody keeps a whole frame of them.
+        // Completed rows of the guides are used at once, so that no whole frame of them is kept.
         prefilter_bands(&network.prefilter, passes, exposure, &prefiltered, &mut |first, parts| {
             let clean: [Planes; 2] = parts.try_into().expect("albedo and normal");
             let mut clean = clean.map(|planes| planes.columns(seen.clone()));
@@ -298,7 +299,7 @@ impl Whole<'_> {
         })
     }
 
-    /// What the network reads of some rows, whose clean albedo and normal are given, and the companions,
+    /// The network's inputs for some rows, whose clean albedo and normal are given, and the companions,
     /// divided as radiance is.
     fn inputs(
         &self,
@@ -343,7 +344,7 @@ struct Last<'a> {
     refit: Refit,
     /// Columns and rows.
     size: (usize, usize),
-    /// What the refit has under way: radiance, normal, what radiance was divided by, and companions.
+    /// Rows that the refit has not finished: radiance, normal, what radiance was divided by, and companions.
     held: Vec<Planes>,
     /// Radiance and companions of the whole frame.
     written: &'a mut [Planes],
@@ -359,7 +360,7 @@ impl<'a> Last<'a> {
     fn push(&mut self, first: usize, mut parts: Vec<Planes>) {
         let Whole { companions, radiance, exposure, .. } = *self.whole;
         let end = first + parts[0].height;
-        // Images have three channels while they are filtered; a layer of one is not held three times.
+        // Images have three channels while they are filtered. Of a layer of one channel, only one is held.
         for (part, companion) in parts[3..].iter_mut().zip(companions) {
             if companion.planes.channels == 1 {
                 *part = part.of_first(1);
@@ -395,8 +396,9 @@ impl<'a> Last<'a> {
     }
 }
 
-/// Changes the first `done` rows of a light as a refit changed the beauty: to the `scale` of the result,
-/// times the beauty after over the beauty `before`.
+/// Changes the first `done` rows of a light as a refit changed the beauty: multiplies each value by the
+/// beauty `after` the refit over the beauty `before` it. The former is in the `scale` of the result already;
+/// where the latter is 0, the value is multiplied by `scale`.
 fn follow(light: &mut Planes, (before, after): (&Planes, &Planes), done: usize, scale: f32) {
     let (width, pixels) = (light.width, light.pixels());
     light.data.par_chunks_mut(pixels).enumerate().for_each(|(c, plane)| {

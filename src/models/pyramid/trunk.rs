@@ -23,8 +23,8 @@ pub const MULTIPLE: usize = 1 << LEVELS;
 /// Rows and columns of kernels, but for some of full resolution.
 pub const KERNEL: usize = 5;
 
-/// Channels that the head of full resolution has besides for one pixel: a gain for each colour and, where
-/// radiance is filtered, which albedo to divide by, and how far to follow the shading.
+/// Further channels of the full-resolution head for each pixel: a gain for each colour and, where radiance is
+/// filtered, which albedo to divide by, and how far to follow the shading.
 const GAINS: usize = 3;
 const DIVISOR: usize = 1;
 const SHADE: usize = 1;
@@ -32,11 +32,11 @@ const SHADE: usize = 1;
 /// A decoder level is this much wider than the encoders beside it.
 const DECODER_EXTRA: usize = 16;
 
-/// Heads begin this much smaller than Xavier: kernels start nearly flat.
+/// Factor on the heads' Xavier weights at the start, so that kernels start nearly flat.
 const HEAD_GAIN: f32 = 0.3;
 
-/// What inputs may be in 8 bits: logarithms up to 300 times white, beyond which brightness decides on no
-/// kernel; and all that albedo and normals are.
+/// The values that inputs may have in 8 bits: logarithms up to 300 times white, beyond which brightness makes
+/// no difference to kernels; and for guides the whole range of albedo and normals.
 const LOGARITHMS: Steps = Steps::to(3.0);
 const GUIDES: Steps = Steps::within(1.0);
 
@@ -55,10 +55,11 @@ pub struct Variant<'a> {
 /// The layers of a network or of its prefilter.
 #[derive(Clone)]
 pub struct Trunk {
-    /// Each after those that it reads: those of the radiance encoder, of the guide encoder, of the decoder.
+    /// The layers of the radiance encoder, of the guide encoder, and of the decoder. Each layer comes after
+    /// those that it reads.
     pub layers: Vec<Layer>,
-    /// One for each level of the pyramid of images, full resolution first, which predicts the rest of a frame
-    /// besides.
+    /// One head for each level of the pyramid of images, full resolution first. That of full resolution also
+    /// predicts what a [`Finish`] holds.
     pub heads: Vec<Head>,
     /// Rows and columns of the kernels of full resolution.
     full_kernel: usize,
@@ -73,7 +74,7 @@ pub struct Layer {
     pub step: Step,
     /// The layers that it reads.
     pub sources: Vec<usize>,
-    /// It writes at `1/2^level` of the frame's resolution.
+    /// The layer writes at `1/2^level` of the frame's resolution.
     pub level: usize,
     /// Channels that it writes.
     channels: usize,
@@ -82,14 +83,15 @@ pub struct Layer {
 /// What a layer does.
 #[derive(Clone)]
 pub enum Step {
-    /// Makes channels of the quads of an input, which in 8 bits may have these values.
+    /// Makes the pixels of each quad of an input channels of one pixel. In 8 bits, the input's values are
+    /// these steps.
     Input(Steps),
     /// Halves rows and columns.
     Pool,
     Conv(Box<Conv>),
 }
 
-/// What predicts a level of the pyramid of images.
+/// A layer that predicts the kernels of a level of the pyramid of images.
 #[derive(Clone)]
 pub struct Head {
     pub conv: Conv,
@@ -109,7 +111,7 @@ impl Layer {
     fn reach(&self) -> usize {
         match self.conv().map(|conv| conv.arithmetic().geometry) {
             Some(Geometry::Same(k)) => (k / 2) << self.level,
-            // Half a pixel of the coarser level, as a pool.
+            // A transposed convolution reaches half a pixel of the coarser level, as a pool does.
             Some(_) => 1 << self.level,
             None => 1 << (self.level - 1),
         }
@@ -149,7 +151,7 @@ impl Builder<'_> {
         self.add(Step::Conv(conv.into()), &[source], level - 1, width)
     }
 
-    /// A head of so many channels a pixel.
+    /// A head with `channels` channels for each pixel.
     fn head(&mut self, name: &str, source: usize, channels: usize, factor: usize) -> Head {
         let (name, inputs) = (format!("{}head.{name}", self.prefix), [self.layers[source].channels]);
         let outputs = factor * factor * channels;
@@ -201,7 +203,7 @@ impl Trunk {
         Self { layers: build.layers, heads, full_kernel }
     }
 
-    /// Rows and columns of the kernels of a level of the pyramid that is filtered, 0 the finest.
+    /// Rows and columns of the kernels of a level of the filtered pyramid; level 0 is the finest.
     pub fn kernel(&self, level: usize) -> usize {
         if level == 0 { self.full_kernel } else { KERNEL }
     }
@@ -211,7 +213,7 @@ impl Trunk {
         &self,
         inputs: [&Stacked; 2],
     ) -> (Vec<Prediction<T>>, Finish<T>) {
-        // How many still read each layer: the tape so far goes with the last of them.
+        // How many layers and heads have yet to read each layer. The last of them takes over its tape.
         let mut readers = vec![0; self.layers.len()];
         let reads = self.layers.iter().flat_map(|layer| &layer.sources);
         reads.chain(self.heads.iter().map(|head| &head.source)).for_each(|source| readers[*source] += 1);
@@ -265,7 +267,7 @@ impl Trunk {
         layers + kernels + pyramid
     }
 
-    /// Multiply-accumulates for one pixel of the frame, of which `images` are filtered.
+    /// Multiply-accumulates for one pixel of the frame, where `images` images are filtered.
     pub fn macs_per_pixel(&self, images: usize) -> f64 {
         let each = |macs: usize, level: usize| macs as f64 / 4f64.powi(level as i32);
         let layers = self.layers.iter().filter_map(|layer| Some((layer.conv()?, layer.level)));
@@ -290,7 +292,7 @@ impl Trunk {
         if self.heads[0].conv.arithmetic().precision != Precision::Int8 {
             return self.convolutions().for_each(|conv| conv.freeze(&[]));
         }
-        // Every layer takes in the steps of what it reads.
+        // Every layer is frozen with the steps of what it reads.
         let mut steps: Vec<Steps> = Vec::with_capacity(self.layers.len());
         for layer in &mut self.layers {
             let sources: Vec<Steps> = layer.sources.iter().map(|source| steps[*source]).collect();
@@ -307,8 +309,8 @@ impl Trunk {
     }
 }
 
-/// Channels of a level's head for one pixel: k x k kernel, confidence, the mask that blends the level below,
-/// and the corners from which that is upsampled.
+/// Channels of a level's head for one pixel: the k x k kernel, the confidence, the mask by which the level
+/// below is blended in, and the corners from which that level is upsampled.
 const fn head_of(k: usize) -> usize {
     k * k + 2 + CORNERS
 }
@@ -325,24 +327,25 @@ pub struct Prediction<T> {
     pub corners: Field<T>,
 }
 
-/// What the head of full resolution says of the rest of a frame, once its light is filtered.
+/// What the head of full resolution predicts besides the kernels of its level.
 pub struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     pub gain: Field<T>,
-    /// But for a prefilter, how far to divide by the noisy albedo, before its logistic, and what the shading
-    /// is multiplied by before it is added to all gains' logits, both (N, 1, H, W).
+    /// How far to divide by the noisy albedo, before its logistic, and what the shading is multiplied by
+    /// before it is added to all gains' logits, both (N, 1, H, W). A prefilter has neither.
     pub refined: Option<(Field<T>, Field<T>)>,
 }
 
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
-    /// The same once more, with empty tapes.
+    /// A second handle on the same prediction, with empty tapes.
     pub fn fork(&self) -> Self {
         let Self { kernel, confidence, mask, corners } = self;
         let [kernel, confidence, mask, corners] = [kernel, confidence, mask, corners].map(Field::fork);
         Self { kernel, confidence, mask, corners }
     }
 
-    /// Parts what a level's head says, k x k kernels first: `planes(first, count)` are some of its planes.
+    /// Splits the planes of a level's head, whose k x k kernels come first. `planes(first, count)` gives some
+    /// of these planes.
     pub fn split(k: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> Self {
         let taps = k * k;
         Self {
@@ -353,7 +356,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
         }
     }
 
-    /// Parts what the head of full resolution says, k x k kernels first, which has `count` planes.
+    /// Splits the `count` planes of the head of full resolution, whose k x k kernels come first.
     pub fn split_full(
         k: usize,
         count: usize,
@@ -366,8 +369,8 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     }
 }
 
-/// Some planes of a head's output; `factor` 2 where each quad of pixels shares one pixel of the trunk.
-/// The tape goes with the first that are asked for.
+/// Some planes of a head's output; `factor` 2 where each quad of pixels shares one pixel of the trunk. The
+/// first planes that are asked for take the tape.
 fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
     mut head: Activation<T>,
     factor: usize,
@@ -381,8 +384,7 @@ fn planes_of<T: Tape<f32, Cpu> + Merge<T>>(
 }
 
 /// Filters an image, (N, 3, H, W), by what is predicted for every level of its pyramid, full resolution
-/// first: from the coarsest up, each level is blended with what filtering made of the one below, and
-/// filtered.
+/// first. From the coarsest level up, each level is blended with the filtered level below, and then filtered.
 pub fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(
     mut image: Field<T>,
     levels: Vec<Prediction<T>>,

@@ -1,5 +1,5 @@
-//! AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. 8 bits and conversions are those of
-//! AVX-512.
+//! AMX-BF16: 16x16 tiles, 8192 multiply-accumulates an instruction. Products of 8 bits and conversions are
+//! those of the AVX-512 engine.
 
 use std::{arch::asm, sync::OnceLock};
 
@@ -201,7 +201,7 @@ impl Backend for Amx {
     }
 }
 
-/// Whether the processor has AMX-BF16 and the kernel lets this process use it.
+/// Whether the processor has AMX-BF16 and the system's kernel lets this process use it.
 fn permitted() -> bool {
     /// Bits of CPUID leaf 7, EDX.
     const AMX_BF16: u32 = 1 << 22;
@@ -226,7 +226,7 @@ fn permitted() -> bool {
 const ROW: usize = 64;
 const TILE: usize = 16 * ROW;
 
-/// Eight tiles of 16 rows of 64 bytes, while it lives.
+/// Keeps eight tiles of 16 rows of 64 bytes configured on this thread while it lives.
 struct Tiles;
 
 impl Tiles {

@@ -1,4 +1,5 @@
-//! AVX2 and AVX-VNNI: 8 bits, in vectors of 32 bytes. bfloat16 is the portable engine's.
+//! AVX2 and AVX-VNNI: products of 8 bits, in vectors of 32 bytes. Those of bfloat16 are the portable
+//! engine's.
 
 use std::arch::x86_64::*;
 
@@ -10,10 +11,10 @@ use crate::kernels::{
     winograd::{self, PATCH, POWERS, Ring, SIDE},
 };
 
-/// Positions whose sums stay in registers, two for each.
+/// Positions whose sums stay in registers. Each takes two.
 const TILE: usize = 4;
 
-/// Cells whose products stay in registers, two for each.
+/// Cells whose products stay in registers. Each takes two.
 const STRIP: usize = 4;
 
 /// Lanes of a register.
@@ -51,11 +52,11 @@ impl Backend for Avx2 {
     #[target_feature(enable = "avx2")]
     unsafe fn evaluate(self, patch: [*const u8; PATCH], cells: usize, points: *mut u8, stride: usize) {
         let nothing = Halves(self, _mm256_setzero_si256());
-        // Columns of a patch at the points, the last two of which are the next patch's first.
+        // Columns of a patch at the points. The last two are the first two of the next patch.
         let mut columns = [[nothing; PATCH]; PATCH];
         for cell in 0..cells {
-            // SAFETY: the caller's promise; sixteen channels are aligned to as many bytes, and to twice that
-            // as points.
+            // SAFETY: the caller's promise; sixteen channels of 8 bits are aligned to 16 bytes, and to 32 at
+            // the points, where they have 16 bits.
             unsafe {
                 for x in if cell == 0 { 0 } else { PATCH - SIDE }..PATCH {
                     let mut column = [nothing; PATCH];
@@ -163,7 +164,7 @@ impl Backend for Avx2 {
     }
 }
 
-/// AVX-VNNI: as many in one instruction.
+/// AVX-VNNI: as many multiply-accumulates a lane as AVX2, in one instruction.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct AvxVnni(());
 
@@ -185,14 +186,14 @@ impl Backend for AvxVnni {
     }
 }
 
-/// How products of the words of two rows add up.
+/// How the products of two rows of words are added to a sum.
 trait Words: Copy {
     /// `acc[i] + sum over rows r and j of x[r][i][j] w[r][i][j]`.
     fn add(self, acc: __m256i, x: [__m256i; 2], w: [__m256i; 2]) -> __m256i;
 }
 
-/// Two products of each row add up in 16 bits, as weights are made to fit into
-/// ([`FITTING_STEPS`](crate::kernels::narrow::FITTING_STEPS)), then in 32.
+/// Two products of each of the two rows are added up in 16 bits first, then in 32. Weights are rounded so
+/// that such sums fit into 16 bits ([`FITTING_STEPS`](crate::kernels::narrow::FITTING_STEPS)).
 impl Words for Avx2 {
     #[inline(always)]
     fn add(self, acc: __m256i, x: [__m256i; 2], w: [__m256i; 2]) -> __m256i {
@@ -253,7 +254,7 @@ unsafe fn tiles<W: Words>(words: W, product: Product, sums: &mut Sums) {
 #[derive(Clone, Copy)]
 struct Halves(Avx2, __m256i);
 
-/// 8 of 32 bits.
+/// 8 numbers of 32 bits.
 #[derive(Clone, Copy)]
 struct Wholes(Avx2, __m256i);
 

@@ -1,4 +1,4 @@
-//! AVX512-VNNI and AVX512-BF16: 8 and 16 bits, in vectors of 64 bytes.
+//! AVX512-VNNI and AVX512-BF16: products of 8 bits and of bfloat16, in vectors of 64 bytes.
 
 use std::arch::x86_64::*;
 
@@ -11,12 +11,12 @@ use crate::kernels::{
     simd::{Avx512 as Lanes, Simd},
 };
 
-/// Sums that stay in registers, of the positions of a tile for one output plane or two, beside as many
-/// registers of weights. Fewer would wait for each other.
+/// Sums that stay in registers: those of a tile's positions for one output plane or two. Half of the
+/// registers are left for weights. With fewer sums, additions to the same sum would wait for each other.
 const SUMS: usize = 16;
 
-/// AVX512-VNNI: four multiply-accumulates of 8 bits a lane, of twice as many as AVX2 has. bfloat16 is the
-/// portable engine's.
+/// AVX512-VNNI: four multiply-accumulates of 8 bits a lane, and twice as many lanes as AVX2 has. Products of
+/// bfloat16 are the portable engine's.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Vnni(Lanes);
 
@@ -39,7 +39,7 @@ impl Backend for Vnni {
     }
 }
 
-/// AVX512-BF16 besides: two multiply-accumulates a lane.
+/// AVX512-VNNI and AVX512-BF16: also two multiply-accumulates of bfloat16 a lane.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Avx512(Vnni);
 
@@ -50,8 +50,8 @@ impl Backend for Avx512 {
         is_x86_feature_detected!("avx512bf16").then(Vnni::detect).flatten().map(Self)
     }
 
-    /// AMD's processors are faster so; on Intel's (Emerald Rapids) a training step in bfloat16 takes 1.7 x as
-    /// long.
+    /// AMD's processors are faster in bfloat16; on Intel's (Emerald Rapids) a training step in it takes 1.7 x
+    /// as long.
     fn prefers_bf16(self) -> bool {
         !is_intel()
     }
@@ -125,7 +125,7 @@ fn is_intel() -> bool {
     [vendor.ebx, vendor.edx, vendor.ecx].map(u32::to_le_bytes).concat() == b"GenuineIntel"
 }
 
-/// How products of the pairs or fours of values of a vector add up for every lane.
+/// How the products of two or four neighbouring values of a vector add up in every lane.
 trait Words: Copy {
     /// The lanes that come with it.
     fn lanes(self) -> Lanes;
@@ -217,8 +217,8 @@ unsafe fn tiles<W: Words, const OUT: usize, const TILE: usize>(words: W, product
     }
 }
 
-/// Adds the products of a word of each of a tile's rows, `stride` bytes apart from `x` on, with those in
-/// `w` of each output plane, `plane` rows apart.
+/// Multiplies one word of each row of a tile by the words at `w` of each output plane, and adds the products
+/// to `acc`. Rows of the tile lie `stride` bytes apart from `x` on, and output planes `plane` rows apart.
 ///
 /// # Safety
 /// All of them can be read.

@@ -1,5 +1,6 @@
-//! What depends on the processor: matrix products and conversions. Each has a file here, which says what it
-//! has, what it prefers, and how it multiplies, behind one trait; [`Engine`] is whichever was found.
+//! What depends on the processor: matrix products and conversions. Each kind of processor has a file here,
+//! which says behind one trait what instructions it has, what it prefers, and how it multiplies. [`Engine`]
+//! is the one that was found.
 
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod amx;
@@ -33,7 +34,8 @@ const NINTH: u32 = 0x38e3_8e39;
 pub struct Product<'a> {
     pub terms: &'a [Term],
     /// How many groups of rows of each term's weights are not zero: an engine may leave out the others.
-    // Plain loops do not, and other processors have those alone.
+    // Plain loops leave none out, and processors other than x86-64 have only plain loops: there nothing reads
+    // this.
     #[cfg_attr(not(target_arch = "x86_64"), expect(dead_code))]
     pub groups: &'a [u8],
     pub position: usize,
@@ -43,10 +45,11 @@ pub struct Product<'a> {
     pub plane: usize,
 }
 
-/// A product of 32 input channels, each a row of `stride` bytes, and one or two output planes, over pixels.
+/// A product, summed over pixels, of 32 input channels, each a row of `stride` bytes, with one or two output
+/// planes.
 #[derive(Clone, Copy)]
 pub struct Correlation {
-    /// Times 32 positions.
+    /// Number of positions that are summed over, divided by 32.
     pub steps: usize,
     pub channels: *const bf16,
     pub stride: usize,
@@ -76,7 +79,7 @@ enum Unit {
     Amx(amx::Amx),
 }
 
-/// `work` with the backend of an engine: the one place that tells them apart.
+/// Evaluates `work` with the backend of an engine. Only this macro tells the engines apart.
 macro_rules! with_backend {
     ($engine:expr, $backend:ident => $work:expr) => {
         match $engine.0 {
@@ -150,14 +153,14 @@ impl Engine {
         with_backend!(self, backend => backend.prefers_int8())
     }
 
-    /// Whether it has convolutions of 8 bits of a geometry by cells of outputs ([`super::winograd`]) rather
-    /// than tap by tap.
+    /// Whether it computes convolutions of this geometry in 8 bits by cells of outputs ([`super::winograd`])
+    /// rather than tap by tap.
     pub(super) fn prefers_winograd(self, geometry: Geometry) -> bool {
         with_backend!(self, backend => backend.prefers_winograd(geometry))
     }
 
-    /// Whether it adds up products of 8 bits in 16 before it does in 32, those of four channels, in a
-    /// convolution of a geometry.
+    /// Whether, in a convolution of this geometry in 8 bits, it adds up the products of four channels in 16
+    /// bits before it adds those sums up in 32.
     pub fn adds_in_16_bits(self, geometry: Geometry) -> bool {
         with_backend!(self, backend => backend.adds_in_16_bits(geometry))
     }
@@ -182,10 +185,10 @@ impl Engine {
         }
     }
 
-    /// 16 channels of 8 bits of the patches of `cells` cells side by side, at the 36 points of
-    /// [`super::winograd`]: `patch` is where each row of the first begins, `points` where the first point of
-    /// the first cell goes. Cells follow one another, and points lie `stride` cells apart, a [`Wide`]
-    /// each.
+    /// Evaluates the patches of `cells` cells side by side, 16 channels of 8 bits, at the 36 points of
+    /// [`super::winograd`]. `patch` is where each row of the first patch begins, and `points` where the first
+    /// point of the first cell goes. The cells of a point follow one another, a [`Wide`] each, and points lie
+    /// `stride` such values apart.
     ///
     /// # Safety
     /// All of them can be read and written.
@@ -227,9 +230,9 @@ impl Engine {
         }
     }
 
-    /// The sums of a cell for one output plane, from its products at the points, which lie `stride` values
-    /// apart: row `y` of the cell goes to `sums[y]` of the output plane and from the column that `place`
-    /// says.
+    /// Computes the sums of a cell for one output plane from its products at the points, which lie `stride`
+    /// values apart. Row `y` of the cell goes to `sums[y]`; `place` is the output plane and the column it
+    /// begins at.
     ///
     /// # Safety
     /// All of them can be read.
@@ -293,7 +296,7 @@ impl Engine {
     }
 }
 
-/// What the processor says of itself.
+/// What the processor tells of itself by the CPUID instruction.
 #[cfg(target_arch = "x86_64")]
 #[allow(unused_unsafe)] // Newer versions of Rust hold the intrinsic to be safe.
 fn cpuid(leaf: u32) -> std::arch::x86_64::CpuidResult {

@@ -1,5 +1,5 @@
-//! What an engine does, by plain loops: the oracle of the other engines, which do so what they have no
-//! instructions for.
+//! What an engine does, written as plain loops. They are the oracle of the other engines, which use them
+//! wherever they have no instructions.
 
 use std::num::Wrapping;
 
@@ -13,10 +13,10 @@ use crate::kernels::{
     winograd::{self, PATCH, POWERS, SIDE},
 };
 
-/// A way to multiply narrow matrices, by plain loops where it has no instructions. A value proves that the
-/// processor has those: only [`Backend::detect`] makes one.
+/// A way to multiply narrow matrices; the plain loops given here do what a backend has no instructions for. A
+/// value proves that the processor has the backend's instructions, since only [`Backend::detect`] makes one.
 pub trait Backend: Copy {
-    /// What `DEMC_ENGINE` calls it, but for its capitals.
+    /// Its name in the environment variable `DEMC_ENGINE`, in which capitals do not matter.
     const NAME: &str;
 
     /// The backend, if this processor has it.
@@ -50,7 +50,7 @@ pub trait Backend: Copy {
     /// [`super::Engine::multiply`] in 8 bits.
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn multiply_int8(self, product: Product, sums: &mut Sums) {
         // SAFETY: the caller's promise.
         unsafe { multiply::<true>(product, sums) }
@@ -59,7 +59,7 @@ pub trait Backend: Copy {
     /// [`super::Engine::multiply`] in bfloat16.
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn multiply_bf16(self, product: Product, sums: &mut Sums) {
         // SAFETY: the caller's promise.
         unsafe { multiply::<false>(product, sums) }
@@ -68,7 +68,7 @@ pub trait Backend: Copy {
     /// See [`super::Engine::evaluate`].
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn evaluate(self, patch: [*const u8; PATCH], cells: usize, points: *mut u8, stride: usize) {
         for (cell, lane) in (0..cells).flat_map(|cell| (0..LANES).map(move |lane| (cell, lane))) {
             // SAFETY: the caller's promise.
@@ -91,7 +91,7 @@ pub trait Backend: Copy {
     /// [`super::Engine::multiply_points`] for one output plane.
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn multiply_points(
         self,
         groups: &[u8],
@@ -122,7 +122,7 @@ pub trait Backend: Copy {
     /// See [`super::Engine::interpolate`].
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn interpolate(
         self,
         products: *const Wide,
@@ -152,7 +152,7 @@ pub trait Backend: Copy {
     /// See [`super::Engine::correlate`].
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn correlate(self, correlation: Correlation, sums: &mut Sums) {
         let Correlation { steps, channels, stride, pairs, outputs, plane } = correlation;
         for (o, sums) in sums.0[..outputs].iter_mut().enumerate() {
@@ -175,7 +175,7 @@ pub trait Backend: Copy {
     /// See [`super::Engine::narrow_spread`].
     ///
     /// # Safety
-    /// As that; both halves are of one length.
+    /// As for that function; both halves are of one length.
     unsafe fn narrow_spread(self, low: &[Block], high: Option<&[Block]>, out: *mut Wide, step: usize) {
         for (i, low) in low.iter().enumerate() {
             let mut both = Wide::ZERO;
@@ -201,7 +201,7 @@ pub trait Backend: Copy {
     /// See [`super::Engine::transpose`].
     ///
     /// # Safety
-    /// As that.
+    /// As for that function.
     unsafe fn transpose(self, blocks: &[Block], rows: *mut bf16, stride: usize) {
         for c in 0..LANES {
             for i in 0..LANES {
