@@ -527,23 +527,25 @@ fn preview_path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
     }
 }
 
-/// A name of any kind as a part of a file's: what file systems take for more than a letter is written by its
-/// number, as in an URL.
+/// Any name as part of a file's name: characters that file systems may take for more than a letter are
+/// written by their numbers, as in a URL.
 fn file_name(name: &str) -> String {
     let safe = |c: char| c.is_alphanumeric() || "-_ +".contains(c);
     let write = |c: char| if safe(c) { c.into() } else { format!("%{:02X}", u32::from(c)) };
     name.chars().map(write).collect()
 }
 
-/// The headers of what is at the output's place: an EXR, whole since results are written so.
+/// The headers of the EXR that exists at `output`, if there is one. It is whole, since results are written
+/// whole.
 pub(super) fn existing(output: &Path) -> Option<Frame> {
     Frame::read_headers(output).ok()
 }
 
-/// Whether that is the frame that is wanted; writes what previews of it are wanted and missing.
+/// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
+/// missing.
 ///
 /// # Errors
-/// It is another: nothing is overwritten unasked. Or a preview cannot be written.
+/// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers_by(headers, &options.sources.mapping);
