@@ -252,12 +252,12 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
     }
 }
 
-/// The view layer to hold against one of that name in another file: its namesake, or the only one with
-/// Combined besides the compositor's. A file without view layers, whose name is empty, has nothing to choose
-/// by: see [`choose`].
+/// The view layer to compare with one called `name` in another file: the one of the same name, or else the
+/// only one with Combined besides the compositor's. An empty `name`, as in files without view layers, tells
+/// nothing to choose by, and the view layer is that of [`choose`].
 ///
 /// # Errors
-/// There is none; the message lists what there is.
+/// There is no such view layer; the message lists what there is.
 pub fn choose_like<'a>(frame: &Frame, layers: &'a [Layer], name: &str) -> Result<&'a Layer> {
     if let Some(namesake) = layers.iter().find(|l| l.name == name) {
         return Ok(namesake);
