@@ -37,18 +37,18 @@ pub enum Error {
         path: PathBuf,
         /// The view layer searched.
         view_layer: String,
-        /// The renderer that wrote it; the message says how it is told to write the passes.
+        /// The renderer that wrote the file; the message says how to make it write the passes.
         renderer: &'static Renderer,
         /// The passes that are missing.
         passes: Vec<Pass>,
-        /// The method that needs it.
+        /// The method that needs them.
         needed_by: String,
     },
     /// The command line or a parameter is wrong.
     Usage(String),
     /// The user asked to stop (Ctrl-C).
     Interrupted,
-    /// The program itself is at fault; what its check said.
+    /// The program itself is at fault; the text is what its check said.
     Internal(String),
 }
 
@@ -96,7 +96,7 @@ impl fmt::Display for Error {
     }
 }
 
-/// What to do about passes that a view layer of a renderer's file lacks.
+/// The remedy for `passes` that a view layer of a file lacks, where `renderer` wrote the file.
 pub fn remedy(view_layer: &str, renderer: &Renderer, passes: &[Pass]) -> String {
     let mut settings: Vec<String> = passes.iter().map(|pass| renderer.setting(*pass)).collect();
     settings.dedup();
@@ -104,7 +104,7 @@ pub fn remedy(view_layer: &str, renderer: &Renderer, passes: &[Pass]) -> String 
     if !view_layer.is_empty() {
         return settings;
     }
-    // Nothing tells of what program a file is that names nothing.
+    // A file without view layers does not tell which program wrote it.
     let multilayer = if renderer.is_blender() { "; save as OpenEXR MultiLayer" } else { "" };
     let guides = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
     let elsewhere = match passes.iter().all(|pass| guides.contains(pass)) {
@@ -123,11 +123,11 @@ impl std::error::Error for Error {
     }
 }
 
-/// What `step` makes of the frame in a file. A defect that shows in one frame must not cost the results of
-/// all others: a panic becomes the failure of its file.
+/// Runs `step` on the frame in a file and turns a panic into an error of that file: a defect that one frame
+/// reveals must not cost the results of all others.
 ///
 /// # Errors
-/// Those of `step`, or it panicked.
+/// Those of `step`, or `step` panicked.
 pub fn attempt<T>(input: &Path, step: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(step)).unwrap_or_else(|panic| {
         let what = panic_message(&*panic);

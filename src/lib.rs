@@ -1,6 +1,6 @@
 //! Removes Monte Carlo noise from Blender Cycles renders stored as multilayer EXR.
 //!
-//! A frame is read, denoised, and written with everything it held and a layer more:
+//! A frame is read, denoised, and written with everything that it held and one layer more:
 //!
 //! ```
 //! # fn main() -> demc::Result<()> {
@@ -24,12 +24,12 @@
 //! Modules point downwards only:
 //! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits
 //! weights; [`denoise`] takes files through a method; [`models`] holds every denoising method behind one
-//! trait; [`augment`] changes a frame to another that is as good; [`features`] turns passes into network
-//! inputs; [`filters`] are classical building blocks; [`nn`] is differentiable image operations on dfdx's
-//! tape; [`shot`] is what methods are given, [`sources`] where it is found, and a [`companion`] a layer
-//! denoised along; [`lint`] finds in a frame what ruins a denoise; [`passes`] says what a channel means;
-//! [`frame`] is an EXR exactly as stored; [`metrics`] are pure functions; [`kernels`] holds the arithmetic,
-//! and the only `unsafe`.
+//! trait; [`augment`] turns a frame into another that serves training as well; [`features`] turns passes into
+//! network inputs; [`filters`] holds classical building blocks, and [`nn`] differentiable image operations on
+//! dfdx's tape; [`shot`] is what methods are given, [`sources`] tells where its parts are found, and a
+//! [`companion`] is a layer that is denoised along with the beauty; [`lint`] finds in a frame what ruins a
+//! denoise; [`passes`] says what a channel means; [`frame`] is an EXR exactly as stored; [`metrics`] are pure
+//! functions; [`kernels`] holds the arithmetic, and the only `unsafe`.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 

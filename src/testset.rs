@@ -39,7 +39,7 @@ impl Pair {
         }
     }
 
-    /// What to say where there is no reference.
+    /// The error for a pair whose reference is missing.
     pub fn no_reference(&self) -> Error {
         let wanted = self.reference.display();
         let remedy = "render it, or take the noisy file out of the set";
@@ -58,7 +58,7 @@ impl Pair {
 pub enum Unmatched {
     /// A noisy render, with the reference that was looked for.
     Noisy(Pair),
-    /// A reference that no noisy render goes with.
+    /// A reference without a noisy render.
     Reference(PathBuf),
 }
 
@@ -75,7 +75,7 @@ impl fmt::Display for Unmatched {
     }
 }
 
-/// What a specification names: the pairs, by scene, frame and spp, and the files left over.
+/// What a specification names: the pairs, and the files that are left over.
 #[derive(Clone, Debug, Default)]
 pub struct TestSet {
     /// Complete pairs, sorted by scene, frame, spp and path.
@@ -138,8 +138,8 @@ pub fn read(spec: &str) -> Result<TestSet> {
     Ok(set)
 }
 
-/// Whether a file is other programs' own: unfinished work, or such as the `._room_0004spp.exr` that macOS
-/// leaves beside a file it copied.
+/// Whether a file's name begins with a dot. Other programs name unfinished files so, and macOS leaves files
+/// such as `._room_0004spp.exr` beside a file that it copied.
 pub fn is_hidden(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'))
 }
@@ -176,8 +176,8 @@ fn parse_name(file_name: &str) -> Option<Name<'_>> {
     Some(Name { scene, spp: Some(digits.parse().ok()?), frame })
 }
 
-/// Pairs files by name within their directory. `report_references`: name references that no noisy
-/// render goes with (a glob may well pick a subset of the noisy ones, a directory is complete).
+/// Pairs files by name within their directory. If `report_references`, references without a noisy render are
+/// left over: a directory should be complete, while a glob may well pick only some of the noisy renders.
 fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool) -> TestSet {
     // Keyed by directory, scene and frame: one reference serves every spp of its view.
     let mut references: BTreeMap<(PathBuf, String, Option<String>), PathBuf> = BTreeMap::new();
@@ -214,8 +214,8 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
 }
 
 impl TestSet {
-    /// Every noisy render, sorted as the pairs are: with those without their reference, which a table must
-    /// not hide.
+    /// Every noisy render, sorted as the pairs are. Those without a reference are among them, since a table
+    /// must not hide them.
     pub fn all_noisy(&self) -> Vec<Pair> {
         let lacking = self.unmatched.iter().filter_map(|unmatched| match unmatched {
             Unmatched::Noisy(pair) => Some(pair),
@@ -242,7 +242,8 @@ impl TestSet {
     }
 }
 
-/// Frames by number, so that 0099 comes before 0100 and -0001 before 0000.
+/// Sorts by scene, frame number, spp and path. Frames go by number, so that 0099 comes before 0100 and -0001
+/// before 0000.
 fn sort(pairs: &mut [Pair]) {
     pairs.sort_by_cached_key(|p| {
         let number = p.frame.as_ref().and_then(|f| f.parse::<i64>().ok());
@@ -259,10 +260,9 @@ struct ManifestRow {
     spp: u32,
 }
 
-/// Reads a CSV manifest. A listed file that does not exist leaves its row unmatched only when it is
-/// the reference; a noisy file that is missing is kept, so that the row fails where it is read. Two lines of
-/// one meaning count once; two that say different things of the same files are an error, as reports know a
-/// pair by its files.
+/// Reads a CSV manifest. A line whose reference does not exist is unmatched. A line whose noisy file does not
+/// exist is kept, so that it fails where the file is read. Lines that say the same count once. Lines that
+/// give the same two files another scene or spp are an error, since reports identify a pair by its files.
 fn manifest(path: &Path) -> Result<TestSet> {
     let remedy = "a manifest is CSV with the header scene,noisy,reference,spp";
     let mut reader = csv::ReaderBuilder::new()

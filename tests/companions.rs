@@ -1,5 +1,5 @@
-//! Layers that go along with the beauty, on a render that Cycles makes here: what light passes add up to, and
-//! alpha.
+//! Layers that are denoised along with the beauty, on a render that Cycles makes here: what light passes add
+//! up to, and alpha.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! `demc compare`: which pixels of two files are held against each other.
+//! `demc compare`: which pixels of two files are compared with each other.
 
 mod common;
 

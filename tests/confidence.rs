@@ -1,4 +1,4 @@
-//! What demc says of its own results: how far off each pixel is expected to be, which frames want more
+//! What demc says of its own results: how far off each pixel is expected to be, and which frames want more
 //! samples.
 //!
 //! The frames were never trained on: a house at 4 samples, and a corner of another scene at 64.

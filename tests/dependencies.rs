@@ -1,5 +1,6 @@
-//! What the program and the Python module are built of may be given away with them, and comes from crates.io:
-//! the `deny.toml` of each, of which `cargo deny` checks the rest, such as known flaws.
+//! Dependencies of the program and of the Python module come from crates.io, and their licences let them be
+//! given away with these. The `deny.toml` of each says so; `cargo deny` checks the rest of it, such as known
+//! flaws.
 
 use std::{collections::HashSet, path::Path, process::Command};
 

@@ -1,6 +1,6 @@
 //! `export_passes.py` as a new user tries it: scenes with something unusual, reruns, mistyped arguments.
 //!
-//! On bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set.
+//! It runs on bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set.
 
 mod common;
 

@@ -1,8 +1,8 @@
 //! The Blender extension: built, installed from its archive, and used by buttons and handlers, without a
 //! window and in one.
 //!
-//! On bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set; in a window of the
-//! Blender that `DEMC_BLENDER` names.
+//! It runs on bpy 5.0, and on the Python with bpy 4.5 that `DEMC_BPY45` names, where it is set; and in a
+//! window of the Blender that `DEMC_BLENDER` names.
 
 mod common;
 

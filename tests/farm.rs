@@ -1,5 +1,5 @@
 //! `blender_scripts/farm`: a real Slurm on this machine, a real runner of Open Job Description, and training
-//! data from several tasks. All frames are there at the end, with the bits that one machine makes.
+//! data from several tasks. In the end all frames must be there, with the bits that a single machine makes.
 
 mod common;
 

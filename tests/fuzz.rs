@@ -2,7 +2,8 @@
 //! few thousand times in a process of its own, whose memory is limited. Every case must end in a result or in
 //! an error; what is written must be readable again. `eval/fuzz/run.sh` does the same for hours.
 //!
-//! `DEMC_FUZZ_CASES` and `DEMC_FUZZ_FIRST` say how many cases and from which on, to see one again.
+//! `DEMC_FUZZ_CASES` says how many cases are run, and `DEMC_FUZZ_FIRST` which is the first, so that a case
+//! can be seen again.
 #![cfg(unix)]
 
 mod common;

@@ -1,5 +1,6 @@
-//! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and
-//! remainders included. The engines of narrow formats get values that these hold, and so must be as exact.
+//! Every tier of every kernel against the textbook sum in f64, on random shapes, odd sizes and remainders
+//! included. The engines of narrow formats get values that these formats hold exactly, so they must be as
+//! exact.
 
 use std::{env, process::Command};
 

@@ -1,8 +1,8 @@
 //! Every layer against JAX: outputs, and gradients with respect to inputs and parameters.
 //!
-//! `data/layers.safetensors` holds what `data/make_layers.py` computed in float64; what may differ is
-//! the rounding of f32 alone. What acts on planes is held against plain loops in f64 as well, whose rows are
-//! longer than a vector and whose logits are larger than any exponential of f32.
+//! `data/layers.safetensors` holds what `data/make_layers.py` computed in float64, so results may differ by
+//! the rounding of f32 alone. Operations on planes are also compared with plain loops in f64, on rows that
+//! are longer than a vector and with logits whose exponentials f32 cannot hold.
 
 use std::{env, process::Command};
 

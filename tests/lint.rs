@@ -1,7 +1,7 @@
-//! What ruins a denoise, on frames that have one fault each: a small path tracer's idea of a tiled wall,
-//! rendered sample by sample as Cycles does it (each sample picks its place within the pixel filter, and
-//! belongs to one pixel), and spoilt in one way. A sound frame must bring no warning, a spoilt one that of
-//! its fault and no other.
+//! What ruins a denoise, on frames that have one fault each. A small path tracer renders a tiled wall sample
+//! by sample as Cycles does (each sample picks its place within the pixel filter, and belongs to one pixel),
+//! and the frame is spoilt in one way. A sound frame must bring no warning, a spoilt one that of its fault
+//! and no other.
 
 mod common;
 

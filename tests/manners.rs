@@ -1,5 +1,5 @@
-//! How the program behaves beside its work: help whose examples run, completions, manual pages, colours,
-//! quiet, progress, reports over many runs.
+//! How the program behaves apart from its results: help whose examples run, completions, manual pages,
+//! colours, `--quiet`, progress, reports over many runs.
 
 mod common;
 

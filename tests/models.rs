@@ -1,4 +1,4 @@
-//! The networks as contracts: sizes of the paper's, reach and scaling of the built-in ones.
+//! What the networks promise: the sizes of the paper's, the reach and the scaling of the built-in ones.
 
 use demc::{
     features::{self, Inputs, Shading},

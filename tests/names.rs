@@ -1,5 +1,5 @@
-//! Files as other renderers and compositors name them: each comes out as the same frame by Blender's names
-//! does.
+//! Files with the names of other renderers and compositors: each must give the same result as the same frame
+//! with Blender's names.
 
 mod common;
 

@@ -1,5 +1,5 @@
-//! The pages by user run from top to bottom, as their readers do, and every link of the documentation leads
-//! somewhere.
+//! The commands of the documentation's pages by user are run from top to bottom, as readers run them, and
+//! every link of the documentation must lead somewhere.
 
 mod common;
 

@@ -1,8 +1,9 @@
-//! The bits of every method's result on a frame, pinned: work on the house must leave them as they are.
+//! The bits of every method's result on a frame, pinned: changes that are not about pixels must leave them as
+//! they are.
 //!
 //! `tests/data/pins.txt` has a line for each method, and one more for each other result that some
 //! instructions give it: its name, the tier and engine (`DEMC_TIER`, `DEMC_ENGINE`) that were run, and a hash
-//! of the result. What changes pixels on purpose writes the file anew, in the same commit:
+//! of the result. A commit that changes pixels on purpose also writes the file anew:
 //!
 //! ```text
 //! DEMC_PINS=write cargo test --release --test pins

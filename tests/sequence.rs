@@ -1,8 +1,8 @@
 //! `demc denoise --temporal` on small sequences of a textured wall that moves by known vectors: what
-//! neighbours give, what a result depends on, and what is said where a neighbour is of no use. And the metric
-//! of flicker against numpy.
+//! neighbours contribute, what a result depends on, and what is said where a neighbour is of no use. The
+//! metric of flicker is tested against numpy too.
 //!
-//! The method is `noisy`, which returns its input: what is tested is what is made of it over time.
+//! The method is `noisy`, which returns its input, so that only the combination of frames is tested.
 
 mod common;
 

@@ -95,7 +95,7 @@ pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
     Ok((scores, reference))
 }
 
-/// What is judged, as the Combined of its view layer: the layer named, or by default `Denoised`, or else
+/// The image to judge, as the Combined of its view layer: the layer named, or by default `Denoised`, or else
 /// Combined.
 fn judged(args: &Args) -> Result<PassSet> {
     let (frame, view_layer) = (Frame::read(&args.image)?, args.view_layer.as_deref());
@@ -118,7 +118,7 @@ fn judged(args: &Args) -> Result<PassSet> {
     combined(&frame, &layer)
 }
 
-/// What it is judged by, of the view layer of that name if there is one.
+/// The reference, of the view layer of that name if there is one.
 fn reference(args: &Args, view_layer: &str) -> Result<PassSet> {
     let frame = Frame::read(&args.reference)?;
     let layers = passes::layers(&frame);
@@ -132,7 +132,7 @@ fn reference(args: &Args, view_layer: &str) -> Result<PassSet> {
     combined(&frame, &layer)
 }
 
-/// The first view layer that holds a layer of that name, which is its Combined then.
+/// The first view layer that holds a layer of that name, with this layer as its Combined.
 fn named(frame: &Frame, view_layer: Option<&str>, name: &str) -> Result<Layer> {
     passes::rgb_layers(frame, view_layer, name).into_iter().next().ok_or_else(|| {
         let why = format!("has no layer '{name}' with R, G and B; `demc inspect` lists those there are");

@@ -1,5 +1,5 @@
-//! What the environment sets, looked at before anything is done: a typing error there is told, and not taken
-//! for no setting.
+//! Checks environment variables before anything is done, so that a typing error is reported and does not pass
+//! for a variable that is not set.
 
 use crate::{
     Error, Result,
@@ -9,7 +9,7 @@ use crate::{
     },
 };
 
-/// Threads that nobody means: so many cannot be started.
+/// The most threads that a variable may ask for; more than this cannot be started, and nobody means it.
 const MOST_THREADS: usize = 4096;
 
 /// Refuses settings that mean nothing.
@@ -32,7 +32,7 @@ pub fn check() -> Result<()> {
     choice("DEMC_ENGINE", &Engine::available())
 }
 
-/// Whether a variable names one of what there is to choose from, or nothing.
+/// Checks that a variable is empty or names one of the choices.
 fn choice<T: std::fmt::Debug>(variable: &str, choices: &[T]) -> Result<()> {
     let value = std::env::var_os(variable).unwrap_or_default();
     let value = value.to_string_lossy();

@@ -22,8 +22,8 @@ pub struct Inputs {
 /// How directories are looked through.
 #[derive(Clone, Debug, Default)]
 pub struct Search {
-    /// Whether the directories in them are too, and those in these. Links to directories are not followed:
-    /// the same files would be found twice.
+    /// Whether the directories in them are searched too, at any depth. Links to directories are not followed,
+    /// since the same files would be found twice.
     pub recursive: bool,
     /// A directory that is left out, where results are written.
     pub except: Option<PathBuf>,
@@ -79,7 +79,7 @@ pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
             all.empty.push((input.clone(), Error::Usage(format!("{}: {nothing}", input.display()))));
         }
     }
-    // By name too: frames that are held are links to another.
+    // Files are told apart by name too, since held frames are links to another frame.
     let mut seen = HashSet::new();
     let identity = |Input { file, .. }: &Input| {
         (fs::canonicalize(file).unwrap_or_else(|_| file.clone()), file.file_name().map(ToOwned::to_owned))
@@ -88,15 +88,15 @@ pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
     Ok(all)
 }
 
-/// Whether a path that was found is to be read: no folder or pipe, but a link whose target is missing, which
-/// reading reports.
+/// Whether a path that was found is to be read: a file that is not hidden, or a link whose target is missing,
+/// which reading reports. Folders and pipes are not.
 fn is_input(path: &Path) -> bool {
     !is_hidden(path) && (path.is_file() || (path.is_symlink() && !path.exists()))
 }
 
 fn directory(named: &Path, search: &Search, all: &mut Inputs) {
     let except = search.except.as_ref().and_then(|path| fs::canonicalize(path).ok());
-    // Those that are still to be looked through, as they lie below the one named, the next one last.
+    // Directories that are still to be searched, by their paths below the one named; the next one is last.
     let mut left = vec![PathBuf::new()];
     while let Some(below) = left.pop() {
         let path = if below.as_os_str().is_empty() { named.to_owned() } else { named.join(&below) };

@@ -7,8 +7,7 @@ pub const SOME_FAILED: u8 = 1;
 /// Exit status of a wrong command line.
 pub const USAGE: u8 = 2;
 
-/// What the program ends with, as a number: unlike the standard library's it can be handed to another
-/// language.
+/// The exit status as a number. Unlike the standard library's type, it can be handed to another language.
 #[derive(Clone, Copy)]
 pub struct ExitCode(pub u8);
 
@@ -28,7 +27,7 @@ pub fn print_line(line: &str) {
     let _ = writeln!(io::stdout(), "{line}");
 }
 
-/// One line on stderr. Nobody who reads it is no reason to stop either.
+/// One line on stderr. That nobody reads it is no reason to stop either.
 pub fn warn_line(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");
 }

@@ -58,7 +58,7 @@ pub fn man(args: &ManArgs, command: &Command) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The command line without the subcommands that the program keeps for itself.
+/// The command line without the hidden subcommands.
 fn for_users(command: &Command) -> Command {
     let bare = Command::new("demc").version(env!("CARGO_PKG_VERSION"));
     let bare = command.get_about().cloned().into_iter().fold(bare, Command::about);

@@ -83,7 +83,8 @@ impl Args {
         Ok(methods)
     }
 
-    /// Those of the methods asked for that are this project's own, each with so many frames before and after.
+    /// Those of the methods asked for that are this project's own, each with `reach` frames before a frame
+    /// and after it.
     ///
     /// # Errors
     /// As [`Args::methods`].
@@ -99,7 +100,8 @@ impl Args {
             added.push(Contender {
                 name: short + TEMPORAL,
                 denoiser: Box::new(Temporal::new(models::open(name)?, reach)),
-                // Of a frame with its neighbours in memory, which is not what a stream takes.
+                // It would be measured with all neighbours of a frame in memory, which a stream does not
+                // take.
                 peak_mib: Box::new(|_| None),
                 stamp: format!("{} {reach}", method.stamp),
             });
@@ -108,8 +110,9 @@ impl Args {
     }
 }
 
-/// A weights file goes by its stem and the arithmetic asked for, by its folder too where those alone are
-/// another's, and by all that was asked for where that is another's as well.
+/// The name of a method in tables. A weights file has its stem and the arithmetic asked for as its name.
+/// Where another file has the same name its folder is added, and where that does not help either the name is
+/// all that was asked for.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
     let stem = |name: &str| {
@@ -128,7 +131,7 @@ pub fn short_name(name: &str, all: &[&str]) -> String {
     short.or_else(long).unwrap_or_else(|| name.into())
 }
 
-/// Whether no other method goes by that name.
+/// Whether no other method has that name.
 fn is_unique(own: &str, name: &str, all: &[&str], named: impl Fn(&str) -> Option<String>) -> bool {
     !all.iter().any(|other| *other != name && named(other).as_deref() == Some(own))
 }
@@ -138,8 +141,8 @@ fn weights_file(name: &str) -> Option<&Path> {
     Some(Path::new(models::split_precision(name).0)).filter(|path| path.is_file())
 }
 
-/// The noisy renders of a test set. References that go with none are named on stderr; renders without their
-/// reference have rows that say so.
+/// The noisy renders of a test set. References without a noisy render are named on stderr; renders without a
+/// reference will have rows that say so.
 ///
 /// # Errors
 /// As [`testset::read`].
@@ -151,7 +154,7 @@ pub fn noisy_renders(spec: &str) -> Result<Vec<Pair>> {
     Ok(set.all_noisy())
 }
 
-/// That many threads.
+/// A pool of that many threads.
 ///
 /// # Errors
 /// The system refuses.
@@ -162,7 +165,7 @@ pub fn pool(count: usize) -> Result<rayon::ThreadPool> {
         .map_err(|e| Error::Usage(format!("cannot start {count} threads: {e}; use fewer")))
 }
 
-/// Says how many rows failed, and which table says why; the exit status that goes with it.
+/// Says how many rows failed, and which table says why; returns the exit status.
 pub fn finish(failed: usize, table: &Path) -> ExitCode {
     if failed == 0 {
         return ExitCode::SUCCESS;

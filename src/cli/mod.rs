@@ -1,6 +1,6 @@
 //! The command line: one file a subcommand, raw arguments resolved here and nowhere else.
 
-// They panic where nobody reads any more: see `print_line`.
+// `println!` and `eprintln!` panic where nobody reads any more: see `print_line`.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod compare;
@@ -81,8 +81,8 @@ pub fn main() -> process::ExitCode {
     main_with(Cli::parse()).0.into()
 }
 
-/// As [`main`], with these arguments, the program's own path first: for a program that is not a process' own
-/// executable, as the command of a Python package is not.
+/// As [`main`], with these arguments, of which the first is the program's own path. This is for programs that
+/// are not the executable of their process, such as the command of a Python package.
 pub fn main_as(arguments: Vec<OsString>) -> u8 {
     if let Some(program) = arguments.first() {
         let _ = PROGRAM.set(program.into());
@@ -90,10 +90,10 @@ pub fn main_as(arguments: Vec<OsString>) -> u8 {
     main_with(Cli::parse_from(arguments)).0
 }
 
-/// The program, where it is not the process' executable.
+/// The path of the program, where it is not the executable of the process.
 static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
-/// What runs `demc` when it is started.
+/// The path of the program that runs `demc`.
 fn program() -> io::Result<PathBuf> {
     PROGRAM.get().cloned().map_or_else(std::env::current_exe, Ok)
 }
@@ -109,7 +109,7 @@ pub fn inspect_json(path: &Path) -> Result<String> {
     Ok(serde_json::to_string(&report).expect("strings and numbers serialise"))
 }
 
-/// What `demc compare` makes of two files, by its names.
+/// The scores that `demc compare` prints for two files.
 ///
 /// # Errors
 /// A file is unusable, or the images cannot be compared.

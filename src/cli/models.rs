@@ -41,7 +41,7 @@ fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<St
         },
         parameters: network.params().iter().filter(|p| p.trainable).map(|p| p.values().len()).sum(),
         kmac_per_pixel: (macs / 100.0).round() / 10.0,
-        // Rows and columns of the square that an output pixel can see.
+        // The side of the square of input pixels on which an output pixel depends.
         receptive_field: 2 * network.reach() + 1,
         passes: network.passes().iter().map(ToString::to_string).collect(),
         trained,

@@ -35,8 +35,8 @@ pub struct Args {
     threads: Option<u16>,
 }
 
-/// Denoises once and prints what that added, and what the process held in all with the passes that the
-/// method reads.
+/// Denoises once and prints the memory that this added, and what the process held in all, including the
+/// passes that the method reads.
 ///
 /// # Errors
 /// The frame cannot be read or denoised, or the system does not tell (only Linux does).

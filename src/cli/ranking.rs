@@ -3,8 +3,8 @@
 use super::lines::print_line;
 use crate::{Error, Result};
 
-/// The RelMSE of a result falls with the samples of its render by this power of their number: what the
-/// built-in models reach on 41 generated views of 1 to 256 samples, in the median.
+/// The RelMSE of a result falls as this power of the number of samples of its render. It is the median of
+/// what the built-in models reach on 41 generated views of 1 to 256 samples.
 const POWER: f64 = 0.5;
 
 /// Expected errors of frames.
@@ -30,7 +30,7 @@ pub fn parse_wish(text: &str) -> Result<f64> {
 }
 
 impl Ranking {
-    /// An empty one.
+    /// A ranking without frames.
     pub fn new(wish: Option<f64>) -> Self {
         Self { wish, frames: Vec::new() }
     }
@@ -67,7 +67,7 @@ impl Ranking {
     }
 }
 
-/// A number by its first two digits: more of it is not known.
+/// A number rounded up to two digits, since more of it is not known.
 fn digits(number: f64) -> String {
     let unit = 10f64.powf((number.log10().floor() - 1.0).max(0.0));
     format!("{:.0}", (number / unit).ceil() * unit)

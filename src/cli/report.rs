@@ -1,6 +1,7 @@
-//! `demc report`: what the JSON lines of many `demc denoise --json` come to, on a farm one file a task.
+//! `demc report`: sums up the JSON lines of many runs of `demc denoise --json`; on a farm, each task has a
+//! file of them.
 //!
-//! In: their files. Out: a line for each frame that failed or that no task tells of, the totals, the exit
+//! In: these files. Out: a line for each frame that failed or that no task tells of, the totals, the exit
 //! status.
 
 use std::{
@@ -65,7 +66,7 @@ enum Status {
     Failed,
 }
 
-/// What became of a frame in the end.
+/// What became of a frame after all tries.
 struct Fate {
     status: Status,
     error: String,
@@ -135,7 +136,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(if failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
-/// A frame that any try denoised is denoised: tasks are run again, and meet.
+/// Adds a line. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap.
 fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     let rank = |status| match status {
         Status::Failed => 0,
@@ -154,7 +155,7 @@ fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) ->
     if of.is_empty() {
         return Ok(Vec::new());
     }
-    // Tasks may have come to the folder by other ways.
+    // Tasks may have reached the folder by another path.
     let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     let told: Vec<PathBuf> = frames.keys().map(|input| place(input)).collect();
     let search = Search { recursive, ..Search::default() };

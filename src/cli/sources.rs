@@ -1,4 +1,4 @@
-//! Options that say where passes are, where their names do not tell.
+//! Options that say where passes are that cannot be found by their names.
 
 use std::path::PathBuf;
 
@@ -36,7 +36,7 @@ pub struct GuideFiles {
 }
 
 impl Names {
-    /// What they say together.
+    /// The mapping that both options make together.
     ///
     /// # Errors
     /// One makes no sense, or the file cannot be read.
@@ -53,7 +53,7 @@ impl Names {
 }
 
 impl GuideFiles {
-    /// With the names, where the passes of one frame or of several are.
+    /// Where the passes of one frame (`is_one`) or of several are, by these files and by `names`.
     ///
     /// # Errors
     /// One file is named for several frames.

@@ -99,7 +99,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(methods::finish(failed, &args.out.join("stability.csv")))
 }
 
-/// The trials asked for in the order of all, the unchanged frame first: others are told beside it.
+/// The trials asked for, in the order of all. The unchanged frame comes first, since the others are compared
+/// with it.
 fn in_order(asked: &[Trial]) -> Vec<Trial> {
     let is_asked = |trial: &Trial| *trial == Trial::AsRendered || asked.contains(trial);
     Trial::ALL.into_iter().filter(is_asked).collect()

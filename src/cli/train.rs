@@ -191,7 +191,7 @@ fn held_out(pair: &Pair) -> bool {
     (hash >> 32) % HOLD_OUT == 0
 }
 
-/// Pairs with absolute paths: a run may be resumed from another folder.
+/// Pairs with absolute paths, since a run may be resumed from another folder.
 fn from_anywhere(mut pairs: Vec<Pair>) -> Result<Vec<Pair>> {
     for path in pairs.iter_mut().flat_map(|pair| [&mut pair.noisy, &mut pair.reference]) {
         *path = std::path::absolute(&path).map_err(Error::io("read", &*path))?;
@@ -232,7 +232,7 @@ impl Args {
         } else {
             (all_pairs(&self.val)?, pairs)
         };
-        // However each was typed.
+        // The same file may have been typed in different ways.
         let file = |p: &Pair| fs::canonicalize(&p.reference).unwrap_or_else(|_| p.reference.clone());
         let validated: HashSet<PathBuf> = validation.iter().map(file).collect();
         if let Some(pair) = training.iter().find(|p| validated.contains(&file(p))) {
@@ -285,7 +285,7 @@ impl Args {
     }
 }
 
-/// The settings of a run that goes on, which its folder holds and people edit.
+/// The settings of a run that is resumed, from its folder, where people may have edited them.
 fn stored_options(config: &Path) -> Result<TrainOptions> {
     let text = fs::read_to_string(config).map_err(Error::io("read", config))?;
     let options: TrainOptions = serde_json::from_str(&text).map_err(|e| {
@@ -304,8 +304,8 @@ fn stored_options(config: &Path) -> Result<TrainOptions> {
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    // This thread works too: a step is hundreds of short parallel loops, and handing each over costs more
-    // than many of them last.
+    // This thread works too. A step is hundreds of short parallel loops, and handing one over to other
+    // threads takes longer than many of them last.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).use_current_thread();
     pool.build_global().map_err(|e| usage(format!("--threads: {e}")))?;
     let config = args.out.join("config.json");
@@ -398,12 +398,12 @@ mod tests {
                 assert_eq!(held_out(&of_sequence), still(scene), "{scene}, frame {frame}");
             }
         }
-        // Crops of a view may overlap.
+        // Crops of a view may overlap, so all of them go the same way.
         for (crop, scene) in [("c0", 0), ("c1", 0), ("c12", 0), ("c0", 1), ("c1", 1)] {
             let of_crop = pair(format!("train/s{scene:04}_room_{crop}_ref.exr"), None);
             assert_eq!(held_out(&of_crop), still(scene), "{scene}, crop {crop}");
         }
-        // Which stills they are is not to change.
+        // The stills that are held out must stay the same from version to version.
         let held: Vec<usize> = (0..40).filter(|scene| still(*scene)).collect();
         assert_eq!(held, [0, 3, 4, 7, 15, 20, 33, 39]);
     }

@@ -1,8 +1,8 @@
 //! The batch: reading the next frame, denoising this one and writing the last overlap, so that a batch
-//! takes about as long as the model does. At most three frames are in memory, and of a sequence its window
-//! besides; where several frames are denoised at once, as many times that. See [`Lane`].
+//! takes about as long as the model does. At most three frames are in memory, and for a sequence its window
+//! besides; where several frames are denoised at once, each of them takes that much. See [`Lane`].
 //!
-//! The threads report to the caller's thread, which alone talks to the user.
+//! All threads report to the caller's thread, which alone talks to the user.
 
 use std::{
     collections::VecDeque,
@@ -45,7 +45,7 @@ pub enum End {
 pub(super) enum Message {
     /// A file has ended.
     Ended(Job, Box<Outcome>),
-    /// All is done that a lane was given.
+    /// A lane has done all that it was given.
     LaneEnded,
     Stop,
 }
@@ -64,8 +64,8 @@ pub(super) struct Shared {
     source: Source,
     pub model: Arc<dyn Denoiser>,
     pub options: Options,
-    /// Held for reading while a file is being written, and for writing, for good, once the user has asked to
-    /// stop.
+    /// Locked for reading while a file is being written. Once the user has asked to stop it is locked for
+    /// writing and never released, so that no file is begun any more.
     pub writing: RwLock<()>,
     is_stopped: AtomicBool,
 }
@@ -80,7 +80,7 @@ enum Source {
 struct List {
     frames: VecDeque<Job>,
     sequences: VecDeque<Stretch>,
-    /// Of the sequence that was begun last.
+    /// What is left of the sequence that was begun last.
     stretches: VecDeque<Stretch>,
 }
 
@@ -96,7 +96,8 @@ pub(super) enum Work {
 pub struct Stopper(Sender<Message>);
 
 impl Stopper {
-    /// A file that is being written is finished, no other is begun. Does nothing once the batch has ended.
+    /// Stops the batch: files that are being written are finished, and no other is begun. Does nothing once
+    /// the batch has ended.
     pub fn stop(&self) {
         let _ = self.0.send(Message::Stop);
     }
@@ -117,7 +118,7 @@ impl Batch {
     /// A batch of files that are still coming in.
     ///
     /// # Errors
-    /// Frames are to be denoised with those after them, which are not there yet.
+    /// [`Options::temporal`] is set, for which each frame needs those after it, which are not there yet.
     pub fn watching(watch: Watch, model: Arc<dyn Denoiser>, options: Options) -> Result<Self> {
         if options.temporal.is_some() {
             let why = "a watch denoises each frame as it comes in, and --temporal needs those after it too: leave out one of \
@@ -149,8 +150,8 @@ impl Batch {
     /// Runs all jobs; `report` is called once for each as it ends, on this thread.
     ///
     /// # Panics
-    /// If the system has no room for three threads for each of the frames that are denoised at once, and
-    /// those they compute with.
+    /// If the system cannot start three threads for each of the frames that are denoised at once, and the
+    /// threads that these compute with.
     pub fn run(self, mut report: impl FnMut(&Job, &Outcome)) -> End {
         let Self { shared, lanes, messages, to_batch } = self;
         for lane in 0..lanes {
@@ -163,8 +164,8 @@ impl Batch {
                 Message::LaneEnded => running -= 1,
                 Message::Stop => {
                     shared.is_stopped.store(true, Ordering::Relaxed);
-                    // Let files being written come to their end and no other begin; the process may then end
-                    // without waiting for the model.
+                    // This waits for files that are being written and lets no other begin. The process may
+                    // then end without waiting for the model.
                     let gate = shared.writing.write().unwrap_or_else(PoisonError::into_inner);
                     std::mem::forget(gate);
                     while let Ok(message) = messages.try_recv() {
@@ -197,7 +198,7 @@ impl Shared {
                 while list.stretches.is_empty()
                     && let Some(mut sequence) = list.sequences.pop_front()
                 {
-                    // What is finished goes first, so that what is left is split alike.
+                    // Finished jobs are taken out first, so that those that are left are split evenly.
                     sequence.jobs.retain(|(job, _)| !self.take_up_existing(job, ended));
                     list.stretches = sequence.split(lanes).into();
                 }
@@ -221,7 +222,7 @@ impl Shared {
         self.is_stopped.load(Ordering::Relaxed)
     }
 
-    /// Reads a file; none if it is not whole yet and is waited for.
+    /// Reads a file; none if it is watched and not whole yet, in which case it is waited for.
     pub fn read(&self, input: &Path) -> Option<Result<Frame>> {
         let frame = attempt(input, || Frame::read(input));
         match (&self.source, frame) {
@@ -233,7 +234,7 @@ impl Shared {
         }
     }
 
-    /// Whether the result of a job was there already; what became of that is reported.
+    /// Whether the result of a job exists already; if so, the job's end is reported.
     pub fn take_up_existing(&self, job: &Job, ended: &Sender<Message>) -> bool {
         let existing = if self.options.overwrite { None } else { job::existing(&job.output) };
         let Some(headers) = existing else { return false };

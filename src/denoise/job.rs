@@ -1,4 +1,4 @@
-//! One frame in three steps that a batch overlaps: load, denoise, store.
+//! One frame in three steps: load, denoise, store. A batch overlaps the steps of different frames.
 
 use std::{
     collections::BTreeMap,
@@ -22,7 +22,7 @@ use crate::{
     sources::Sources,
 };
 
-/// One file to do.
+/// One file to denoise.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Job {
     /// The render.
@@ -47,19 +47,19 @@ pub struct Options {
     pub preview: Option<WritePicture>,
     /// Whether a [`super::Batch`] denoises again what is finished.
     pub overwrite: bool,
-    /// Frames before and after one that a [`super::Batch`] makes it better and steadier with; none for frame
-    /// by frame.
+    /// How many frames before one, and after it, a [`super::Batch`] uses to make it better and steadier; none
+    /// for frame by frame.
     pub temporal: Option<usize>,
     /// What becomes of alpha.
     pub alpha: Alpha,
-    /// Where passes are, where their names do not tell.
+    /// Where passes are that cannot be found by their names.
     pub sources: Sources,
     /// Whether light passes and light groups are denoised as well, so that they add up to the denoised
     /// beauty.
     pub passes: bool,
     /// Whether the left and the right edge of a frame meet.
     pub wrap: Wrap,
-    /// Whether a layer tells how far off each pixel is expected to be.
+    /// Whether a layer is added that tells how far off each pixel is expected to be.
     pub confidence: bool,
 }
 
@@ -85,7 +85,7 @@ impl Default for Options {
 /// Whether a name can be a layer's: it must make channel names that read back as this layer and no other.
 ///
 /// # Errors
-/// It cannot; says why.
+/// Why it cannot.
 pub fn check_layer_name(name: &str) -> Result<(), &'static str> {
     let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
     if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
@@ -97,7 +97,7 @@ pub fn check_layer_name(name: &str) -> Result<(), &'static str> {
     }
 }
 
-/// What became of a frame, for the user.
+/// What the user is told of a frame that was denoised.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The view layer denoised.
@@ -112,19 +112,19 @@ pub struct Report {
     pub light_groups: Vec<String>,
     /// Samples of a pixel, or the most that it may have had, where the file tells.
     pub samples: Option<u32>,
-    /// Whether Blender had denoised Combined, and what it was before was taken.
+    /// Whether Blender had denoised Combined, so that its Noisy Image was denoised instead.
     pub was_denoised: bool,
-    /// The result's expected RelMSE, where the model can tell, as the mean of its views.
+    /// The expected RelMSE of the result, as the mean over its views, where the model can tell.
     pub expected_error: Option<f64>,
     /// Seconds in the model alone.
     pub seconds: f64,
-    /// NaN and infinite input values repaired, by pass.
+    /// How many NaN and infinite input values were repaired, by pass.
     pub repaired: BTreeMap<String, usize>,
     /// What the user should know.
     pub notes: Vec<String>,
 }
 
-/// A frame and, for each of its stereo views, where its beauty is and what to compute with.
+/// A frame and, for each of its stereo views, where the view's beauty is and what `T` holds of the view.
 pub struct Views<T> {
     frame: Frame,
     views: Vec<(Layer, T)>,
@@ -141,10 +141,10 @@ pub fn load(input: &Path, model: &dyn Denoiser, options: &Options) -> Result<Vie
     take_apart(Frame::read(input)?, model, options)
 }
 
-/// As [`load`], of a frame that was read.
+/// As [`load`], from a frame that has been read.
 ///
 /// # Errors
-/// As [`load`], but for files that cannot be read.
+/// As [`load`], except that the frame's own file is not read.
 pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) -> Result<Views<Shot>> {
     check_options(model, options)?;
     let input = frame.path();
@@ -172,7 +172,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
     let lights = if options.passes { light_passes() } else { Vec::new() };
     let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion, &lights].concat();
-    // Beside its stereo views a view layer may hold channels of no view.
+    // Besides its stereo views, a view layer may hold channels that belong to no view.
     let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
     let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
     if eyes.iter().any(has_beauty) {
@@ -209,7 +209,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     Ok(Views { frame, views, report })
 }
 
-/// Whether the model can do what is asked for, and all of it at once: known before anything is read.
+/// Refuses options that the model cannot meet or that exclude each other, before anything is read.
 fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
     let wrong = |why: String| Err(Error::Usage(why));
     if let Some((name, Err(why))) = options.layer.as_deref().map(|name| (name, check_layer_name(name))) {
@@ -256,8 +256,8 @@ pub struct Denoised {
 /// # Errors
 /// The model cannot denoise the frame.
 pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
-    // On one of rayon's threads: from here, each of a network's hundreds of steps would have to wake them up
-    // first.
+    // This runs on one of rayon's threads. From outside, each of a network's hundreds of steps would first
+    // have to wake them up.
     rayon::scope(|_| denoise_here(loaded, model, options))
 }
 
@@ -266,7 +266,7 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
         let (radiance, error) = run_expecting(&shot, &mut along.companions, model, options, report)?;
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
-        // What was read is of no more use.
+        // What was read is not needed any more, so its memory is freed.
         drop(shot);
         let (denoised_alpha, lights) = along.finish(frame, layer);
         let done = finish(&path, radiance, (denoised_alpha.or(alpha), lights), model, report)?;
@@ -274,8 +274,7 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     })
 }
 
-/// Denoises passes that are in memory, by the steps by which a file is denoised: radiance that is finite, (3,
-/// H, W).
+/// Denoises passes that are in memory, by the same steps as a file's. Returns finite radiance, (3, H, W).
 ///
 /// # Errors
 /// A pass is missing, or the model cannot denoise the frame.
@@ -289,15 +288,15 @@ pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Plan
 }
 
 impl<T> Views<T> {
-    /// Adds to what the user should know.
+    /// Adds a note for the user.
     pub(super) fn say(&mut self, note: &str) {
         self.report.notes.push(note.into());
     }
 
-    /// What becomes of every view.
+    /// Replaces what `T` holds of every view by what `change` makes of it.
     ///
     /// # Errors
-    /// It becomes nothing of one.
+    /// The first error of `change`.
     pub(super) fn each<U>(
         self,
         mut change: impl FnMut(&Frame, &Layer, T, &mut Report) -> Result<U>,
@@ -328,7 +327,7 @@ pub(super) fn run(
     Ok(run_by(denoise, shot, &mut [], model, report)?.0)
 }
 
-/// As [`run`], of what goes along with the view too, and how far off the result is expected to be.
+/// As [`run`], and also denoises the companions in place and tells how far off the result is expected to be.
 fn run_expecting(
     shot: &Shot,
     companions: &mut [Companion],
@@ -340,7 +339,7 @@ fn run_expecting(
     run_by(denoise, shot, companions, model, report)
 }
 
-/// Runs what a model does, and notes what the user should know.
+/// Runs `denoise` over a view, measures its time and adds the model's notes to the report.
 fn run_by(
     denoise: impl FnOnce(&Shot, &mut [Companion]) -> Result<(Planes, Option<ExpectedError>)>,
     shot: &Shot,
@@ -363,10 +362,11 @@ fn run_by(
     Ok((radiance, error))
 }
 
-/// What is stored of the view of a file: radiance, alpha, and light passes.
+/// What is stored of a view: radiance, alpha and light passes. Values of radiance and light passes that are
+/// not finite are filled in.
 ///
 /// # Errors
-/// What the model made is of no use.
+/// Most values of one of them are not finite.
 pub(super) fn finish(
     path: &Path,
     radiance: Planes,
@@ -381,10 +381,10 @@ pub(super) fn finish(
     Ok(Denoised { radiance, alpha, lights, error: None })
 }
 
-/// Whatever a model returns, what is written is finite.
+/// What a model returned, with values that are not finite filled in from around them.
 ///
 /// # Errors
-/// Most values are not: what is around them is no picture.
+/// Most values are not finite, so that what is around them is no picture.
 fn finite(radiance: Planes, model: &str, input: &Path, report: &mut Report) -> Result<Planes> {
     let values = radiance.data.len();
     let mut set = PassSet::new(PathBuf::new(), "", radiance.width, radiance.height);
@@ -413,7 +413,7 @@ fn layer_name(view_layer: &str, name: &str) -> String {
 /// The result does not fit into the file's format, or cannot be written.
 pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<Report> {
     let (frame, report) = insert(denoised, output, options)?;
-    // Last: an EXR that exists is a frame that is finished.
+    // The EXR is written last, so that one that exists is a finished frame.
     frame.write(output)?;
     Ok(report)
 }
@@ -444,7 +444,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
             let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
             frame.set_expected_error(&result, &view_name(layer), error.mean());
             let name = layer_name(&layer.name, &error_layer(options));
-            // One that an earlier result had would not be true of this one.
+            // Such a layer of an earlier result would not be true of this one, so it is replaced.
             if options.confidence || frame.is_own_layer(&name) {
                 let values = error.plane();
                 let channel =
@@ -527,23 +527,25 @@ fn preview_path(output: &Path, layer: &Layer, views: usize) -> PathBuf {
     }
 }
 
-/// A name of any kind as a part of a file's: what file systems take for more than a letter is written by its
-/// number, as in an URL.
+/// Any name as part of a file's name: characters that file systems may take for more than a letter are
+/// written by their numbers, as in a URL.
 fn file_name(name: &str) -> String {
     let safe = |c: char| c.is_alphanumeric() || "-_ +".contains(c);
     let write = |c: char| if safe(c) { c.into() } else { format!("%{:02X}", u32::from(c)) };
     name.chars().map(write).collect()
 }
 
-/// The headers of what is at the output's place: an EXR, whole since results are written so.
+/// The headers of the EXR that exists at `output`, if there is one. It is whole, since results are written
+/// whole.
 pub(super) fn existing(output: &Path) -> Option<Frame> {
     Frame::read_headers(output).ok()
 }
 
-/// Whether that is the frame that is wanted; writes what previews of it are wanted and missing.
+/// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
+/// missing.
 ///
 /// # Errors
-/// It is another: nothing is overwritten unasked. Or a preview cannot be written.
+/// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
 pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let output = headers.path();
     let layers = passes::layers_by(headers, &options.sources.mapping);

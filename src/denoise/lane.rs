@@ -1,5 +1,5 @@
-//! A lane of a batch: one frame is denoised in it at a time, while the next is read and the last is written.
-//! A batch has one lane for each frame that it denoises at once, with threads of its own to compute with.
+//! A lane of a batch denoises one frame at a time, while it reads the next and writes the last. A batch has
+//! as many lanes as frames that it denoises at once, each with threads of its own to compute with.
 
 use std::{
     path::Path,
@@ -21,30 +21,30 @@ use super::{
 };
 use crate::{Error, Result, error::attempt, frame::Frame, shot::Shot};
 
-/// What the stages of a lane have.
+/// What the stages of a lane share.
 #[derive(Clone)]
 pub struct Lane {
     shared: Arc<Shared>,
     /// How many lanes there are.
     lanes: usize,
-    /// Its threads; without, all that there are.
+    /// The threads that it computes with; without a pool, all that there are.
     pool: Option<Arc<ThreadPool>>,
     ended: Sender<Message>,
 }
 
-/// What the reading stage has for the one that denoises.
+/// What the reading stage sends to the denoising stage.
 enum Loaded {
     /// What was read of a frame that is denoised by itself.
     Frame(Job, Result<Views<Shot>>),
-    /// A stretch of a sequence begins: forget the one before.
+    /// A stretch of a sequence begins, so the one before is forgotten.
     Begin,
     /// What was read of a frame of the sequence, by its number, and whether it is to be denoised.
     Neighbour { number: i64, loaded: Result<Views<Shot>>, is_written: bool },
-    /// All that lies around a frame has been read.
+    /// All frames around this one have been read.
     Complete { job: Job, number: i64 },
 }
 
-/// Says that a lane has ended when it is dropped, whatever its stages came to.
+/// Tells when it is dropped that a lane has ended, whether its stages finished or panicked.
 struct SaysEnd(Sender<Message>);
 
 impl Drop for SaysEnd {
@@ -54,7 +54,7 @@ impl Drop for SaysEnd {
 }
 
 impl Lane {
-    /// Starts the lane of that number out of so many.
+    /// Starts lane number `lane` of `lanes`.
     pub fn start(shared: &Arc<Shared>, (lane, lanes): (usize, usize), ended: &Sender<Message>) {
         let threads = rayon::current_num_threads();
         let own = threads / lanes + usize::from(lane < threads % lanes);
@@ -71,7 +71,7 @@ impl Lane {
         let says_end = SaysEnd(ended.clone());
         lane.spawn("write", move |lane| {
             lane.store_all(&denoised);
-            // The last to end: the channels before it are closed.
+            // This stage ends last, since the channels that lead to it are closed by then.
             drop(says_end);
         });
     }
@@ -96,7 +96,7 @@ impl Lane {
         self.ended.send(Message::Ended(job, Box::new(outcome))).ok()
     }
 
-    /// Reads what the lane is given; none when there is no next stage.
+    /// Reads what the lane is given; none when the next stage has ended.
     fn load_all(&self, next: &SyncSender<Loaded>) -> Option<()> {
         while let Some(work) = self.shared.next(self.lanes, &self.ended) {
             match work {
@@ -111,20 +111,20 @@ impl Lane {
         Some(())
     }
 
-    /// Reads a job's file; none where its result is there, or it is not whole yet.
+    /// Reads a job's file; none where its result exists already, or the file is not whole yet.
     fn read_new(&self, job: &Job) -> Option<Result<Frame>> {
         if self.shared.take_up_existing(job, &self.ended) { None } else { self.shared.read(&job.input) }
     }
 
-    /// The passes that are needed of what was read of a file.
+    /// Decodes the passes that are needed from a file that was read.
     fn take_apart(&self, input: &Path, read: Result<Frame>) -> Result<Views<Shot>> {
         let Shared { model, options, .. } = &*self.shared;
         let frame = read?;
         attempt(input, || self.on_own_threads(|| job::take_apart(frame, &**model, options)))
     }
 
-    /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when
-    /// there is no next stage.
+    /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when the
+    /// next stage has ended.
     fn load_stretch(&self, stretch: Stretch, next: &SyncSender<Loaded>) -> Option<()> {
         let load = |file: &Path| self.take_apart(file, attempt(file, || Frame::read(file)));
         let Stretch { files, jobs, is_numbered } = stretch;
@@ -154,7 +154,7 @@ impl Lane {
         Some(())
     }
 
-    /// Frames that are taken before and after one.
+    /// How many frames before one, and after it, it is denoised with.
     fn reach(&self) -> usize {
         self.shared.options.temporal.unwrap_or_default()
     }

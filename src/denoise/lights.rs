@@ -1,4 +1,5 @@
-//! The layers of a frame that go along with its beauty: alpha, and the light passes of which Cycles makes it.
+//! The layers of a frame that are denoised along with its beauty: alpha, and the light passes that Cycles
+//! adds up to the beauty.
 //!
 //! Cycles adds up Combined as `(direct + indirect) * colour` of diffuse, glossy and transmissive surfaces,
 //! plus volumes, emission and environment; or as the sum of the light groups. A light pass that is stored
@@ -20,7 +21,8 @@ use crate::{
 /// What becomes of alpha.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Alpha {
-    /// It is denoised where it differs from pixel to pixel and the model can, and else kept.
+    /// It is denoised where it differs from pixel to pixel and the model can denoise it; otherwise it is
+    /// kept.
     #[default]
     Auto,
     /// It is denoised.
@@ -29,21 +31,21 @@ pub enum Alpha {
     Keep,
 }
 
-/// Light that is stored divided by a colour, and that colour.
+/// Light passes that are stored divided by a colour, and that colour.
 const LIT: [([Pass; 2], Pass); 3] = [
     ([Pass::DiffuseDirect, Pass::DiffuseIndirect], Pass::DiffuseColor),
     ([Pass::GlossyDirect, Pass::GlossyIndirect], Pass::GlossyColor),
     ([Pass::TransmissionDirect, Pass::TransmissionIndirect], Pass::TransmissionColor),
 ];
 
-/// Light that is stored as it is added.
+/// Light passes that are stored as they are added.
 const ADDED: [Pass; 4] = [Pass::VolumeDirect, Pass::VolumeIndirect, Pass::Emission, Pass::Environment];
 
-/// A denoised colour is at least this where there is light to be divided by it: enough for half floats to
-/// hold it exactly enough, and too little to be seen.
+/// The least value of a denoised colour by which light is divided: large enough for half floats to hold it
+/// with sufficient precision, and too small to be seen.
 const LEAST_COLOUR: f32 = 1e-3;
 
-/// Every pass that may go along, but for alpha.
+/// Every pass that may go along, except alpha.
 pub fn light_passes() -> Vec<Pass> {
     let lit = LIT.iter().flat_map(|(lights, colour)| [lights[0], lights[1], *colour]);
     lit.chain(ADDED).chain([Pass::ShadowCatcher]).collect()
@@ -72,12 +74,12 @@ impl Source {
 #[derive(Default)]
 pub struct Along {
     sources: Vec<Source>,
-    /// As many, for the model.
+    /// One for each source, for the model.
     pub companions: Vec<Companion>,
 }
 
 impl Along {
-    /// Takes out of a shot what is to go along, and says what cannot.
+    /// Takes out of a shot the passes that are to go along, and notes those that cannot.
     pub fn take(shot: &mut Shot, model: &dyn Denoiser, options: &Options, notes: &mut Vec<String>) -> Self {
         let mut along = Self::default();
         let denoises_alpha = match options.alpha {
@@ -160,7 +162,7 @@ impl Along {
     }
 }
 
-/// Divides denoised light by its denoised colour, which is first made what the file can store of it.
+/// Divides denoised light by its denoised colour, which is first rounded to what the file can store.
 fn divide(done: &mut [(Source, Planes)], lights: [Pass; 2], colour: Pass, frame: &Frame, layer: &Layer) {
     let find = |done: &[(Source, Planes)], pass| done.iter().position(|(s, _)| *s == Source::Pass(pass));
     let Some(at) = find(done, colour) else { return };

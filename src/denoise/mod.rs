@@ -1,9 +1,9 @@
 //! The denoise engine: files in, each of them out again with a layer more.
 //!
-//! [`file()`] does one frame, [`Batch`] many, with reading, denoising and writing overlapped. [`load`],
-//! [`denoise`] and [`store`] are the steps of which both are made. With [`Options::temporal`], a batch does
-//! frames of a sequence with their neighbours. Nothing is printed: what the user should know is in each
-//! frame's [`Report`].
+//! [`file()`] denoises one frame, and [`Batch`] many, with reading, denoising and writing overlapped. Both
+//! are made of the steps [`load`], [`denoise`] and [`store`]. With [`Options::temporal`], a batch denoises
+//! the frames of a sequence together with their neighbours. Nothing is printed: what the user should know is
+//! in each frame's [`Report`].
 
 mod batch;
 mod job;
@@ -32,8 +32,8 @@ pub use wrap::Wrap;
 pub use crate::frame_number::frame_number;
 use crate::{Result, models::Denoiser};
 
-/// Reads a frame, denoises it and writes it, whole, with the result as a new layer. What is at the output's
-/// place is replaced.
+/// Reads a frame, denoises it and writes all of it, with the result as a new layer. A file that exists at
+/// `output` is replaced.
 ///
 /// # Errors
 /// The input is unusable or lacks a pass that the model needs, or the output cannot be written.

@@ -1,7 +1,7 @@
-//! Where the result of each input is written: under the input's own name, and below `--out` as the input lies
-//! below the folder that was named.
+//! Where the result of each input is written: under the input's own name, in the same folders below `--out`
+//! as the input is below the folder that was named.
 //!
-//! In: inputs. Out: jobs of which no two write one file, and none its own input.
+//! In: inputs. Out: jobs of which no two write the same file, and none overwrites its own input.
 
 use std::{
     collections::HashMap,
@@ -17,19 +17,19 @@ use crate::{Error, Result};
 pub struct Input {
     /// The file.
     pub file: PathBuf,
-    /// The folders that lead to it from the folder that was named: empty where that holds the file itself.
+    /// The path from the folder that was named to the file's folder; empty where they are the same.
     pub below: PathBuf,
 }
 
 /// The jobs that write each file's result into a folder, under the file's own name.
 ///
 /// # Errors
-/// Two results would have one path, or one that of its input.
+/// Two results would have the same path, or a result would have that of its input.
 pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
     plan_tree(files.into_iter().map(|file| Input { file, below: PathBuf::new() }), out)
 }
 
-/// As [`plan`], and the folders below the one that was named are kept.
+/// As [`plan`], but with the folders below the one that was named.
 ///
 /// # Errors
 /// As [`plan`].
@@ -38,7 +38,7 @@ pub fn plan_tree(inputs: impl IntoIterator<Item = Input>, out: &Path) -> Result<
     inputs.into_iter().map(|input| plan.place(input)).collect()
 }
 
-/// The results that have a place so far.
+/// The results that have been given a path so far.
 pub struct Plan {
     out: PathBuf,
     /// The input of each result.
@@ -46,7 +46,7 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// No results in a folder.
+    /// A plan without results, for the folder `out`.
     pub fn new(out: &Path) -> Self {
         Self { out: out.into(), placed: HashMap::new() }
     }
@@ -54,7 +54,7 @@ impl Plan {
     /// The job that writes a file's result.
     ///
     /// # Errors
-    /// The result of another file, or a file that is read, has that place.
+    /// The result of another file, or the input itself, has the same path.
     pub fn place(&mut self, Input { file: input, below }: Input) -> Result<Job> {
         let Some(name) = input.file_name() else {
             return Err(Error::Usage(format!("{}: names no file", input.display())));
@@ -79,8 +79,8 @@ impl Plan {
     }
 }
 
-/// Whether two paths lead to one file: folders may be mounted twice, so that where they are on the disk
-/// decides.
+/// Whether two paths lead to the same file. Folders may be mounted twice, so on Unix the files' places on the
+/// disk are compared.
 fn is_same_file(a: &Path, b: &Path) -> bool {
     #[cfg(unix)]
     {

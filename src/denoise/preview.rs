@@ -18,7 +18,7 @@ use crate::{
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, radiance: &Planes) -> Result<()> {
-    // A black frame has no exposure: any shows it black.
+    // A black frame has no exposure, and any exposure shows it black.
     let image = display(radiance, exposure(radiance).unwrap_or(1.0));
     let (r, g, b) = (image.channel(0), image.channel(1), image.channel(2));
     let to_byte = |v: f32| (v * 255.0).round() as u8;

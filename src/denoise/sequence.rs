@@ -2,8 +2,8 @@
 //!
 //! In: paths. A frame's number is the digits at the end of its name, of any width, as Blender writes it
 //! before the extension: `shot_0004spp.0017.exr`, `shot0017.exr`, `shot.-0003.exr`. Neighbours are looked for
-//! beside a frame whether they were named or not: what becomes of it depends on what lies there, not on what
-//! else is done by the same command.
+//! in the frame's folder, whether the user named them or not: a result depends on the files that lie there,
+//! not on what else the same command denoises.
 
 use std::{
     collections::BTreeMap,
@@ -30,7 +30,7 @@ struct Place {
 }
 
 impl Place {
-    /// Of a file; none where its name ends in no number.
+    /// The place of a file; none where its name does not end in a number.
     fn of(file: &Path) -> Option<Self> {
         let name = file.file_name()?.to_str()?;
         let stem = file.file_stem()?.to_str()?;
@@ -58,14 +58,14 @@ impl Place {
     }
 }
 
-/// Whether a file is the frame after another, by their names.
+/// Whether a file is the frame right after another, by their names.
 pub fn follows(file: &Path, before: &Path) -> bool {
     let [Some(place), Some(before)] = [file, before].map(Place::of) else { return false };
     place.key == before.key && place.number - before.number == 1
 }
 
-/// The files of a frame's sequence that lie beside it, up to so many frames before and after, by how many
-/// frames later they are.
+/// The other files of a frame's sequence in its folder, from `reach` frames before it to `reach` frames after
+/// it. Keys tell how many frames later each is; negative ones are earlier.
 pub fn neighbours(file: &Path, reach: usize) -> BTreeMap<i32, PathBuf> {
     let Some(place) = Place::of(file).filter(|_| reach > 0) else { return BTreeMap::new() };
     let offset = |number: i64| i32::try_from(number - place.number).ok();
@@ -74,18 +74,18 @@ pub fn neighbours(file: &Path, reach: usize) -> BTreeMap<i32, PathBuf> {
     files.filter_map(|(number, path)| Some((offset(number).filter(|at| near(*at))?, path))).collect()
 }
 
-/// Jobs of a sequence, by number, or a job alone.
+/// Jobs of one sequence, sorted by number, or a single job without a number.
 pub struct Stretch {
-    /// What lies on disk, the jobs' own files at their numbers.
+    /// All files of the sequence on disk, by number. The jobs' own files stand at their numbers.
     pub files: Arc<BTreeMap<i64, PathBuf>>,
     /// Each job, and its number.
     pub jobs: Vec<(Job, i64)>,
-    /// Whether its files' names tell a number.
+    /// Whether the names of its files end in a number.
     pub is_numbered: bool,
 }
 
 impl Stretch {
-    /// The jobs in up to `count` stretches that are alike long.
+    /// Splits the jobs into at most `count` stretches of about the same length.
     pub fn split(self, count: usize) -> Vec<Self> {
         let Self { files, jobs, is_numbered } = self;
         let length = jobs.len().div_ceil(count).max(1);
@@ -108,8 +108,8 @@ pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
     for job in jobs {
         let place = Place::of(&job.input);
         let number = place.as_ref().map_or(0, |place| place.number);
-        // Two files of one number, such as 7 and 0007, are frames of two sequences: neither may hide the
-        // other.
+        // Two files with the same number, such as 7 and 0007, are put into two sequences, so that neither
+        // hides the other.
         let at = place.as_ref().and_then(|place| known.get(&place.key)).copied();
         let at = at.filter(|at| sequences[*at].jobs.iter().all(|(_, other)| *other != number));
         let at = at.unwrap_or_else(|| {

@@ -2,9 +2,9 @@
 //!
 //! A file is whole when its size and its time of change stayed the same from one look to the next, and it
 //! then reads as a complete EXR: its offset table is filled in, which OpenEXR does last, and every block of
-//! pixels that the table tells of ends within the file. A file that does not read so far waits for its next
-//! change. Folders are looked through again and again, since no message of a change comes from a disk of
-//! another machine.
+//! pixels in the table ends within the file. A file that does not yet read as whole waits for its next
+//! change. Folders are looked through again and again, since the disk of another machine sends no message of
+//! a change.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -21,26 +21,27 @@ use crate::{Error, frame::Frame};
 /// Time from one look to the next, at least.
 const INTERVAL: Duration = Duration::from_secs(1);
 
-/// Looking takes at most this share of the time: a large folder on a slow disk is looked through less often.
+/// The pause after a look is at least this many times as long as the look, so that a large folder on a slow
+/// disk is looked through less often.
 const LOOKING: u32 = 10;
 
-/// A file that did not read as a whole one is tried again after this time even if it shows no change: on some
-/// disks the time of change counts in steps of two seconds, which hide the last write.
+/// A file that did not read as whole is tried again after this time even if it shows no change: some disks
+/// count the time of change in steps of two seconds, which can hide the last write.
 const RETRY: Duration = Duration::from_secs(10);
 
-/// What lies there at one look.
+/// What one look found.
 #[derive(Default)]
 pub struct Look {
-    /// What there is to do, finished or not.
+    /// All jobs, including those whose files are not whole yet.
     pub jobs: Vec<Job>,
-    /// What cannot be done, by the input, with the reason; each is told once.
+    /// Inputs that cannot be denoised, each with the reason; each is told once.
     pub failures: Vec<(PathBuf, Error)>,
 }
 
 /// Looks for files until none has come for a while.
 pub struct Watch {
     look: Mutex<Box<dyn FnMut() -> Look + Send>>,
-    /// It ends when nothing was new for so long; never without.
+    /// It ends when nothing was new for this long; if none, never.
     idle: Option<Duration>,
     /// Whether a file that was taken is taken again when it has changed.
     again: bool,
@@ -50,7 +51,8 @@ pub struct Watch {
 struct State {
     files: BTreeMap<PathBuf, File>,
     ready: VecDeque<Job>,
-    /// Failures that were told, and those that are to be.
+    /// Inputs whose failures were taken in, so that each is told once, and failures that are still to be
+    /// told.
     told: Vec<PathBuf>,
     failures: Vec<(PathBuf, Error)>,
     /// When a file was last new or had changed.
@@ -84,15 +86,15 @@ enum Status {
 pub(super) enum Next {
     /// A file that stayed the same since the last look.
     Job(Job),
-    /// What cannot be done.
+    /// An input that cannot be denoised, and why.
     Failure(PathBuf, Error),
-    /// Nothing was new for the time given.
+    /// Nothing was new for the time given, or the watch was told to stop.
     End,
 }
 
 impl Watch {
-    /// Looks with `look` for files, and ends when none was new for the time `idle`; without that, never. A
-    /// file that was taken is taken `again` when it has changed, as one that was rendered again.
+    /// Looks for files by `look`, and ends when none was new for the time `idle`, or never without that time.
+    /// If `again`, a file that was taken and has changed, as one that was rendered again, is taken again.
     pub fn new(look: impl FnMut() -> Look + Send + 'static, idle: Option<Duration>, again: bool) -> Self {
         let (files, ready, told, failures) = Default::default();
         let state = Mutex::new(State { files, ready, told, failures, changed: Instant::now() });
@@ -132,14 +134,14 @@ impl Watch {
         }
     }
 
-    /// Takes back a file that did not read as a whole one.
+    /// Takes back a file that did not read as whole.
     pub(super) fn put_back(&self, input: &Path, error: Error) {
         if let Some(file) = self.state().files.get_mut(input) {
             file.status = Status::Broken(error, Instant::now());
         }
     }
 
-    /// The files that never became whole, each with what it lacks.
+    /// The files that never became whole, each with the error of reading it.
     pub(super) fn leftovers(&self) -> Vec<(Job, Error)> {
         let files = std::mem::take(&mut self.state().files).into_values();
         let unfinished = |file: File| match file.status {
@@ -193,7 +195,7 @@ impl Stamp {
     }
 }
 
-/// Waits; false when told to stop in between.
+/// Waits for that time; returns false if it was told to stop meanwhile.
 fn wait(time: Duration, is_stopped: &impl Fn() -> bool) -> bool {
     const STEP: Duration = Duration::from_millis(50);
     let start = Instant::now();
@@ -211,7 +213,7 @@ mod tests {
     use super::*;
     use std::sync::Arc;
 
-    /// A folder of one file that is not there yet, and what a watch over it says.
+    /// A folder for one file that is not there yet, and a watch over it.
     struct Scene {
         folder: tempfile::TempDir,
         watch: Arc<Watch>,

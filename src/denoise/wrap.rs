@@ -1,5 +1,5 @@
-//! Frames whose left and right edges meet, as those of an all-round panorama do: each edge is denoised with
-//! what lies beyond the other, so that no seam shows where a viewer joins them.
+//! Frames whose left and right edges meet, as those of a 360-degree panorama do: each edge is denoised
+//! together with columns from the other side of the frame, so that no seam shows where a viewer joins them.
 
 use crate::{
     Result, companion::Companion, frame::Frame, models::ExpectedError, passes::PassSet, planes::Planes,
@@ -19,7 +19,7 @@ pub enum Wrap {
 }
 
 impl Wrap {
-    /// Whether they do in this frame.
+    /// Whether the edges of this frame meet.
     pub(super) fn of(self, frame: &Frame) -> bool {
         match self {
             Self::Auto => frame.is_latitude_longitude(),
@@ -29,12 +29,13 @@ impl Wrap {
     }
 }
 
-/// Columns of the other edge that an edge is denoised with: as many as the built-in networks see to either
-/// side of a pixel, and a multiple of what they halve a frame by, so that their quads lie where they did.
+/// How many columns of the other side an edge is denoised with: as many as the built-in networks see to
+/// either side of a pixel, and a multiple of what they halve a frame by, so that their quads lie where they
+/// did.
 const MARGIN: usize = 256;
 
-/// What `run` makes of a shot, and of what goes along with it, that has more columns at either edge, which
-/// are taken off again.
+/// Adds columns to the shot and its companions at both edges, gives them to `run`, and takes the columns off
+/// the results again.
 ///
 /// # Errors
 /// As `run`.
@@ -57,7 +58,7 @@ pub(super) fn joined(
     Ok((narrow(&radiance), error.map(|error| error.without_margins(MARGIN))))
 }
 
-/// Goes on at either edge with what lies beyond the other.
+/// Adds [`MARGIN`] columns at each edge, which are those at the other edge.
 fn widen(planes: &Planes) -> Planes {
     let (width, before) = (planes.width, planes.width - MARGIN % planes.width);
     Planes::from_rows(planes.channels, (width + 2 * MARGIN, planes.height), |c, y, row| {

@@ -19,7 +19,7 @@ const SUFFIX: &str = ".tmp";
 /// Lets `write` fill a new file that takes the name `path` only when it is complete.
 ///
 /// # Errors
-/// Whatever `write` reports, or that the file cannot be created or renamed.
+/// Those of `write`, or the file cannot be created or renamed.
 pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Result<()> {
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
@@ -27,7 +27,7 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
     };
     let file = temporary(folder).map_err(Error::io("write", path))?;
     write(file.as_file())?;
-    // The name must not outlive a crash of the machine that its pixels did not.
+    // After a crash of the machine, there must be no file of that name without its pixels.
     file.as_file().sync_all().map_err(Error::io("write", path))?;
     file.persist(path).map_err(|e| Error::io("write", path)(e.error))?;
     Ok(())
@@ -37,7 +37,7 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
 /// Temporary files that killed processes left there are removed.
 ///
 /// # Errors
-/// It cannot be made, or no file in it.
+/// The folder cannot be made, or no file can be made in it.
 pub fn prepare_folder(folder: &Path) -> Result<()> {
     fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let refused = |error| Error::io("write", folder)(error);
@@ -48,7 +48,7 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
         if !(name.starts_with(PREFIX) && name.ends_with(SUFFIX)) {
             continue;
         }
-        // Where it cannot be opened or locked it is another's business.
+        // A file that cannot be opened or locked belongs to another process.
         let Ok(file) = File::options().write(true).open(entry.path()) else { continue };
         if file.try_lock().is_ok() {
             let _ = fs::remove_file(entry.path());
@@ -57,7 +57,7 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// A new file of a name of its own, locked.
+/// A new file with a unique name, locked.
 fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(PREFIX).suffix(SUFFIX);
@@ -73,7 +73,7 @@ fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
         if file.as_file().lock().is_err() || file.path().exists() {
             return Ok(file);
         }
-        // Taken for a leftover before it was locked.
+        // The file was taken for a leftover and removed before it was locked.
     }
 }
 

@@ -1,17 +1,17 @@
-//! Whether a stored block may be handed to its decoder. Decoders set memory aside for what a block says it
-//! unpacks to: that must be no more than so few bytes can hold, or a damaged counter takes all the memory
-//! there is and ends the process.
+//! Whether a stored block may be handed to its decoder. Decoders set memory aside for the size that a block
+//! claims to unpack to. A claim of more than its bytes can hold is refused, or a damaged counter could take
+//! all memory and end the process.
 //!
-//! In: a block's bytes and the size of its pixels. Out: why it is not to be decoded, if it is not.
+//! In: a block's bytes and the size of its pixels. Out: why it must not be decoded, if so.
 
 use exr::{compression::Compression, math::Vec2, meta::header::Header};
 
-/// The most that deflate packs into a byte: 258 bytes take two bits.
+/// The most bytes that deflate packs into one: 258 bytes take two bits.
 const DEFLATE: usize = 1032;
-/// More than any kind but DWA packs into a byte: deflate, of which PXR24 leaves out every fourth; PIZ's runs
-/// make 453.
+/// More bytes than any compression except DWA packs into one. PXR24 leaves out every fourth byte before
+/// deflate, and PIZ's runs pack 453.
 const MOST_PACKED: usize = 2 * DEFLATE;
-/// Bytes that DWA's longest run makes of two.
+/// The most bytes that two bytes of DWA's run-length code unpack to.
 const LONGEST_RUN: usize = 128;
 /// Values in a block of DWA's cosine transform.
 const TRANSFORMED: usize = 64;
@@ -19,7 +19,7 @@ const TRANSFORMED: usize = 64;
 /// Refuses a block of `size` pixels that claims more than its bytes can hold.
 ///
 /// # Errors
-/// Says what it claims.
+/// What the block claims.
 pub fn check(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), String> {
     let raw = size.area() * header.channels.bytes_per_pixel;
     // Stored as it is, since no kind of compression made it smaller.
@@ -36,7 +36,7 @@ pub fn check(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), St
     }
 }
 
-/// The counters at the start of a DWA block (`DataSizesSingle` in OpenEXR's internal_dwa_compressor.h)
+/// Checks the counters at the start of a DWA block (`DataSizesSingle` in OpenEXR's internal_dwa_compressor.h)
 /// against each other, and against the pixels of the block.
 fn check_dwa(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), String> {
     const COUNTERS: usize = 11;
@@ -78,7 +78,7 @@ fn check_dwa(header: &Header, stored: &[u8], size: Vec2<usize>) -> Result<(), St
     if let Some((what, claimed, most)) = limits.into_iter().find(|(_, claimed, most)| claimed > most) {
         return Err(format!("a DWA block claims {claimed} {what}, but can hold {most}"));
     }
-    // The pixels that are asked for have to come from somewhere.
+    // What the block holds must be enough for its pixels.
     let held = unknown + rle + dc * TRANSFORMED * size_of::<f32>();
     if held < raw { Err(format!("a DWA block holds {held} of {raw} bytes")) } else { Ok(()) }
 }

@@ -1,5 +1,5 @@
-//! The bytes of compressed blocks: in memory where they are new, or else still in the file that was opened. A
-//! frame of many passes whose pixels do not compress is larger than all that denoising it takes.
+//! The bytes of compressed blocks: in memory where they are new, or else still in the file that was opened,
+//! since a frame of many passes whose pixels do not compress takes more memory than denoising it does.
 
 use std::{
     borrow::Cow,
@@ -11,16 +11,16 @@ use std::{
 
 use crate::{Error, Result};
 
-/// What is compressed, or where that is.
+/// Compressed bytes, or where they are.
 pub enum Bytes {
     /// In memory.
     Held(Vec<u8>),
-    /// So many bytes of the file, from there on.
+    /// `len` bytes of the file, from offset `at` on.
     InFile { at: u64, len: usize },
 }
 
 impl Bytes {
-    /// How many there are.
+    /// The number of bytes.
     pub fn len(&self) -> usize {
         match self {
             Self::Held(bytes) => bytes.len(),
@@ -45,7 +45,7 @@ impl Opened {
     /// The bytes of a block.
     ///
     /// # Errors
-    /// The file cannot be read, or has fewer by now.
+    /// The file cannot be read, or has become shorter.
     pub fn bytes<'a>(&self, of: &'a Bytes) -> Result<Cow<'a, [u8]>> {
         match of {
             Bytes::Held(bytes) => Ok(bytes.as_slice().into()),

@@ -1,7 +1,7 @@
 //! Parts that hold luminance beside chroma of half the resolution, as OpenEXR's luminance-chroma images do
 //! (`Y`, `RY`, `BY`; "Technical Introduction to OpenEXR", Luminance/Chroma Images).
 //!
-//! In: uncompressed blocks. Out: chroma at full resolution, and colours of it.
+//! In: uncompressed blocks. Out: chroma at full resolution, and the colours that it makes with luminance.
 
 use exr::{
     block::UncompressedBlock,
@@ -15,8 +15,8 @@ use super::decode::read_values;
 /// The distance of chroma's samples in columns and rows.
 pub const DISTANCE: usize = 2;
 
-/// What the samples at distances 1, 3, 5 ... to each side weigh in a value between them: a windowed sinc, the
-/// filter of OpenEXR's `RgbaYca`.
+/// The weights of the samples at distances 1, 3, 5 ... to each side in a value between them: a windowed sinc,
+/// the filter of OpenEXR's `RgbaYca`.
 const WEIGHTS: [f32; 7] = [0.627_123, -0.186_077, 0.087_929, -0.043_159, 0.019_597, -0.007_540, 0.002_128];
 
 /// Whether some channels are stored at less than full resolution.
@@ -24,9 +24,9 @@ pub fn is_subsampled(header: &Header) -> bool {
     header.channels.list.iter().any(|channel| channel.sampling != Vec2(1, 1))
 }
 
-/// Whether what is subsampled has half the resolution in rows and columns that there is an even number of,
-/// and is compressed as the `exr` crate decodes it: of version 1.74, B44 takes chroma for larger than it is,
-/// and DWA makes other values than OpenEXR.
+/// Whether a part with subsampled channels can be decoded: these have half the resolution, the part has even
+/// numbers of rows and columns, and the `exr` crate decodes its compression rightly. Version 1.74 takes
+/// chroma in B44 for larger than it is, and makes other values of DWA than OpenEXR does.
 pub fn is_readable(header: &Header) -> bool {
     let halves = |c: &ChannelDescription| c.sampling == Vec2(DISTANCE, DISTANCE);
     let (origin, size) = (header.own_attributes.layer_position, header.layer_size);
@@ -39,8 +39,8 @@ pub fn is_readable(header: &Header) -> bool {
         && header.channels.list.iter().all(|c| c.sampling == Vec2(1, 1) || halves(c))
 }
 
-/// What red, green and blue weigh in luminance, by the places of them and of white in the CIE 1931 diagram:
-/// as much as makes white of equal parts.
+/// The weights of red, green and blue in luminance, by which equal parts of them make white, from the
+/// coordinates of the primaries and of white in the CIE 1931 diagram.
 pub fn weights([xr, yr, xg, yg, xb, yb, xw, yw]: [f32; 8]) -> Option<[f32; 3]> {
     let of = |x: f32, y: f32| [x / y, 1.0, (1.0 - x - y) / y].map(f64::from);
     let (red, green, blue, white) = (of(xr, yr), of(xg, yg), of(xb, yb), of(xw, yw));
@@ -54,8 +54,8 @@ pub fn weights([xr, yr, xg, yg, xb, yb, xw, yw]: [f32; 8]) -> Option<[f32; 3]> {
     weights.iter().all(|weight| weight.is_finite() && *weight > 0.0).then_some(weights)
 }
 
-/// The header by which a block is decompressed: the `exr` crate takes the size of a block from the bytes of a
-/// pixel, which depend on how many of the block's rows have chroma.
+/// The header with which a block is decompressed. The `exr` crate computes the size of a block from the bytes
+/// of a pixel, which depend on how many of the block's rows have chroma.
 pub fn of_block(header: &Header, top: usize, size: Vec2<usize>) -> Header {
     let rows = top..top + size.height();
     let bytes: usize = rows.flat_map(|y| row(header, y, size.width())).map(|(_, bytes)| bytes).sum();
@@ -89,7 +89,7 @@ pub fn copy_block(header: &Header, block: &UncompressedBlock, channel: usize, pl
     }
 }
 
-/// Fills the rows and columns between the samples of a plane. Beyond an edge lies its last sample again.
+/// Fills the rows and columns between the samples of a plane. Beyond an edge, its last sample is repeated.
 pub fn reconstruct(plane: &mut [f32], width: usize) {
     for row in plane.chunks_mut(width).step_by(DISTANCE) {
         let samples: Vec<f32> = row.iter().step_by(DISTANCE).copied().collect();
@@ -113,8 +113,8 @@ fn middle(i: usize, count: usize, sample: impl Fn(usize) -> f32) -> f32 {
     weighted.sum()
 }
 
-/// Luminance and chroma, (3, N), to red, green and blue: chroma is `(R - Y) / Y` and `(B - Y) / Y`, luminance
-/// the sum of the colours by `weights`.
+/// Turns luminance and chroma, (3, N), into red, green and blue. Chroma is `(R - Y) / Y` and `(B - Y) / Y`,
+/// and luminance `Y` the sum of the colours weighted by `weights`.
 pub fn to_rgb(planes: &mut [f32], weights: [f32; 3]) {
     let (luminance, chroma) = planes.split_at_mut(planes.len() / 3);
     let (red, blue) = chroma.split_at_mut(luminance.len());

@@ -15,8 +15,8 @@ use crate::{Error, Result};
 const BLOCKS_PER_THREAD: usize = 8;
 
 impl Frame {
-    /// Images of a part, each of the values of some of its channels in the order asked, (C, H, W) of its data
-    /// window. Unsigned integers are rounded to the nearest f32; chroma of half the resolution is
+    /// Images of a part. Each holds the channels asked for, in that order, over the part's data window,
+    /// (C, H, W). Unsigned integers are rounded to the nearest f32; chroma of half the resolution is
     /// interpolated.
     ///
     /// # Errors
@@ -34,7 +34,7 @@ impl Frame {
         for batch in of_part.chunks(BLOCKS_PER_THREAD * rayon::current_num_threads()) {
             let blocks: Vec<UncompressedBlock> =
                 batch.par_iter().map(|stored| self.decompress(stored)).collect::<Result<_>>()?;
-            // Only now: a damaged size fails before memory is taken for it.
+            // Memory is taken only now, so that a damaged size has failed before.
             if decoded.is_empty() {
                 let image = |channels: &&[usize]| self.zeros(channels.len() * area);
                 decoded = images.iter().map(image).collect::<Result<_>>()?;
@@ -56,7 +56,7 @@ impl Frame {
         Ok(decoded)
     }
 
-    /// Values of zero; an error, not the end of the program, where there is no room for them.
+    /// Zeros; where there is no room for them, an error and not the end of the program.
     fn zeros(&self, len: usize) -> Result<Vec<f32>> {
         let mut values = Vec::new();
         if values.try_reserve_exact(len).is_err() {
@@ -128,7 +128,7 @@ pub(super) fn read_values(bytes: &[u8], kind: SampleType, values: &mut [f32]) {
     match kind {
         SampleType::F16 => {
             let halves = bytes.as_chunks::<2>().0.iter().map(|b| f16::from_ne_bytes(*b));
-            // All of a row at once: one by one, half the time goes into calls.
+            // A whole row is converted at once; one by one, half the time would go into calls.
             halves.collect::<Vec<f16>>().convert_to_f32_slice(values);
         }
         SampleType::F32 => wide.for_each(|(value, b)| *value = f32::from_ne_bytes(*b)),

@@ -32,15 +32,16 @@ use crate::{Error, Result};
 /// Largest finite half.
 pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
-/// Attribute that names the layers of its part that demc made, one a line: no other layer of a chosen name is
-/// replaced.
+/// Attribute that names the layers of its part that demc made, one a line. A layer that it does not name is
+/// never replaced by one of the same name.
 const MARK: &str = "demc";
 /// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
 /// view layer.
 const EXPECTED_ERROR: &str = "demcExpectedError";
-/// Attributes of a part that are not true of another of the same picture, beside those of cryptomattes.
+/// Attributes that another part of the same picture does not take over; nor does it take those of
+/// cryptomattes.
 const OWN: [&str; 6] = [MARK, EXPECTED_ERROR, "name", "preview", "chunkCount", "idManifest"];
-/// What a part without a name is called in a file of several, which must have one.
+/// The name that a part without one gets in a file of several parts, where each must have a name.
 const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
 const CRYPTOMATTE: &[u8] = b"cryptomatte/";
@@ -149,7 +150,7 @@ impl Frame {
         attributes.set_text(EXPECTED_ERROR, &lines.join("\n"));
     }
 
-    /// The view layers whose results note their expected RelMSE, and that.
+    /// The view layers whose results note an expected RelMSE, each with that error.
     pub fn expected_errors(&self) -> Vec<(String, f64)> {
         self.stored.iter().flat_map(|stored| expected_errors(&stored.attributes)).collect()
     }
@@ -169,7 +170,7 @@ impl Frame {
         (0..self.parts.len()).any(|part| self.marked(part).iter().any(|layer| layer == name))
     }
 
-    /// Whether a layer of that name, in any letter case, is there that [`Frame::set_layer`] did not add.
+    /// Whether there is a layer of that name, in any letter case, that demc did not make.
     pub fn has_foreign_layer(&self, name: &str) -> bool {
         let is_named = |part: &super::Part, channel: &str| {
             let layer = match channel.rsplit_once('.') {
@@ -224,8 +225,8 @@ impl Frame {
         Ok(recoded)
     }
 
-    /// Blender 5 writes one part per pass: a file of several parts, or of one that is named like all of
-    /// its channels (`ViewLayer.Combined`).
+    /// Whether an added layer gets a part of its own. Blender 5 writes one part per pass: its files have
+    /// several parts, or one that is named like all of its channels (`ViewLayer.Combined`).
     fn is_part_per_pass(&self, part: usize) -> bool {
         let of_its_own = |p: &super::Part| match &p.name {
             Some(name) if name.contains('.') => p
@@ -250,7 +251,8 @@ impl Frame {
         };
         let mut layout = like.clone().with_encoding(like.compression, blocks, like.line_order);
         layout.channels = channel_list(channels.iter().map(|(n, c)| describe(n, c.kind)).collect());
-        // Another layer of the same picture: its colours, camera and view are those of the part beside.
+        // The new part is another layer of the same picture, with the colour space, camera and view of the
+        // part beside.
         let mut attributes = old.clone();
         attributes.0.retain(|attribute| {
             let is_own = OWN.iter().any(|own| own.as_bytes() == attribute.name);
@@ -332,7 +334,7 @@ impl Frame {
 }
 
 impl Stored {
-    /// Adds what parts must say of themselves in a file of several.
+    /// Adds the attributes that a part must have in a file of several.
     fn complete_for_several(&mut self) {
         let Self { attributes, layout } = self;
         let kind = match (layout.blocks, layout.deep) {
@@ -361,7 +363,7 @@ fn describe(name: &str, kind: SampleKind) -> ChannelDescription {
         SampleKind::Float => SampleType::F32,
         SampleKind::Uint => SampleType::U32,
     };
-    // Not "perceptually linear": radiance, as Blender marks it.
+    // Radiance is marked as not "perceptually linear", as Blender marks it.
     ChannelDescription::new(Text::from_slice_unchecked(name.as_bytes()), kind, false)
 }
 
@@ -505,8 +507,8 @@ fn push_values(data: &mut Vec<u8>, values: &[f32], kind: SampleType) {
     }
 }
 
-/// Appends values of `N` bytes; into memory that is there, or each byte would ask whether there is room for
-/// it.
+/// Appends values of `N` bytes. Memory is taken for all of them first, or there would be a check for room at
+/// each byte.
 fn push_bytes<const N: usize>(data: &mut Vec<u8>, values: impl ExactSizeIterator<Item = [u8; N]>) {
     let start = data.len();
     data.resize(start + N * values.len(), 0);

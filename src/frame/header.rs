@@ -73,7 +73,7 @@ impl Attributes {
         self.floats("chromaticities", "chromaticities")
     }
 
-    /// The numbers of an attribute that has so many.
+    /// The numbers of an attribute; none where it does not have `N` of them.
     fn floats<const N: usize>(&self, name: &str, kind: &str) -> Option<[f32; N]> {
         let numbers = self.value(name, kind)?.as_chunks::<4>().0;
         let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
@@ -87,7 +87,7 @@ impl Attributes {
         numbers.try_into().ok()
     }
 
-    /// A rectangle of pixels; one that is empty or turned inside out has none.
+    /// A rectangle of pixels; where it is empty or turned inside out, its size is zero.
     pub fn window(&self, name: &str) -> Option<Window> {
         let [x0, y0, x1, y1] = self.corners(name)?;
         let span = |from: i32, to: i32| usize::try_from(i64::from(to) - i64::from(from) + 1).unwrap_or(0);
@@ -117,13 +117,13 @@ impl Attributes {
         }
     }
 
-    /// Says how many blocks there are, as files of several parts must.
+    /// Sets the number of blocks, which files of several parts must state.
     pub fn set_chunk_count(&mut self, layout: &Header) {
         let count = i32::try_from(layout.chunk_count).expect("sizes of parts were checked");
         self.set("chunkCount", "int", count.to_le_bytes().to_vec());
     }
 
-    /// Whether some name is longer than files may hold without saying so.
+    /// Whether some name is longer than [`SHORT_NAME`], which the file's flags must say.
     pub fn has_long_names(&self, layout: &Header) -> bool {
         let names = self.0.iter().flat_map(|a| [a.name.len(), a.kind.len()]);
         names.chain(layout.channels.list.iter().map(|c| c.name.as_slice().len())).any(|len| len > SHORT_NAME)
@@ -140,11 +140,11 @@ impl Attributes {
         out.write_all(&[0])
     }
 
-    /// How blocks lie in the part. Whether they are tiles is known from elsewhere: `type` counts in some
-    /// files only.
+    /// How blocks lie in the part. Whether they are tiles or deep is passed in, since the attribute `type`
+    /// decides that in some files only.
     ///
     /// # Errors
-    /// Says which attribute is missing or makes no sense.
+    /// Which attribute is missing or makes no sense.
     pub fn layout(&self, is_tiled: bool, is_deep: bool) -> Result<Header, String> {
         let required = |name: &str, kind: &str| {
             self.value(name, kind).ok_or_else(|| format!("missing or invalid {name} attribute"))
@@ -170,7 +170,7 @@ impl Attributes {
             BlockDescription::Tiles(tiles) => tiles.tile_size.width().max(tiles.tile_size.height()),
             BlockDescription::ScanLines => 1,
         };
-        // As OpenEXR has it: sums of such numbers fit 32 bits.
+        // OpenEXR has the same limit, so that sums of such numbers fit into 32 bits.
         if [x, y].iter().any(|edge| edge.unsigned_abs() > 1 << 29) {
             return Err("its data window lies too far out".into());
         }
@@ -235,13 +235,14 @@ fn compression_id(compression: Compression) -> u8 {
     }
 }
 
-/// EXR text is bytes without a declared encoding: Blender writes UTF-8; Latin-1 reads anything else.
+/// The text of an EXR, which is bytes without a declared encoding: UTF-8, as Blender writes it, or else
+/// Latin-1.
 pub fn string(bytes: &[u8]) -> String {
     std::str::from_utf8(bytes).map_or_else(|_| bytes.iter().map(|b| char::from(*b)).collect(), str::to_owned)
 }
 
-/// A list of channels: name, type, whether it is perceptually linear, three bytes of nothing, and the
-/// distance of its samples.
+/// Reads a list of channels. Each has a name, a type, whether it is perceptually linear, three unused bytes,
+/// and the distance of its samples.
 fn read_channels(mut bytes: &[u8]) -> Result<Vec<ChannelDescription>, String> {
     let mut channels = Vec::new();
     let mut names = HashSet::new();
@@ -275,7 +276,7 @@ fn read_channels(mut bytes: &[u8]) -> Result<Vec<ChannelDescription>, String> {
         });
         bytes = rest;
     }
-    // Pixels lie in the order of names, whatever the list's, and so OpenEXR reads them.
+    // Pixels lie in the order of the channels' names, whatever the order of the list; OpenEXR reads them so.
     channels.sort_by(|a, b| a.name.as_slice().cmp(b.name.as_slice()));
     if channels.is_empty() { Err("it has no channels".into()) } else { Ok(channels) }
 }
@@ -301,8 +302,8 @@ fn write_channels(channels: &ChannelList) -> Vec<u8> {
     bytes
 }
 
-/// Width and height of tiles, and a byte for levels: their kind, and from the fifth bit on how halves are
-/// rounded.
+/// Reads the width and height of tiles, and a byte for resolution levels: their kind, and from the fifth bit
+/// on how halved sizes are rounded.
 fn read_tiles(bytes: &[u8]) -> Result<TileDescription, String> {
     let invalid = "missing or invalid tiles attribute";
     let [w0, w1, w2, w3, h0, h1, h2, h3, mode] = *bytes else { return Err(invalid.into()) };

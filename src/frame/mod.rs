@@ -48,11 +48,11 @@ mod flags {
     pub const DEEP: u32 = 1 << 11;
     /// The multi-part layout.
     pub const MULTI_PART: u32 = 1 << 12;
-    /// Those that there are.
+    /// All flags.
     pub const ALL: u32 = TILED | LONG_NAMES | DEEP | MULTI_PART;
 }
 
-/// An EXR file as it was stored. What is compressed stays in the file, which is kept open, until it is
+/// An EXR file as it was stored. Compressed blocks stay in the file, which is kept open, until they are
 /// wanted.
 pub struct Frame {
     path: PathBuf,
@@ -78,7 +78,7 @@ struct StoredChunk {
     part: usize,
     index: usize,
     place: TileCoordinates,
-    /// What is compressed; of a deep block with its sizes before it.
+    /// The compressed bytes; those of a deep block begin with its sizes.
     bytes: Bytes,
 }
 
@@ -101,7 +101,7 @@ pub struct Part {
     pub data_window: Window,
     /// Compressed size in bytes.
     pub stored_bytes: usize,
-    /// Whether what is stored at less than full resolution can be decoded.
+    /// Whether channels stored at less than full resolution can be decoded.
     has_readable_chroma: bool,
 }
 
@@ -177,14 +177,14 @@ impl Frame {
         self.stored.iter().any(|stored| stored.attributes.value("envmap", "envmap") == Some(&[0]))
     }
 
-    /// What red, green and blue weigh in the luminance of a part: of its primaries, or of Rec. 709's where it
-    /// names none.
+    /// The weights of red, green and blue in the luminance of a part, by its primaries, or those of Rec. 709
+    /// where it names none.
     pub fn luminance_weights(&self, part: usize) -> [f32; 3] {
         let primaries = self.stored[part].attributes.chromaticities();
         primaries.and_then(chroma::weights).unwrap_or(LUMINANCE.map(|weight| weight as f32))
     }
 
-    /// What viewers show, in the coordinates of the data windows.
+    /// The rectangle that viewers show, in the coordinates of the data windows.
     pub fn display_window(&self) -> Window {
         let first = &self.stored[0].attributes;
         first.window("displayWindow").unwrap_or(self.parts[0].data_window)

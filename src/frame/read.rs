@@ -1,5 +1,5 @@
-//! From a file to a [`Frame`]: headers, then where every chunk is, each checked to be present
-//! exactly once, so that a truncated render is refused here and not half denoised.
+//! Reads a file into a [`Frame`]: headers, then the place of every chunk. Each chunk must be present exactly
+//! once, so that a truncated render is refused here and not half denoised.
 
 use std::{
     collections::HashMap,
@@ -22,7 +22,7 @@ use super::{
 };
 use crate::{Error, Result};
 
-/// Offset-table entry of one chunk.
+/// Bytes of a chunk's entry in the offset table.
 const OFFSET_BYTES: u64 = 8;
 /// Longest name of an attribute, a type or a channel.
 const LONGEST_NAME: usize = 255;
@@ -45,7 +45,7 @@ impl Frame {
     /// Reads a file's headers alone: what it holds, none of its pixels.
     ///
     /// # Errors
-    /// As [`Frame::read`], but for damaged pixels.
+    /// As [`Frame::read`], except that damaged pixels are not noticed.
     pub fn read_headers(path: impl AsRef<Path>) -> Result<Self> {
         let (_, mut frame) = open(path.as_ref())?;
         frame.describe();
@@ -130,7 +130,7 @@ impl From<String> for Failure {
     }
 }
 
-/// A file that is gone through once from beginning to end. No more memory is taken than it has bytes left.
+/// A file that is read once from beginning to end, without taking more memory than it has bytes left.
 struct Source {
     reader: BufReader<File>,
     at: u64,
@@ -175,7 +175,7 @@ impl Source {
         if to >= self.len {
             return Err(Failure::Truncated);
         }
-        // Keeps what is buffered, where it is near.
+        // This keeps what is buffered, where the new place lies within that.
         self.reader.seek_relative(to.cast_signed() - self.at.cast_signed())?;
         self.at = to;
         Ok(())
@@ -192,7 +192,7 @@ impl Source {
         let mut chunks = 0u64;
         while let Some(attributes) = self.attributes()? {
             let kind = attributes.text("type").unwrap_or_default();
-            // In a file of one part the flags decide, and `type` only what deep data is like.
+            // In a file of one part the flags decide, and `type` decides only whether deep data is tiled.
             let (is_tiled, is_deep) = if frame.multi_part {
                 (kind.contains("tile"), kind.starts_with("deep"))
             } else if has(flags::DEEP) {
@@ -201,7 +201,7 @@ impl Source {
                 (has(flags::TILED), false)
             };
             let layout = attributes.layout(is_tiled, is_deep)?;
-            // Before memory is set aside for each of them.
+            // This comes before memory is set aside for each chunk.
             chunks += layout.chunk_count as u64;
             if chunks.saturating_mul(OFFSET_BYTES) > self.len {
                 return Err(Failure::Truncated);
@@ -239,7 +239,8 @@ impl Source {
                 stored.layout.blocks_increasing_y_order().enumerate().map(|(i, t)| (t.location, i)).collect()
             })
             .collect();
-        // Through the offset tables, sorted: files may hold gaps and any order of chunks.
+        // Chunks are found through the sorted offset tables, since files may have gaps and chunks in any
+        // order.
         let mut offsets = Vec::new();
         for (part, stored) in parts.iter().enumerate() {
             for _ in 0..stored.layout.chunk_count {
@@ -301,7 +302,7 @@ impl Source {
         self.bytes_from(self.at, size)
     }
 
-    /// Bytes that stay where they are, which must be there.
+    /// `count` bytes from offset `at` on, which stay in the file; they must be there.
     fn bytes_from(&self, at: u64, count: u64) -> Result<Bytes, Failure> {
         if count > self.len.saturating_sub(at) {
             return Err(Failure::Truncated);
@@ -309,7 +310,7 @@ impl Source {
         Ok(Bytes::InFile { at, len: usize::try_from(count).map_err(|_| Failure::Truncated)? })
     }
 
-    /// A deep block from its sizes on: those of its two packed halves, and what the second unpacks to.
+    /// A deep block, from its sizes on: those of its two packed halves, and of the second one unpacked.
     fn deep_bytes(&mut self) -> Result<Bytes, Failure> {
         let start = self.at;
         let sizes: [u8; 24] = self.array()?;

@@ -1,4 +1,4 @@
-//! A frame to a file, whole or not at all.
+//! Writes a frame to a file, whole or not at all.
 
 use std::{
     io::{self, BufWriter, Write},
@@ -31,7 +31,7 @@ impl Frame {
         })
     }
 
-    /// Writes all that stands before the chunks, which follow in the order returned.
+    /// Writes all that comes before the chunks; these are to follow in the order returned.
     fn write_start(&self, out: &mut impl Write) -> io::Result<&[StoredChunk]> {
         let mut start = MAGIC.to_vec();
         start.extend_from_slice(&self.version().to_le_bytes());

@@ -12,7 +12,8 @@ use exr::{
 };
 use flate2::{Compress, FlushCompress};
 
-/// On renders as small as miniz's level 4, which the `exr` crate uses, in half the time.
+/// The level of deflate. It compresses renders as well as miniz's level 4, which the `exr` crate uses, in
+/// half the time.
 const LEVEL: u32 = 2;
 
 /// A block of a part as it is stored.
@@ -32,7 +33,7 @@ pub fn compress(block: UncompressedBlock, header: &Header) -> exr::error::Result
     )
 }
 
-/// Compressed bytes; none where they are not fewer: such a block is stored as it is.
+/// Compressed bytes; none where they would not be fewer, since such a block is stored as it is.
 fn deflate(raw: &[u8]) -> Option<Vec<u8>> {
     let (pairs, last) = raw.as_chunks::<2>();
     let mut parted: Vec<u8> = pairs.iter().map(|pair| pair[0]).collect();

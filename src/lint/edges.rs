@@ -18,14 +18,14 @@ use crate::{
 /// Edges that are needed to judge by.
 const EDGES: usize = 100;
 
-/// Pixels on a side of the squares that edges are judged in: one long edge must not decide alone, as it lies
-/// on the grid of pixels in one way, and has one light.
+/// Side in pixels of the squares in which edges are judged. One long edge must not decide alone, since it
+/// lies on the pixel grid in one way and has one light.
 const SQUARE: usize = 16;
 
 /// Edges that a square needs.
 const EDGES_OF_SQUARE: usize = 8;
 
-/// What is found at pixels, by square.
+/// Groups what was found at pixels by square, without the squares that have too few edges.
 fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Vec<Vec<T>> {
     let mut squares: BTreeMap<(usize, usize), Vec<T>> = BTreeMap::new();
     for (place, value) in found {
@@ -34,8 +34,8 @@ fn by_square<T>(width: usize, found: impl IntoIterator<Item = (usize, T)>) -> Ve
     squares.into_values().filter(|square| square.len() >= EDGES_OF_SQUARE).collect()
 }
 
-/// Judges edges, and where the guides lie as the render does also against its `light`, the sums of its
-/// channels.
+/// Judges the edges of the guides. `light`, the sums of the render's channels, is given only where the guides
+/// are not shifted against the render; the render's edges are then judged too.
 pub fn check(set: &PassSet, render: &Planes, light: Option<&Vec<f32>>, findings: &mut Vec<Finding>) {
     let (Some(albedo), Some(normal)) = (set.get(Pass::DenoisingAlbedo), set.get(Pass::DenoisingNormal))
     else {
@@ -48,7 +48,8 @@ pub fn check(set: &PassSet, render: &Planes, light: Option<&Vec<f32>>, findings:
     encoded(render, (albedo, normal), light, findings);
 }
 
-/// The way along rows or down columns: how far apart pixels are, and how many there are in a line and lines.
+/// The direction along rows or down columns: the distance between neighbouring pixels of a line and their
+/// number, and the distance between neighbouring lines and their number. Distances are in the plane's index.
 #[derive(Clone, Copy)]
 struct Way {
     step: usize,
@@ -65,7 +66,8 @@ impl Way {
         ]
     }
 
-    /// What is found at pixels that are `margin` away from the ends of their lines, given their index.
+    /// What `find` returns for the indices of all pixels that are at least `margin` away from the ends of
+    /// their lines.
     fn find<T: Send>(self, margin: usize, find: impl Fn(usize) -> Option<T> + Sync) -> Vec<T> {
         let find = &find;
         let line = |line: usize| {
@@ -75,27 +77,30 @@ impl Way {
         (0..self.lines).into_par_iter().flat_map_iter(line).collect()
     }
 
-    /// The pixel so many steps away.
+    /// The index of the pixel that is `steps` pixels further along the line.
     fn at(self, place: usize, steps: isize) -> usize {
         place.wrapping_add_signed(steps * self.step.cast_signed())
     }
 }
 
-/// Steps of a guide that are smaller are not looked at.
+/// The smallest step of a guide that is looked at.
 const STEP: f32 = 0.15;
 
 /// Squares that are needed to judge softness by.
 const SOFT_SQUARES: usize = 12;
 
-/// The sharpest quarter of the steps between plain sides has more than this share between two pixels, since a
-/// pixel edge cuts most of a filter in two: 0.62 to 1 in sound renders, 0.73 with a filter of 3 pixels, 0.50
-/// to 0.53 of 6. In most of the squares the middle one must be below as well (0.5 of 6 pixels).
+/// How much of a step between plain sides lies between two neighbouring pixels, as a share of the whole step.
+/// With a narrow filter that is most of it: in sound renders the sharpest quarter of the steps has shares
+/// above 0.62 to 1, with a filter of 3 pixels above 0.73, and with one of 6 pixels above 0.50 to 0.53. Guides
+/// are soft where that quarter begins at this share or below, and where three quarters of the squares have a
+/// median at or below it too (0.5 with a filter of 6 pixels).
 const SHARP: f32 = 0.56;
 
-/// Soft guides: a filter that is wide, though its noise is independent, as that of Cycles is.
+/// Finds soft guides, which tell of a wide pixel filter. The noise does not tell of it where a renderer keeps
+/// it independent from pixel to pixel, as Cycles does.
 fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
-    // Differences of pixels on each side of the largest that belong to the step, and of those beyond, which
-    // are plain.
+    // So many differences between neighbours on each side of the largest belong to the step; beyond them the
+    // sides are plain.
     const REACH: isize = 3;
     let mut shares = Vec::new();
     for planes in guides {
@@ -136,7 +141,7 @@ fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
     ));
 }
 
-/// A step of the guides that has plain sides of nine pixels: the pixel in its middle.
+/// Whether a pixel is the middle of a step of the guides whose sides are plain up to nine pixels away.
 fn is_edge((albedo, normal): (&Planes, &Planes), way: Way, place: usize) -> bool {
     let planes = || (0..3).flat_map(|c| [(albedo.channel(c), 4.0), (normal.channel(c), 1.0)]);
     let value = |plane: &[f32], most: f32, n: isize| plane[way.at(place, n)].min(most);
@@ -150,29 +155,29 @@ fn is_edge((albedo, normal): (&Planes, &Planes), way: Way, place: usize) -> bool
         })
 }
 
-/// Of the light's step across edges, the share that is there within 3 pixels on both sides: of all edges
-/// together 0.67 to 1.1 in sound renders of 320x180 pixels and more, after a blur of 9 pixels across the
-/// edges 0.34 to 0.58, of 13 below 0.42.
+/// A beauty is blurred where less than this share of the light's step across edges lies within 3 pixels on
+/// both sides. Over all edges together the share is 0.67 to 1.1 in sound renders of 320x180 pixels and more,
+/// 0.34 to 0.58 after a blur of 9 pixels across the edges, and below 0.42 after one of 13.
 const NEAR: f64 = 0.6;
 
 /// Squares that are needed to judge a blur by.
 const BLURRED_SQUARES: usize = 8;
 
-/// The same share in three of four squares: 0.86 and more in sound renders, after the blur of 9 pixels 0.5 to
-/// 0.77, of 13 0.35 to 0.58.
+/// The share below which three of four squares must lie as well. They lie below 0.86 or more in sound
+/// renders, below 0.5 to 0.77 after the blur of 9 pixels, and below 0.35 to 0.58 after that of 13.
 const NEAR_IN_SQUARES: f32 = 0.65;
 
-/// A root mean square of the step, as a logarithm, below which light hides the edges.
+/// Where the root mean square of the light's steps, as logarithms, is below this, light hides the edges.
 const LIGHT_STEP: f64 = 0.3;
 
-/// Motion from which on edges are also judged by themselves, in pixels a frame.
+/// Edges that move by at least this many pixels a frame are also judged apart from the others.
 const MOTION: f32 = 4.0;
 
-/// Steps of the light across an edge of the guides, as logarithms: near it, at two distances from it; and
-/// whether it moves.
+/// Steps of the light across an edge of the guides, as logarithms: one near the edge and two further away;
+/// and whether the edge moves.
 type Step = (f64, f64, f64, bool);
 
-/// A beauty that is blurred where the guides are sharp.
+/// Finds a beauty that is blurred where the guides are sharp.
 fn blurred(set: &PassSet, guides: (&Planes, &Planes), logs: &[f32], findings: &mut Vec<Finding>) {
     let vectors = set.get(Pass::Vector);
     for (direction, way) in Way::both(set.width, set.height).into_iter().enumerate() {
@@ -183,7 +188,7 @@ fn blurred(set: &PassSet, guides: (&Planes, &Planes), logs: &[f32], findings: &m
                 };
                 let step = |a: isize, b: isize| mean([a, b]) - mean([-a, -b]);
                 let motion = vectors.map_or(0.0, |v| v.channel(direction)[place].abs());
-                // Pixels of their own each, so that noise adds nothing to products on average.
+                // Each step is of other pixels, so that noise adds nothing to their products on average.
                 (place, (step(2, 3), step(6, 8), step(7, 9), motion >= MOTION))
             })
         });
@@ -225,14 +230,15 @@ fn blurred(set: &PassSet, guides: (&Planes, &Planes), logs: &[f32], findings: &m
     }
 }
 
-/// Steps of the albedo, as logarithms, that are looked at.
+/// The smallest step of the albedo, as a logarithm, that is looked at.
 const ALBEDO_STEP: f32 = 0.5;
 
-/// How large the light's steps are beside those of the albedo: 0.76 to 1.3 in linear renders, 0.38 to 0.61 in
-/// the same ones with the curve of sRGB.
+/// Ratios of the light's steps to those of the albedo, as logarithms, that tell of encoded pixels. They are
+/// 0.76 to 1.3 in linear renders, and 0.38 to 0.61 in the same renders with the curve of sRGB.
 const ENCODED: std::ops::Range<f32> = 0.3..0.66;
 
-/// Pixels with the curve of a display: none is above one, and light does not follow the albedo in proportion.
+/// Finds pixels that were encoded for a display: none is above one, and light is not proportional to the
+/// albedo.
 fn encoded(render: &Planes, guides: (&Planes, &Planes), light: &[f32], findings: &mut Vec<Finding>) {
     let (albedo, normal) = guides;
     if !render.data.iter().all(|v| (0.0..=1.0).contains(v)) {

@@ -7,31 +7,31 @@
 use super::{Finding, GUIDES, render};
 use crate::{passes::PassSet, planes::Planes};
 
-/// The noise of a frame, as far as it shows: by how much the light of each pixel differs from the mean of
-/// those around it, relative; NaN where that may be texture or an edge.
+/// The noise of a frame, as far as it shows: the relative difference of each pixel's light from the mean of
+/// the pixels around it, or NaN where that may be texture or an edge.
 pub struct Grain {
     width: usize,
     values: Vec<f32>,
 }
 
-/// Guides whose 3x3 pixels differ by more than this show texture or an edge.
+/// Where the 3x3 pixels of a guide differ by more than this, there is texture or an edge.
 const FLAT: f32 = 0.05;
 
-/// Differences are cut at this: a firefly would decide alone.
+/// Differences are clamped to this, so that a firefly does not decide alone.
 const LARGEST: f32 = 1.0;
 
-/// With a smaller root mean square, what differs is as likely to be detail of the light.
+/// Where the root mean square of the differences is smaller, they are as likely to be detail of the light.
 const LEAST: f64 = 0.03;
 
-/// Fewer pixels tell nothing.
+/// The fewest pixels to judge by.
 const PIXELS: usize = 500;
 
-/// Noise of which more than this is the same in two frames is shared; of frames of their own seeds some
-/// thousandths are.
+/// The correlation of two frames' noise above which they share one pattern. Frames with seeds of their own
+/// have a correlation of some thousandths.
 const SHARED: f64 = 0.2;
 
 impl Grain {
-    /// Of a view layer's passes; none without Combined or anything to tell texture by.
+    /// The grain of a view layer's passes; none without Combined or without any guide to tell texture by.
     pub fn of(set: &PassSet) -> Option<Self> {
         let radiance = render(set)?;
         let guides: Vec<&Planes> = GUIDES.iter().filter_map(|pass| set.get(*pass)).collect();
@@ -56,15 +56,15 @@ impl Grain {
                 return f32::NAN;
             }
             let mean = around(at).map(light).iter().sum::<f32>() / 4.0;
-            // Beside black, and where values are not finite, it is no number.
+            // Where all pixels around are black, there is no relative difference.
             if mean > 0.0 { (light(at) / mean - 1.0).clamp(-LARGEST, LARGEST) } else { f32::NAN }
         };
         let values = (0..width * height).map(value).collect();
         Some(Self { width, values })
     }
 
-    /// How much of the noise is that of `other`, at the same places of the screen: 1 is all. None where too
-    /// little shows.
+    /// The correlation with the noise of `other` at the same pixels: 1 where both are the same. None where
+    /// too few pixels or too little noise show.
     fn shared(&self, other: &Self) -> Option<f64> {
         if (self.width, self.values.len()) != (other.width, other.values.len()) {
             return None;
@@ -75,14 +75,16 @@ impl Grain {
         if both.len() < PIXELS {
             return None;
         }
-        // Relative differences of positive values are more often small and negative than large and positive.
+        // Means are subtracted: relative differences of positive values are more often small and negative
+        // than large and positive, so their mean need not be zero.
         let (a, b) = (mean(&|v| v.0), mean(&|v| v.1));
         let [of_a, of_b] = [mean(&|v| (v.0 - a).powi(2)), mean(&|v| (v.1 - b).powi(2))];
         let product = mean(&|v| (v.0 - a) * (v.1 - b));
         (of_a.min(of_b).sqrt() > LEAST).then(|| product / (of_a * of_b).sqrt())
     }
 
-    /// What is to be said of a frame whose grain is `other`'s, the frame before it of the name given.
+    /// The warning for a frame that shares its noise with `other`, the grain of the frame before it, whose
+    /// name is `before`.
     pub fn warning(&self, other: &Self, before: &str) -> Option<Finding> {
         let shared = self.shared(other).filter(|shared| *shared > SHARED)?;
         Some(Finding::new(

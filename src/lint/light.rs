@@ -6,10 +6,11 @@ use crate::{
     planes::Planes,
 };
 
-/// Guides whose pixels differ by less than this show one plain surface.
+/// Where neighbouring pixels of the guides differ by less than this, they show one plain surface.
 const FLAT: f32 = 0.05;
 
-/// A darkest light that is told from black, relative to the median: logarithms need a floor.
+/// What is added to light before its logarithm is taken, relative to the median, since black has no
+/// logarithm.
 const FLOOR: f32 = 0.01;
 
 /// The sum of a render's channels, finite and not negative.
@@ -20,7 +21,7 @@ pub fn sums(render: &Planes) -> Vec<f32> {
     pixels.map(|((r, g), b)| clean(*r) + clean(*g) + clean(*b)).collect()
 }
 
-/// The logarithm of light; its floor depends on the median of what is not black.
+/// The logarithm of each sum plus `floor` times the median of the sums that are not black.
 pub fn logarithms(sums: &[f32], floor: f32) -> Vec<f32> {
     let mut positive: Vec<f32> = sums.iter().copied().filter(|v| *v > 0.0).collect();
     let floor = (floor * median(&mut positive).unwrap_or(1.0)).max(f32::MIN_POSITIVE);
@@ -32,19 +33,20 @@ pub fn usual_logarithms(sums: &[f32]) -> Vec<f32> {
     logarithms(sums, FLOOR)
 }
 
-/// The middle value, the upper of two; none of none.
+/// The middle value, or the upper of the two middle values; none for no values.
 pub fn median(values: &mut [f32]) -> Option<f32> {
     quantile(values, 0.5)
 }
 
-/// The value below which a share of the values lie; none of none.
+/// The value below which that share of the values lies; none for no values.
 pub fn quantile(values: &mut [f32], share: f32) -> Option<f32> {
     let at = ((values.len() as f32 * share) as usize).min(values.len().checked_sub(1)?);
     Some(*values.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
-/// Where the guides show a plain surface that is lit: no edge or texture within a pixel, something is hit,
-/// and the albedo is not itself the light, as that of lamps is in Cycles. None without a normal.
+/// Which pixels show a plain surface that is lit: the guides have no edge or texture within a pixel, the
+/// normal is not zero, so that something was hit, and the albedo does not equal the light, as that of lamps
+/// does in Cycles. None without a normal.
 pub fn lit_surfaces(set: &PassSet, render: &Planes) -> Option<Vec<bool>> {
     let normal = set.get(Pass::DenoisingNormal).or_else(|| set.get(Pass::Normal))?;
     let albedo = set.get(Pass::DenoisingAlbedo);

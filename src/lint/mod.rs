@@ -1,10 +1,10 @@
 //! What ruins a denoise, found in a frame's passes before any work is done.
 //!
-//! In: the passes of a frame as they are stored, and what the file says of them; of a shot, frames one after
-//! another. Out: [`Finding`]s, each with a code, a sentence, and the setting that mends it. Pure functions:
-//! nothing is read, repaired or printed here. A rule speaks up only where its measure lies well beyond what
-//! sound renders show: thresholds stand beside what was measured on 27 noisy and 24 clean frames of 13
-//! scenes.
+//! In: the passes of a frame as they are stored, and what the file says of them; or, for a shot, frames one
+//! after another. Out: [`Finding`]s, each with a code, a sentence, and the setting that mends it. All
+//! functions are pure: nothing is read, repaired or printed here. A rule finds something only where its
+//! measure lies well beyond that of sound renders. The docs of the thresholds say what was measured, on 27
+//! noisy and 24 clean frames of 13 scenes.
 
 mod edges;
 mod grain;
@@ -28,7 +28,7 @@ use crate::{
 /// Something that ruins a denoise, or is likely to.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What it is, for scripts: the names are kept.
+    /// The kind of finding, for scripts; codes are not renamed.
     pub code: &'static str,
     /// What was found, as a sentence without its end.
     pub message: String,
@@ -43,22 +43,22 @@ impl Finding {
     }
 }
 
-/// What a file says of a frame's passes beside their values.
+/// What a file says of a frame's passes, apart from their values.
 #[derive(Clone, Debug, Default)]
 pub struct About {
     /// Passes stored as half floats.
     pub half: BTreeSet<Pass>,
-    /// Whether Position is a mean over samples, and not the pass of the first one.
+    /// Whether Position is a mean over samples, and not Cycles' own pass, which holds the first sample.
     pub position_averaged: bool,
     /// The colour space that the file names, as OpenEXR, Blender or OpenImageIO write it.
     pub colour_space: Option<String>,
     /// The passes that are missing for the model that is used by default.
     pub missing: Vec<Pass>,
-    /// That model.
+    /// The name of that model.
     pub model: String,
 }
 
-/// What is found in a frame by itself.
+/// The findings in a single frame.
 pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     let mut findings = Vec::new();
     missing(set.renderer, about, &mut findings);
@@ -71,23 +71,23 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     let Some(render) = render(set) else { return findings };
     let light = light::sums(render);
     noise::check(set, render, &light, &mut findings);
-    // What lies elsewhere tells nothing of the beauty's edges.
+    // Shifted guides tell nothing of the beauty's edges.
     let is_shifted = shift::check(set, &light, &mut findings);
     edges::check(set, render, (!is_shifted).then_some(&light), &mut findings);
     noise::clamped(set, &light, &mut findings);
     findings
 }
 
-/// Frames that are smaller in a direction are not judged as pictures: they show too few edges and too little
-/// noise. Of 252 sound crops of 128x128 pixels, some 30 would be warned of.
+/// The least width and height of a frame that is judged as a picture: smaller ones show too few edges and too
+/// little noise. Of 252 sound crops of 128x128 pixels, some 30 would be warned of.
 const LEAST_SIZE: usize = 160;
 
-/// The render, before Blender denoised it itself.
+/// The noisy render: Noisy Image, which Blender keeps where it denoised Combined itself, or else Combined.
 fn render(set: &PassSet) -> Option<&Planes> {
     set.get(Pass::NoisyImage).or_else(|| set.get(Pass::Combined))
 }
 
-/// The passes that tell a model what surfaces look like: averaged over samples.
+/// The passes that tell a model what surfaces look like. Both are averaged over samples.
 const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 
 fn missing(renderer: &Renderer, about: &About, findings: &mut Vec<Finding>) {

@@ -1,9 +1,9 @@
-//! What the noise of a render tells: whether it was removed already, or smeared, or cut off.
+//! What the noise of a render tells: whether it was removed already, spread over pixels, or clamped.
 //!
-//! Samples of a path tracer that picks its filter by importance, as Cycles does, belong to one pixel each:
-//! their noise is independent from pixel to pixel. On a plain surface, a pixel then differs from the four
-//! next to it as much as from the four two pixels away. After a denoiser, a filter that spreads samples over
-//! pixels, or a resize, it differs less from nearer ones.
+//! In a path tracer that draws samples according to its pixel filter, as Cycles does, each sample belongs to
+//! one pixel, so noise is independent from pixel to pixel. On a plain surface, a pixel then differs from the
+//! mean of the four next to it as much as from that of the four two pixels away. After a denoiser, a filter
+//! that spreads samples over pixels, or a resize, it differs less from the nearer four.
 
 use rayon::prelude::*;
 
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{passes::PassSet, planes::Planes};
 
-/// Pixels on a side of the squares that are judged one by one: much of a frame may show no noise by right.
+/// Side in pixels of the squares that are judged one by one, since much of a frame may rightly show no noise.
 const SQUARE: usize = 32;
 
 /// Pixels of plain surfaces that a square needs.
@@ -22,23 +22,24 @@ const PIXELS: usize = 100;
 /// Squares that a frame needs.
 const SQUARES: usize = 12;
 
-/// The share of the squares whose differences of neighbours are as small as told, so that noise that is
-/// independent anywhere clears a frame.
+/// A frame is judged by the ratio below which this share of its squares lies, so that independent noise in a
+/// quarter of them clears it.
 const MOST: f32 = 0.75;
 
-/// Of renders with independent noise, 1 in theory, MOST of the squares have ratios below 0.96 to 1.14 (24
-/// frames, 4 to 4096 samples); denoised by Blender 0.70, spread over pixels by a Gaussian of half a pixel
-/// 0.66 to 0.88.
+/// The ratio below which a frame's noise is not independent. With independent noise the ratio is 1 in theory,
+/// and [`MOST`] of the squares lie below 0.96 to 1.14 (24 frames, 4 to 4096 samples). In frames that Blender
+/// denoised they lie below 0.70, and after spreading over pixels by a Gaussian of half a pixel below 0.66 to
+/// 0.88.
 const ALIKE: f32 = 0.88;
 
-/// Relative differences of neighbours below which noise was removed, and not spread: 0.001 after denoising;
-/// noise of 4 to 64 samples that is spread by half a pixel has 0.01 to 0.5.
+/// Relative difference of neighbours below which noise was removed, and not merely spread. It is 0.001 after
+/// denoising, and 0.01 to 0.5 in noise of 4 to 64 samples that is spread by half a pixel.
 const REMOVED: f32 = 0.015;
 
-/// `light` is [`sums`](super::light::sums) of the render.
+/// Finds noise that was removed or spread. `light` is [`sums`](super::light::sums) of the render.
 pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<Finding>) {
     if let Some((ratio, amplitude)) = likeness(set, render, light).filter(|(ratio, _)| *ratio < ALIKE) {
-        // Where Blender kept the render it is that which is judged here.
+        // Where Blender kept the noisy render beside Combined, that render is judged here.
         findings.push(if amplitude < REMOVED {
             Finding::new(
                 "looks-denoised",
@@ -62,8 +63,8 @@ pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<F
     }
 }
 
-/// By how much less neighbours differ than pixels two apart, in most squares, and the median of their
-/// differences; none where too little shows.
+/// The ratio of the differences of neighbours to those of pixels two apart, below which [`MOST`] of the
+/// squares lie, and the median difference of neighbours; none where too few squares can be judged.
 fn likeness(set: &PassSet, render: &Planes, light: &[f32]) -> Option<(f32, f32)> {
     let surfaces = lit_surfaces(set, render)?;
     let (w, h) = (set.width, set.height);
@@ -102,23 +103,24 @@ fn likeness(set: &PassSet, render: &Planes, light: &[f32]) -> Option<(f32, f32)>
 /// Values of Render Properties > Light Paths > Clamping that are tried.
 const CLAMPS: [f32; 13] = [0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0];
 
-/// Width of a class of light, as a logarithm.
+/// Width of a class of pixels by how far they stand out from those around them, as a logarithm.
 const CLASS: f32 = 0.02;
 
-/// By how many standard deviations of chance a class must stand out.
+/// The standard deviations of chance by which a class must have more pixels than the classes beside it.
 const STANDS_OUT: f32 = 6.0;
 
-/// By how many times more than any other class: lamps and hard light make classes of their own, at any value.
+/// How many times as far as any other class it must stand out, since lamps and hard light make classes of
+/// their own at any value.
 const ALONE: f32 = 2.0;
 
 /// Pixels that a class needs.
 const CLAMPED_PIXELS: f32 = 30.0;
 
-/// Cycles scales a sample whose channels add up to more than three times the clamp down to that. In a pixel
-/// of N samples one such sample adds three times the clamp, divided by N: many pixels stand out from those
-/// around them by just that.
+/// Finds samples that were clamped. Cycles scales a sample whose channels add up to more than three times the
+/// clamp down to that sum. In a pixel of N samples one such sample adds three times the clamp, divided by N,
+/// so that many pixels stand out from those around them by just that.
 ///
-/// To be asked last: what is cut off at 1 was encoded for a display, which is another fault.
+/// This comes last: values that are cut off at 1 were encoded for a display, which is another fault.
 pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
     let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
     if findings.iter().any(|finding| finding.code == "display-pixels") {
@@ -135,17 +137,17 @@ pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
         })
         .collect();
     let counts = Counts::of(logs);
-    // Classes begin a little below a value, which half floats round.
+    // Classes begin a little below the value, since half floats round it.
     let first = |clamp: f32| (3.0 * clamp / samples as f32).ln() - 0.003;
     let tried = CLAMPS.map(|clamp| (counts.stands_out(first(clamp)), clamp));
     let best = tried.iter().map(|(much, _)| *much).fold(0.0, f32::max);
-    // Two samples of one clamp add as much as one of twice the clamp.
+    // Two samples of one clamp add as much as one of twice the clamp, so the lowest that fits is taken.
     let lowest = tried.into_iter().find(|(much, _)| *much >= 0.5 * best);
     let (most, clamp) = lowest.expect("the best is one of them");
     if most < STANDS_OUT {
         return;
     }
-    // All other classes, but those where several samples were cut, and those that overlap.
+    // All other classes, except those of several clamped samples in a pixel and those that overlap with them.
     let own = first(clamp);
     let is_own = |at: f32| (1..=6).any(|n| (at - own - (n as f32).ln()).abs() < 6.0 * CLASS);
     let classes = (-500..600).map(|class| class as f32 * CLASS).filter(|at| !is_own(*at));
@@ -164,18 +166,18 @@ pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
     ));
 }
 
-/// Light below this is not looked at: half floats get coarse.
+/// Pixels that stand out by less light than this are not looked at, since half floats are too coarse there.
 const LEAST_EXCESS: f32 = 1e-4;
 
-/// How many pixels stand out by how much: numbers of logarithms up to each step.
+/// How many pixels stand out by how much: for each step, the number of logarithms up to it.
 struct Counts(Vec<f32>);
 
 impl Counts {
-    /// Steps of a class.
+    /// Steps in a class.
     const STEPS: i32 = 20;
-    /// The first step's logarithm, in steps.
+    /// The logarithm of the first step, in steps.
     const FIRST: i32 = -14_000;
-    /// The last one's.
+    /// The logarithm of the last step, in steps.
     const LAST: i32 = 16_000;
 
     fn step(logarithm: f32) -> i32 {
@@ -195,8 +197,8 @@ impl Counts {
         Self(counts)
     }
 
-    /// Pixels in classes before (negative) or after one that begins at a logarithm, from the first to the
-    /// second.
+    /// The pixels in the classes from `from` up to, but without, `to`. Class 0 begins at `logarithm`, and
+    /// negative classes lie before it.
     fn classes(&self, logarithm: f32, from: i32, to: i32) -> f32 {
         let at = |class: i32| {
             let step = Self::step(logarithm) + class * Self::STEPS - Self::FIRST - 1;
@@ -205,7 +207,8 @@ impl Counts {
         at(to) - at(from)
     }
 
-    /// By how many standard deviations of chance a class has more pixels than those on both sides let expect.
+    /// By how many standard deviations of chance the class that begins at `logarithm` has more pixels than
+    /// the classes on both sides let expect; 0 where it has too few pixels.
     fn stands_out(&self, logarithm: f32) -> f32 {
         let (left, right) = (self.classes(logarithm, -5, -1) / 4.0, self.classes(logarithm, 5, 9) / 4.0);
         let expected = (2.0 * left + right) / 3.0;

@@ -1,8 +1,8 @@
-//! Guides that lie elsewhere than the beauty: of a frame with another camera or crop, or one that was moved
-//! in compositing.
+//! Guides that are shifted against the beauty, because they are of a frame with another camera or crop, or
+//! were moved in compositing.
 //!
-//! Edges of the guides are held against edges of the beauty, at shifts up to some pixels: of a frame's own
-//! guides, none fits better than that of no shift.
+//! Edges of the guides are compared with edges of the beauty at shifts of up to some pixels. A frame's own
+//! guides fit best without a shift.
 
 use rayon::prelude::*;
 
@@ -12,20 +12,21 @@ use crate::{passes::PassSet, planes::Planes};
 /// Largest shift that is tried, in pixels.
 const REACH: usize = 12;
 
-/// Shifts up to this are none: filters and the grid of pixels make as much.
+/// Shifts of up to this many pixels count as none, since filters and the pixel grid make as much.
 const NONE: isize = 1;
 
-/// A correlation of edges below this is none: 0.2 or more of a frame's own guides in 15 of 17 scenes.
+/// A correlation of edges below this counts as none. A frame's own guides have 0.2 or more in 15 of 17
+/// scenes.
 const FITS: f64 = 0.2;
 
-/// By how many times better a shift must fit than no shift: it never does in sound frames of 320x180 pixels
-/// and more; guides moved by 8 pixels fit there 1.25 times as well or better.
+/// How many times as well a shift must fit as no shift. None does in sound frames of 320x180 pixels and more,
+/// where guides that were moved by 8 pixels fit 1.25 times as well or better.
 const BETTER: f64 = 1.2;
 
-/// Rows that are held against each other: those of larger frames are picked evenly.
+/// The most rows that are compared; those of larger frames are picked evenly.
 const ROWS: usize = 400;
 
-/// Whether a guide lies elsewhere than `light`, the sums of the render's channels.
+/// Whether a guide is shifted against `light`, the sums of the render's channels.
 pub fn check(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) -> bool {
     let before = findings.len();
     let (w, h) = (set.width, set.height);
@@ -60,7 +61,7 @@ fn clean(v: f32) -> f32 {
     if v.is_nan() { 0.0 } else { v.clamp(-2.0, 2.0) }
 }
 
-/// The mean of the 3x3 pixels around each, at the rim of those that are there.
+/// The mean of the 3x3 pixels around each pixel, or at the rim, of those that exist.
 fn blur(plane: &[f32], w: usize, h: usize) -> Vec<f32> {
     let mean = |at: usize| {
         let (x, y) = (at % w, at / w);
@@ -72,7 +73,7 @@ fn blur(plane: &[f32], w: usize, h: usize) -> Vec<f32> {
     (0..w * h).into_par_iter().map(mean).collect()
 }
 
-/// How steep planes are at each pixel, together, up to `most`.
+/// The sum of the gradients' lengths of all planes at each pixel, at most `most`.
 fn edges(planes: &[&[f32]], w: usize, h: usize, most: f32) -> Planes {
     Planes::from_rows(1, (w, h), |_, y, out| {
         out.fill(0.0);
@@ -100,7 +101,7 @@ fn shift(beauty: &Planes, guide: &Planes) -> Option<(isize, isize)> {
     let correlation = |(dx, dy): (isize, isize)| {
         let mut sums = [0.0f64; 5];
         for &y in &rows {
-            // The guide moved by (dx, dy) has at a pixel what lies that much before it.
+            // The guide moved by (dx, dy) has at a pixel the value from dx to its left and dy above it.
             let of_guide = row(guide, y.wrapping_add_signed(-dy), REACH.wrapping_add_signed(-dx));
             let mut of_row = [0.0f32; 5];
             for (b, g) in row(beauty, y, REACH).iter().zip(&of_guide) {

@@ -4,23 +4,23 @@
 use super::{Finding, GUIDES, grain::Grain};
 use crate::passes::{BLENDER, Pass, PassSet};
 
-/// What is kept of a frame to hold the next one against it.
+/// What is kept of a frame to compare the next one with it.
 pub struct Trace {
     grain: Option<Grain>,
-    /// Of each guide, a number that two guides share only if they are the same, bit for bit.
+    /// A hash of each guide's bits, by which guides that are the same bit for bit are told.
     guides: Vec<(Pass, u64)>,
     /// Share of the pixels that move; none without vectors.
     moving: Option<f64>,
 }
 
-/// Motion that is seen, in pixels a frame.
+/// A pixel moves where its motion is above this many pixels a frame.
 const MOTION: f32 = 1.0;
 
-/// More of the pixels than this must move for guides that stand still to be of another frame.
+/// Guides that stand still are of another frame where more than this share of the pixels moves.
 const MOVING: f64 = 0.01;
 
 impl Trace {
-    /// Of a view layer's passes.
+    /// What is kept of a view layer's passes.
     pub fn of(set: &PassSet) -> Self {
         let hash = |data: &[f32]| {
             data.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, v| {
@@ -35,7 +35,7 @@ impl Trace {
         Self { grain: Grain::of(set), guides: guides.collect(), moving }
     }
 
-    /// What is found in a frame that follows `before`, whose file is named.
+    /// The findings in a frame that follows `before`, whose file is called `name`.
     pub fn after(&self, before: &Self, name: &str) -> Vec<Finding> {
         let mut findings = Vec::new();
         findings.extend(

@@ -7,8 +7,8 @@ use crate::{
     planes::Planes,
 };
 
-/// Passes that no frame with anything in it has zero everywhere; others rightly are where a scene has no
-/// glass, no volume, no lamp in view.
+/// Passes that are never zero everywhere in a frame that shows anything. Other passes rightly are where a
+/// scene has no glass, no volume or no lamp in view.
 const NEVER_ZERO: [Pass; 6] = [
     Pass::Combined,
     Pass::Normal,
@@ -18,27 +18,29 @@ const NEVER_ZERO: [Pass; 6] = [
     Pass::NoisyImage,
 ];
 
-/// A guide whose values differ by no more than this is one value: half floats near 1 are 0.0005 apart.
+/// A guide whose values differ by no more than this counts as constant; half floats near 1 are 0.0005 apart.
 const CONSTANT: f32 = 0.001;
 
-/// Albedo above this is more than rounding. Cycles adds to the albedo of lamps and screens the light that
-/// they send, of which the render has at least as much: what the albedo has more than the render is the
-/// surface's own.
+/// Albedo above this is more than rounding. Cycles adds the light that lamps and screens send to their
+/// albedo, and the render holds at least as much of it, so that only what the albedo has more than the render
+/// is the surface's own.
 const ABOVE_ONE: f32 = 1.02;
 
-/// Albedo above this is taken for a lamp's, which fog may hide.
+/// Albedo from this on is taken for a lamp's, whose light fog may hide in the render.
 const LAMP: f32 = 4.0;
 
-/// Neighbours of a plain surface differ by less than this share: at the rims of lamps, albedo has any value.
+/// Neighbours on a plain surface differ by less than this share of their value. Only such pixels are judged,
+/// since albedo may have any value at the rims of lamps.
 const PLAIN: f32 = 0.05;
 
-/// So many of all pixels must be above.
+/// The share of all pixels whose albedo must be above one.
 const ABOVE_SHARE: f64 = 0.002;
 
-/// Of 8-bit pixels all are multiples of 1/255; of others so near to one are 2 in 7 by chance.
+/// How far a value may be from a multiple of 1/255, in 255ths. All 8-bit values are as near as this to one,
+/// and of other values 1 in 7 by chance.
 const NEAR_STEP: f32 = 0.07;
 
-/// Fewer values that are neither 0 nor 1 tell nothing.
+/// The fewest values other than 0 and 1 to judge by.
 const STEPS: usize = 1000;
 
 pub fn check(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
@@ -62,7 +64,7 @@ fn single_values(
     findings: &mut Vec<Finding>,
 ) {
     let count = |is: &dyn Fn(f32) -> bool| planes.data.iter().filter(|v| is(**v)).count();
-    // Beyond everything there is no depth, and as a half float that is infinite.
+    // Where nothing is hit there is no depth, which is infinite as a half float.
     let may_be_infinite = matches!(pass, Pass::Depth | Pass::DenoisingDepth);
     let is_well = |v: f32| v.is_finite() || (may_be_infinite && v == f32::INFINITY);
     let bad = count(&|v| !is_well(v));

@@ -14,7 +14,7 @@ use crate::{
 
 /// Names of components that are words.
 const WORDS: [(&str, &str); 4] = [("red", "R"), ("green", "G"), ("blue", "B"), ("alpha", "A")];
-/// The view of files that have one, as Nuke names it.
+/// Nuke's name of the view in files that have only one.
 const MAIN: &str = "main";
 
 /// A channel: where it is and its component's name.
@@ -108,7 +108,7 @@ fn undotted<'a>(channel: &'a str, part: Holder<'a>) -> (&'a str, &'a str) {
 /// A layer's name without the view in it, and the view.
 fn without_view<'a>(prefix: &'a str, part: Holder<'_>) -> (&'a str, Option<String>) {
     let own = part.view.map(str::to_owned);
-    // Of parts, Blender's `ViewLayer.Combined-left` and Nuke's `rgba_main`.
+    // Names of parts end in the view, as Blender's `ViewLayer.Combined-left` and Nuke's `rgba_main`.
     let is_of_part = part.name == Some(prefix);
     for view in part.view.into_iter().chain(is_of_part.then_some(MAIN)) {
         let rest = prefix.strip_suffix(view);
@@ -121,7 +121,7 @@ fn without_view<'a>(prefix: &'a str, part: Holder<'_>) -> (&'a str, Option<Strin
     match (prefix.rsplit_once('.'), prefix.split_once('.')) {
         (None, _) if is_view(prefix) => ("", named(prefix).or(own)),
         (Some((rest, last)), _) if is_view(last) => (rest, named(last).or(own)),
-        // In front, as in `left.Denoising Albedo`.
+        // The view may stand in front, as in `left.Denoising Albedo`.
         (_, Some((first, rest))) if is_view(first) => (rest, named(first).or(own)),
         _ => (prefix, own),
     }
@@ -174,8 +174,8 @@ fn entry(found: &mut Vec<(LayerKey, ByPass)>, key: LayerKey) -> &mut ByPass {
     &mut found[at].1
 }
 
-/// Parts may have any name: where nothing in a view is called like a beauty, the colours of its first part
-/// are it.
+/// Parts may have any name. Where nothing in a view has the name of a beauty, the colours of the view's first
+/// part become the beauty.
 fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
     if !frame.is_multi_part() {
         return;
@@ -189,7 +189,7 @@ fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
             continue;
         }
         let first = layers().flat_map(|(_, passes)| passes.values().flatten()).map(|place| place.part).min();
-        // What is bare in a part of a name that means nothing.
+        // It is R, G and B without a pass, in a part whose name means nothing.
         let is_it = |name: &str, places: &[Place]| {
             let has = |wanted: &str| {
                 places.iter().any(|place| {
@@ -210,7 +210,8 @@ fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
     }
 }
 
-/// In files of one part, what has no view in its name is the default view's, unless that has it as well.
+/// In files of one part, passes without a view in their names belong to the default view, unless that has a
+/// pass of the same name.
 fn join_default_view(found: &mut Vec<(LayerKey, ByPass)>, default: &str) {
     let without: Vec<LayerKey> =
         found.iter().filter(|((_, view), _)| view.is_none()).map(|(key, _)| key.clone()).collect();
@@ -225,7 +226,7 @@ fn join_default_view(found: &mut Vec<(LayerKey, ByPass)>, default: &str) {
             let keeper = if found[target].1.contains_key(&pass) { at } else { target };
             found[keeper].1.insert(pass, places);
         }
-        // The default view keeps the place of what it took in: it comes first.
+        // The default view takes the place of the channels that it took in, so that it comes first.
         if found[at].1.is_empty() {
             found.swap(at, target);
             found.remove(target);

@@ -57,15 +57,15 @@ pub fn layers(frame: &Frame) -> Vec<Layer> {
     layers_by(frame, &Mapping::default())
 }
 
-/// As [`layers`]; a mapping says what passes are called that have names of the user's own.
+/// As [`layers`], with a mapping that names the passes whose names are the user's own.
 pub fn layers_by(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
     let found = by_pass(frame).into_iter();
     found.map(|((name, view), channels)| assign(name, view, channels, mapping)).collect()
 }
 
-/// The view layers, of that name or of any, that hold R, G and B of a layer of any name, such as `Denoised`
-/// or `ViewLayer.Denoised`: each with those as its Combined and nothing else, in file order, once for each
-/// stereo view.
+/// The view layers that hold R, G and B of a layer `name`, which may be any, such as `Denoised` or
+/// `ViewLayer.Denoised`. Each has these as its Combined and nothing else. They come in file order, once for
+/// each stereo view; with `view_layer`, only those of that view layer.
 pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<Layer> {
     let found = by_pass(frame).into_iter();
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
@@ -77,8 +77,8 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
     found.filter_map(as_combined).collect()
 }
 
-/// The layers of a file of its own that are a pass: those of its name, or else the pictures that it holds
-/// without a name.
+/// The layers that are the pass `pass` in a file of its own: those with a name of that pass, or else the
+/// pictures that the file holds without a name.
 pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
     let named: Vec<Layer> =
         layers(frame).into_iter().filter(|layer| layer.passes.contains_key(&pass)).collect();
@@ -103,7 +103,7 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
         });
         found.collect::<BTreeMap<Pass, PassChannels>>()
     };
-    // Bare channels are called alike by all.
+    // Bare channels have the same names in all renderers, so they tell nothing.
     let is_telling = |name: &str| !(layer.name.is_empty() && name == COMBINED) && name != BARE_DEPTH;
     let told = |passes: &BTreeMap<Pass, PassChannels>| {
         passes
@@ -117,8 +117,8 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
     let best = by_all.iter().rev().max_by_key(|(_, passes)| told(passes)); // `max_by_key` keeps the last of equals
     let (renderer, passes) = best.expect("there are renderers");
     (layer.renderer, layer.passes) = (renderer, passes.clone());
-    // Compositors give names of several. What Blender itself leaves out stays out: its passes differ from
-    // others' of one name.
+    // A file that a compositor wrote may have names of several renderers. Passes that Blender leaves out stay
+    // out, since its passes differ from those of the same name in other renderers.
     if !renderer.is_blender() {
         for (pass, at) in by_all.iter().flat_map(|(_, passes)| passes) {
             if is_common(&at.name) && *pass != Pass::Normal {
@@ -173,7 +173,7 @@ pub fn within<'a>(view_layer: &str, name: &'a str) -> &'a str {
     name.strip_prefix(view_layer).and_then(|rest| rest.strip_prefix('.')).unwrap_or(name)
 }
 
-/// The channels of a layer by the names of their passes, and by what programs make of those.
+/// The channels of a layer by the names of their passes, and these names by their [`plain`] forms.
 struct Index<'a> {
     channels: &'a ByPass,
     alike: HashMap<String, &'a str>,
@@ -189,7 +189,7 @@ impl<'a> Index<'a> {
         Self { channels, alike }
     }
 
-    /// The channels of a pass of that name: of the very name, or of one that programs make of it.
+    /// The channels of a pass of exactly that name, or else of one with the same [`plain`] form.
     fn find(&self, name: &str, pass: Pass) -> Option<PassChannels> {
         let name = if self.channels.contains_key(name) { name } else { self.alike.get(&plain(name))? };
         find_components(name, &self.channels[name], pass)
@@ -199,7 +199,8 @@ impl<'a> Index<'a> {
 /// The channels that make up a pass, all in the part of the first.
 fn find_components(name: &str, places: &[Place], pass: Pass) -> Option<PassChannels> {
     components(pass).iter().find_map(|wanted| {
-        // As spelled first: files may hold `R` of the picture beside `r` of something else.
+        // The exact spelling comes first, since files may hold `R` of the picture beside `r` of something
+        // else.
         let of = |wanted: &str, part: Option<usize>| {
             let mut in_part = places.iter().filter(|place| part.is_none_or(|part| place.part == part));
             let exact = in_part.clone().find(|place| place.component == wanted);
@@ -251,12 +252,12 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
     }
 }
 
-/// The view layer to hold against one of that name in another file: its namesake, or the only one with
-/// Combined besides the compositor's. A file without view layers, whose name is empty, has nothing to choose
-/// by: see [`choose`].
+/// The view layer to compare with one called `name` in another file: the one of the same name, or else the
+/// only one with Combined besides the compositor's. An empty `name`, as in files without view layers, tells
+/// nothing to choose by, and the view layer is that of [`choose`].
 ///
 /// # Errors
-/// There is none; the message lists what there is.
+/// There is no such view layer; the message lists what there is.
 pub fn choose_like<'a>(frame: &Frame, layers: &'a [Layer], name: &str) -> Result<&'a Layer> {
     if let Some(namesake) = layers.iter().find(|l| l.name == name) {
         return Ok(namesake);
@@ -308,8 +309,8 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
     set.renderer = layer.renderer;
-    // Blender's metadata; with adaptive sampling, the most samples that a pixel may have had. Programs that
-    // write a render anew leave it out: then what render pairs are named by.
+    // Blender's metadata tells the samples; with adaptive sampling, the most that a pixel may have had.
+    // Programs that write a render anew leave it out; then the file's name may tell, as that of render pairs.
     let told = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
     let told = told.and_then(|count| count.trim().parse().ok());
     set.samples = told.or_else(|| samples(frame.path()));

@@ -23,7 +23,7 @@ impl Mapping {
     /// with the view layer before it or without.
     ///
     /// # Errors
-    /// It says nothing of the kind, or another name for a pass that has one; says what it should.
+    /// The line is not of that form, or gives a pass another name; the text says what is wanted.
     pub fn add(&mut self, line: &str) -> Result<(), String> {
         let (word, name) = line.split_once('=').ok_or("wants PASS=NAME, such as albedo=NAME")?;
         let (word, name) = (word.trim(), name.trim());
@@ -46,10 +46,10 @@ impl Mapping {
         Ok(())
     }
 
-    /// Adds what a file says, a pass a line; empty lines and those that begin with `#` say nothing.
+    /// Adds the lines of a file, one for each pass; empty lines and those that begin with `#` are left out.
     ///
     /// # Errors
-    /// It cannot be read, or a line makes no sense.
+    /// The file cannot be read, or a line makes no sense.
     pub fn add_file(&mut self, path: &Path) -> Result<()> {
         let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
         for (number, line) in text.lines().enumerate() {
@@ -75,7 +75,7 @@ impl Mapping {
     /// Whether a layer holds all that is named.
     ///
     /// # Errors
-    /// It does not: says what it holds.
+    /// The layer lacks one; the message says what it holds.
     pub fn check(&self, path: &Path, layer: &Layer) -> Result<()> {
         // An alpha that goes with the beauty need not be there.
         let mut wanted = self.iter().filter(|(pass, _)| *pass != Pass::Alpha);

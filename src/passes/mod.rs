@@ -129,7 +129,7 @@ impl Pass {
         Pass::Vector,
     ];
 
-    /// What the pass is a quantity of: what else is true of it follows.
+    /// What the pass is a quantity of, which decides its other properties.
     pub fn quantity(self) -> Quantity {
         use Pass::*;
         match self {
@@ -193,7 +193,7 @@ pub struct PassSet {
     pub origin: (i32, i32),
     /// Samples of a pixel, or the most that it may have had, where the file tells.
     pub samples: Option<u32>,
-    /// The renderer that wrote it, as far as its names tell: messages say what to do there.
+    /// The renderer that wrote it, as far as its names tell; messages name that renderer's settings.
     pub renderer: &'static Renderer,
     planes: BTreeMap<Pass, Planes>,
 }
@@ -206,7 +206,7 @@ impl PassSet {
         Self { path, view_layer, width, height, origin, samples, renderer, planes: BTreeMap::new() }
     }
 
-    /// A set of another size that is said to be of the same render.
+    /// A set without passes, of another size, that tells the same facts of the render.
     fn empty(&self, width: usize, height: usize) -> Self {
         Self {
             samples: self.samples,
@@ -256,7 +256,7 @@ impl PassSet {
         part
     }
 
-    /// What `change` makes of every pass, of one new size.
+    /// A set of a new size, in which each pass is what `change` makes of it.
     ///
     /// # Panics
     /// If a result has another size or channel count.
@@ -296,7 +296,7 @@ impl PassSet {
     /// Whether all of these passes are there.
     ///
     /// # Errors
-    /// Some are not: all of those are named, each with its remedy.
+    /// Some are missing; all of them are named, each with its remedy.
     pub fn require_all(&self, passes: impl IntoIterator<Item = Pass>, needed_by: &str) -> Result<()> {
         let missing: Vec<Pass> = passes.into_iter().filter(|pass| self.get(*pass).is_none()).collect();
         if missing.is_empty() { Ok(()) } else { Err(self.missing(missing, needed_by)) }
@@ -336,8 +336,8 @@ impl PassSet {
         self.planes.iter().map(|(p, v)| (*p, v))
     }
 
-    /// Where Blender denoised the render itself, Combined is the result and `Noisy Image` the render:
-    /// makes the render Combined. Returns whether there was one.
+    /// Puts `Noisy Image` in the place of Combined: where Blender denoised the render itself, Combined is the
+    /// result and `Noisy Image` the render. Returns whether there was one.
     pub fn use_noisy_image(&mut self) -> bool {
         match self.planes.remove(&Pass::NoisyImage) {
             Some(noisy) => {
@@ -358,8 +358,8 @@ pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet>
     read(&Frame::read(path)?, view_layer)
 }
 
-/// Reads a file and the passes of the view layer that is to be held against one of that name: see
-/// [`choose_like`].
+/// Reads a file and the passes of the view layer that is to be compared with one of that name in another
+/// file, see [`choose_like`].
 ///
 /// # Errors
 /// The file is unusable, or has no such view layer.

@@ -142,8 +142,8 @@ static ARNOLD: Renderer = Renderer {
     ],
 };
 
-/// V-Ray for 3ds Max and for what names render elements alike. Names: Chaos' documentation, "Render
-/// Elements".
+/// V-Ray for 3ds Max, and for other programs where it names render elements alike. Names: Chaos'
+/// documentation, "Render Elements".
 static VRAY: Renderer = Renderer {
     name: "V-Ray",
     motion: &["VRayVelocity"],
@@ -347,10 +347,10 @@ pub static RENDERERS: [&Renderer; 14] = [
     &LUXCORE, &UNREAL, &MOONRAY,
 ];
 
-/// What depth is called where a channel is called nothing but `Z`.
+/// The name of depth where a channel is called `Z` alone.
 pub const BARE_DEPTH: &str = "Z";
-/// Names that mean something else in other renderers, where they are light: they count in files of their own
-/// renderer.
+/// Names that mean something else in other renderers, where they are light. They count only in files of their
+/// own renderer.
 const AMBIGUOUS: [&str; 1] = ["diffuse"];
 
 impl Renderer {
@@ -364,7 +364,7 @@ impl Renderer {
         std::ptr::eq(self, &BLENDER)
     }
 
-    /// What the renderer calls a pass, the best first; and what any file may.
+    /// The renderer's names of a pass, the preferred one first, and the bare name that any file may use.
     pub fn names(&self, pass: Pass) -> impl Iterator<Item = &'static str> {
         let own = self.row(pass).map_or(&[][..], |row| row.names).iter().copied();
         let bare = match pass {
@@ -375,7 +375,7 @@ impl Renderer {
         own.chain(bare)
     }
 
-    /// How to have the pass in the file, as a sentence part.
+    /// How the renderer is told to write the pass, as a sentence part.
     pub fn setting(&self, pass: Pass) -> String {
         match self.row(pass) {
             Some(row) => row.setting.into(),

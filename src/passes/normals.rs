@@ -1,10 +1,10 @@
-//! Normals of other renderers as Cycles' Denoising Normal has them: camera space, x to the right, y up, z
-//! away from the camera, in -1..1.
+//! Turns normals of other renderers into those of Cycles' Denoising Normal: in camera space, x to the right,
+//! y up, z away from the camera, in -1..1.
 //!
-//! Which way a file has them is found out from the values. What is seen faces the camera: where nearly every
-//! normal points against the ray through its pixel, they are in camera space already. Else they are in world
-//! space, and are turned by the camera's matrix where the file has it (OpenEXR's `worldToCamera`), or by what
-//! is seen: nothing that faces away is.
+//! How a file stores them is found out from the values, since every surface that is seen faces the camera.
+//! Where nearly every normal points against the ray through its pixel, they are in camera space already.
+//! Otherwise they are in world space, and are turned by the camera's matrix where the file has it (OpenEXR's
+//! `worldToCamera`), or else by the viewing direction that the normals of the surfaces face best.
 
 use std::fmt;
 
@@ -33,7 +33,7 @@ pub enum Turn {
     Inwards,
     /// In world space, turned by the camera's matrix.
     ByMatrix,
-    /// In world space, turned by what is seen.
+    /// In world space, turned by the viewing direction that the normals tell.
     BySight,
 }
 
@@ -54,27 +54,28 @@ impl fmt::Display for Change {
     }
 }
 
-/// Lengths of normals that are those of one surface, and not a mixture of several.
+/// Lengths of normals in pixels that show one surface, and not a mixture of several.
 const UNIT: std::ops::Range<f32> = 0.9..1.1;
-/// Share of the pixels that must face the camera to be in its space: some lie on silhouettes and in mirrors.
+/// The share of the normals that must face the camera for them to be in camera space. The others may lie on
+/// silhouettes and in mirrors.
 const FACING: f64 = 0.97;
 /// Half the horizontal field of view of a usual camera, as a tangent: 53 degrees across.
 const HALF_FIELD: f32 = 0.5;
-/// How far a normal may point away from the camera all the same: lenses and interpolated normals differ by as
-/// much.
+/// How far a normal may point away from the camera and still count as facing it, since other lenses and
+/// interpolated normals make as much of a difference.
 const GRAZING: f32 = 0.05;
-/// Share of the surfaces that must be of unit length for a range to be the right one.
+/// The share of the normals that must be of unit length when read as 0..1 for that to be their range.
 const MOST: f64 = 0.5;
 
-/// Makes (3, H, W) normals of any renderer those of Cycles. `world_to_camera` is OpenEXR's attribute of that
-/// name, by rows: vectors are multiplied from the left. Returns what was done; nothing where no normal is
-/// there to tell.
+/// Turns (3, H, W) normals of any renderer into those of Cycles. `world_to_camera` is OpenEXR's attribute of
+/// that name, by rows: vectors are multiplied from the left. Returns what was done; none where no pixel has a
+/// normal to tell by.
 pub fn to_camera_space(normals: &mut Planes, world_to_camera: Option<[f32; 16]>) -> Option<Change> {
     let was_unit_range = is_unit_range(normals);
     if was_unit_range {
         each(normals, |n| {
             let n = n.map(|v| 2.0 * v - 1.0);
-            // Black, as nothing is where nothing is seen.
+            // Pixels that were black, where nothing is seen, stay without a normal.
             if length(n) > 1.5 { [0.0; 3] } else { n }
         });
     }
@@ -127,7 +128,8 @@ fn surfaces(normals: &Planes) -> impl Iterator<Item = Vec3> + '_ {
     all(normals).filter(|n| UNIT.contains(&length(*n)))
 }
 
-/// Whether normals are stored in 0..1, as colours: none is negative, and only so most are of unit length.
+/// Whether normals are stored in 0..1, as colours are: none is negative, and most are of unit length if read
+/// so.
 fn is_unit_range(normals: &Planes) -> bool {
     if normals.data.iter().any(|v| *v < -0.01) {
         return false;
@@ -141,7 +143,7 @@ fn is_unit_range(normals: &Planes) -> bool {
     decoded > of_unit && decoded as f64 > MOST * count as f64
 }
 
-/// How normals in camera space are to be turned; nothing where they are in no camera's.
+/// How normals in camera space are to be turned; none where they are not in camera space.
 fn seen_from(normals: &Planes) -> Option<Turn> {
     let (width, height) = (normals.width, normals.height);
     let (mut away, mut towards, mut count, mut up) = (0usize, 0usize, 0usize, 0.0);
@@ -164,13 +166,13 @@ fn seen_from(normals: &Planes) -> Option<Turn> {
     if is_most(away) {
         return Some(Turn::None);
     }
-    // Floors are seen more than ceilings: up is up unless all is inside out. A frame of nothing but ceiling
-    // is rarer still than normals that point inwards.
+    // Floors are seen more than ceilings, so normals that mostly point down point inwards. A frame of nothing
+    // but ceiling is even rarer than such normals.
     let turn = if up < -0.2 * count as f32 { Turn::Inwards } else { Turn::TowardsCamera };
     is_most(towards).then_some(turn)
 }
 
-/// The rows of the matrix's rotation, each of length one; nothing where it is none.
+/// The rows of the matrix's rotation, each of length one; none where it is not a rotation.
 fn rotation(matrix: [f32; 16]) -> Option<[Vec3; 3]> {
     let rows = [0, 1, 2].map(|i| [0, 1, 2].map(|j| matrix[4 * i + j]));
     let is_row = |row: &Vec3| length(*row).is_finite() && length(*row) > 1e-6;
@@ -179,29 +181,29 @@ fn rotation(matrix: [f32; 16]) -> Option<[Vec3; 3]> {
     is_square.then_some(rows)
 }
 
-/// How far a normal counts that faces a direction: floors seen at a slant tell as much as walls seen straight
-/// on.
+/// The most that a normal that faces a direction counts for it, so that floors seen at a slant tell as much
+/// as walls seen straight on.
 const SLANT: f32 = 0.2;
-/// Directions that are tried for the camera's.
+/// How many directions are tried as the camera's.
 const DIRECTIONS: usize = 2000;
-/// Normals that are looked at.
+/// The most normals that are looked at.
 const SAMPLE: usize = 4096;
 
 /// The camera's axes in the world (right, up, forward), as far as the normals of what it sees tell. Forward
-/// is the direction that most of them face against; up is the world's, y or z, whichever more surfaces lie
-/// flat towards.
+/// is the direction against which most of them face. Up is the y or the z of the world, whichever more
+/// normals point along.
 fn camera_axes(seen: &[Vec3]) -> [Vec3; 3] {
     let sample: Vec<Vec3> = seen.iter().step_by(seen.len().div_ceil(SAMPLE)).copied().collect();
     let facing = |forward: Vec3| sample.iter().map(|n| (-dot(*n, forward)).min(SLANT)).sum::<f32>();
     let mut scored: Vec<(f32, Vec3)> = sphere().map(|forward| (facing(forward), forward)).collect();
-    // Many do equally well where little is seen: the middle of the best.
+    // Many directions do equally well where little is seen, so the mean of the best is taken.
     scored.sort_by(|a, b| b.0.total_cmp(&a.0));
     let best = scored[..20].iter().fold([0.0; 3], |sum, (_, f)| [0, 1, 2].map(|i| sum[i] + f[i]));
     let forward = unit(best);
     let flat = |axis: usize| sample.iter().filter(|n| n[axis] > 0.9).count();
     let mut up = [0.0; 3];
     up[if flat(1) > flat(2) { 1 } else { 2 }] = 1.0;
-    // Straight down or up, any side is right.
+    // For a camera that looks straight down or up, any direction may be its right.
     let side = cross(forward, up);
     let right = if length(side) > 0.05 { unit(side) } else { [1.0, 0.0, 0.0] };
     [right, cross(right, forward), forward]
@@ -282,7 +284,7 @@ mod tests {
         [0, 1, 2].map(|i| (0..3).map(|c| axes[c][i] * n[c]).sum())
     }
 
-    /// The mean angle between what was made of normals and what they are, in degrees.
+    /// The mean angle in degrees between the normals that were found and the true ones.
     fn off(got: &Planes) -> f32 {
         let truth = room();
         let angles = all(got).zip(all(&truth)).map(|(a, b)| dot(a, b).clamp(-1.0, 1.0).acos().to_degrees());

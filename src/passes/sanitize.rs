@@ -49,8 +49,8 @@ fn sanitize_plane(plane: &mut [f32], width: usize, height: usize) -> usize {
     bad.len()
 }
 
-/// Of the 8 neighbours of a value that is infinite, so many must be too for all of them to be bright: all
-/// that lie inside a spot of light or at its edge have as many, chance does not bring as many together.
+/// An infinite value is bright light where at least this many of its 8 neighbours are infinite too. Values
+/// inside a spot of light or at its edge have as many, and chance does not bring as many together.
 const BRIGHT_TOGETHER: usize = 3;
 
 /// What a value that is not finite becomes.

@@ -1,8 +1,8 @@
-//! Axes of the charts: values to pixels, and round ticks.
+//! Axes of the charts: they turn values into pixels, and find round values for ticks.
 
-/// Pixels beyond which a value off the scale is no further away.
+/// Positions are clamped to this many pixels either way, however far off the scale a value is.
 const FAR: f64 = 1e5;
-/// Ticks of a scale over hundreds of decades.
+/// The most ticks of a scale, over hundreds of decades too.
 const MOST_TICKS: usize = 12;
 
 /// Pixels of a panel's plotting area.
@@ -18,7 +18,7 @@ pub struct Area {
     pub bottom: i32,
 }
 
-/// One axis: values to pixels.
+/// One axis, which turns values into pixels.
 pub struct Scale {
     low: f64,
     high: f64,
@@ -55,11 +55,11 @@ impl Scale {
         (from + share * (to - from)).round().clamp(-FAR, FAR) as i32
     }
 
-    /// Round values within the scale, some four to nine of them.
+    /// Round values within the scale, 2 to 12 of them.
     pub fn ticks(&self) -> Vec<f64> {
         let even = |low: f64, high: f64| -> Vec<f64> {
             let step = round_step((high - low) / 6.0);
-            // Numbers so near each other, or to zero, have no round ones between them.
+            // The ends are so near each other, or to zero, that no round value lies between them.
             if !step.is_normal() {
                 return vec![low, high];
             }
@@ -82,7 +82,8 @@ impl Scale {
     }
 }
 
-/// Where a value stands on a scale: the smallest there are stand together, since zero has no logarithm.
+/// Where a value lies on a scale, in decades if it is logarithmic. Zero has no logarithm, so all values below
+/// the smallest normal number lie where that does.
 fn place(value: f64, logarithmic: bool) -> f64 {
     if logarithmic { value.max(f64::MIN_POSITIVE).log10() } else { value }
 }

@@ -1,10 +1,10 @@
-//! `bars_relmse` and `bars_ssim`: every method on every scene, and the means, as in the paper's
-//! figure 10.
+//! `bars_relmse`, `bars_ssim` and `bars_flicker`: every method on every scene, and the means, as in the
+//! paper's figure 10.
 //!
-//! A group of bars is a scene, a bar a method, in one order and colour throughout. RelMSE is on a
-//! logarithmic axis, so the length of a bar there says which is shorter, not by how much; the number
-//! on each bar does. A dot stands over the best of a group; a method that gave nothing on a scene
-//! leaves a cross.
+//! Each group of bars is a scene and each bar a method; methods keep their order and colour throughout.
+//! RelMSE and flicker have a logarithmic axis, so the lengths of bars tell which is shorter, not by how
+//! much; the number on a bar, where there is room for it, tells that. A dot marks the best method of a
+//! group, and a cross a method that has no score on the scene.
 
 use std::{collections::HashMap, ops::Range};
 
@@ -24,7 +24,8 @@ use crate::Result;
 const WIDTH: i32 = 1600;
 /// Left and right ends of the plots.
 const PLOT: (i32, i32) = (74, WIDTH - 16);
-/// Title; a line of the legend; a row of groups, and the part of it that holds bars.
+/// Heights in pixels of the title, of a line of the legend and of a row of groups, and the part of such a row
+/// that holds bars.
 const TITLE: i32 = 52;
 const LEGEND: i32 = 26;
 const ROW: i32 = 330;
@@ -35,7 +36,7 @@ const GAP: f64 = 0.14;
 const NARROWEST: f64 = 10.0;
 /// Bars from this width on carry their value.
 const ROOM_FOR_VALUE: f64 = 12.5;
-/// Scenes beyond these are in the means only.
+/// The most scenes with bars of their own; further ones are in the means only.
 const MOST_SCENES: usize = 60;
 const MEAN_BACKGROUND: RGBColor = RGBColor(243, 243, 246);
 const VALUE: Style = Style::new(11);
@@ -44,14 +45,14 @@ const VALUE: Style = Style::new(11);
 struct Group {
     label: String,
     is_mean: bool,
-    /// By method.
+    /// One value for each method.
     values: Vec<Option<f64>>,
 }
 
 /// One bar chart.
 pub struct Bars {
     title: String,
-    /// Logarithmic axis.
+    /// Whether lower is better; the axis is then logarithmic.
     is_error: bool,
     methods: Vec<(String, RGBColor)>,
     groups: Vec<Group>,
@@ -176,7 +177,7 @@ impl Bars {
         canvas.line(&[(area.left, area.bottom), (end, area.bottom)], INK, 1)
     }
 
-    /// Which bar of a group is the best, where there is something to beat.
+    /// Which bar of a group is the best; none where fewer than two methods have a value.
     fn best(&self, group: &Group) -> Option<usize> {
         let cost = |value: f64| if self.is_error { value } else { -value };
         let scored = group.values.iter().enumerate().filter_map(|(i, v)| Some((i, cost((*v)?))));
@@ -208,7 +209,7 @@ impl Bars {
             };
             let top = scale.at(*value).clamp(area.top, area.bottom);
             canvas.fill([(from, top), (to.max(from + 1), area.bottom)], *colour)?;
-            // Where what stands over the bar ends.
+            // The top of the bar, or of its number where that stands above it.
             let mut above = top;
             if bar >= ROOM_FOR_VALUE {
                 let text = number_label(*value);

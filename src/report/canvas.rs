@@ -13,7 +13,7 @@ use plotters::{
 use super::rows::write_file;
 use crate::{Error, Result};
 
-/// Family under which the font is registered; SVG viewers use their own of this kind.
+/// Family under which the font is registered; SVG viewers use their own font of this family.
 const FAMILY: &str = "sans-serif";
 
 /// Horizontal anchor of a text.
@@ -72,8 +72,8 @@ impl Style {
 /// A surface to draw on, in pixels from the top left.
 pub struct Canvas<'a, B: DrawingBackend> {
     area: &'a DrawingArea<B, Shift>,
-    /// Text of a bitmap, which is drawn last and finer than plotters would; none where it goes to
-    /// the backend (SVG).
+    /// The texts of a bitmap, which are drawn last, and finer than plotters would draw them. None for SVG,
+    /// where plotters' backend gets each text at once.
     deferred: Option<RefCell<Vec<Text>>>,
 }
 
@@ -165,13 +165,13 @@ pub fn draw_on(image: &mut RgbImage, draw: impl FnOnce(&Canvas<BitMapBackend>) -
     texts.iter().try_for_each(|text| blend_text(image, text))
 }
 
-/// Draws a text at several times its size and averages: plotters puts glyphs on whole pixels, which
-/// tears small words apart.
+/// Draws a text at several times its size and averages it down: plotters puts glyphs on whole pixels, which
+/// spaces the letters of small words unevenly.
 fn blend_text(image: &mut RgbImage, text: &Text) -> Result<()> {
     const FINE: u32 = 4;
     let fine = Style { size: text.style.size * FINE, colour: WHITE, ..text.style };
     let (width, height) = fine.measure(&text.text);
-    // Room for what leans over the measured box, capitals above all.
+    // Room for glyphs that reach beyond the measured box, as capitals do.
     let (width, height) = (width as u32 / FINE + 3, (height as u32 / FINE).max(text.style.size) * 3 / 2);
     let mut scratch = RgbImage::new(width * FINE, height * FINE);
     let size = scratch.dimensions();

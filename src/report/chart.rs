@@ -1,7 +1,7 @@
 //! `speed_vs_accuracy`: time against RelMSE and against SSIM, each with its Pareto front.
 //!
-//! A point is a method over the common scenes: geometric means of time and RelMSE, the mean of SSIM.
-//! The noisy input takes no time and stands as a dashed line.
+//! Each point is a method, placed by its geometric means of time and RelMSE, or its mean SSIM, over the
+//! common scenes. The noisy input takes no time and is a dashed line.
 
 use plotters::prelude::*;
 
@@ -37,7 +37,8 @@ struct Point {
 struct Panel {
     title: &'static str,
     axis: &'static str,
-    /// Vertical axis logarithmic, and lower is better; otherwise linear, and higher is better.
+    /// Whether the vertical axis is logarithmic and lower is better; otherwise it is linear and higher is
+    /// better.
     is_error: bool,
     points: Vec<Point>,
     noisy: Option<f64>,
@@ -118,7 +119,7 @@ impl Panel {
         Self { title, axis, is_error, points: points.collect(), noisy }
     }
 
-    /// Points that no other one beats in time and score, fastest first.
+    /// The points to which no other is superior in both time and score, fastest first.
     fn front(&self) -> Vec<&Point> {
         let mut sorted: Vec<&Point> = self.points.iter().collect();
         let cost = |p: &Point| if self.is_error { p.score } else { -p.score };
@@ -145,7 +146,8 @@ impl Panel {
         let x = Scale::new(self.points.iter().map(|p| p.time), true, (left, right));
         let scores = self.points.iter().map(|p| p.score);
         let y = Scale::new(scores.clone(), self.is_error, (bottom, top));
-        // The noisy input sets the scale only where that leaves the methods their room.
+        // The scale takes in the noisy input only where it then covers less than 1.4 times as much, which
+        // leaves room to tell the methods apart.
         let with_noisy = Scale::new(scores.chain(self.noisy), self.is_error, (bottom, top));
         let y = if with_noisy.span() < 1.4 * y.span() { with_noisy } else { y };
         self.draw_axes(canvas, area, &x, &y)?;
@@ -180,7 +182,7 @@ impl Panel {
         canvas.vertical_text(self.axis, (left - 74, (top + bottom) / 2), Style::new(15))
     }
 
-    /// The dashed line of the input, and what it covers.
+    /// Draws the dashed line of the noisy input and its text; returns the boxes that they cover.
     fn draw_noisy<B: DrawingBackend>(
         &self,
         canvas: &Canvas<B>,
@@ -189,7 +191,7 @@ impl Panel {
     ) -> Result<Vec<Rect>> {
         let Some(noisy) = self.noisy else { return Ok(Vec::new()) };
         let inside = top + 3 < y.at(noisy) && y.at(noisy) < bottom - 3;
-        // Off the scale, the line stands at the edge beyond which it lies.
+        // Where the value is off the scale, the line is drawn at the edge beyond which it lies.
         let at = y.at(noisy).clamp(top + 3, bottom - 3);
         canvas.dashes((left, right), at, NOISY_LINE, 2)?;
         let text =
@@ -202,7 +204,7 @@ impl Panel {
         Ok(vec![Rect::around((text_at.0 - w / 2, text_at.1), w + 8, h + 6), line])
     }
 
-    /// The Pareto front as steps, and what they cover.
+    /// Draws the Pareto front as steps; returns the boxes that they cover.
     fn draw_front<B: DrawingBackend>(
         &self,
         canvas: &Canvas<B>,
@@ -210,7 +212,7 @@ impl Panel {
         x: &Scale,
         y: &Scale,
     ) -> Result<Vec<Rect>> {
-        // Between two points of the front, the faster one is the best to be had for the time.
+        // For any time between two points of the front, the faster one has the best score.
         let front: Vec<(i32, i32)> = self.front().iter().map(|p| (x.at(p.time), y.at(p.score))).collect();
         let steps: Vec<(i32, i32)> = front
             .windows(2)

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::Result;
 
-/// Something to draw, whatever is drawn on.
+/// Something that can be drawn on a bitmap and as SVG alike.
 pub trait Figure {
     /// Its width and height in pixels.
     fn size(&self) -> (u32, u32);

@@ -1,5 +1,5 @@
-//! Frames of a test set that are followed by others of their sequence: what methods made of them is kept
-//! until those are scored.
+//! Flicker is measured between two frames of a sequence. So where another frame of the test set follows one,
+//! the methods' results on the first are kept until the second is scored.
 
 use std::{collections::HashMap, path::Path};
 
@@ -16,17 +16,17 @@ use crate::{
     testset::Pair,
 };
 
-/// A frame and what methods made of it.
+/// A frame that another follows, and the methods' results on it.
 pub struct Before<'a> {
     pair: &'a Pair,
     view_layer: Option<&'a str>,
     reference: Option<Planes>,
     images: HashMap<String, Planes>,
-    /// The pair, where a result had to be made anew.
+    /// The frame's files as read, where a result had to be made anew.
     loaded: Option<Loaded>,
 }
 
-/// The frames that are followed, by their noisy files.
+/// The frames that another follows and whose results are kept, by their noisy files.
 pub struct Followed<'a> {
     pairs: &'a [Pair],
     view_layer: Option<&'a str>,
@@ -34,12 +34,12 @@ pub struct Followed<'a> {
 }
 
 impl<'a> Followed<'a> {
-    /// Of a test set, in the order of its pairs.
+    /// For the pairs of a test set; no results are kept yet.
     pub fn new(pairs: &'a [Pair], view_layer: Option<&'a str>) -> Self {
         Self { pairs, view_layer, held: HashMap::new() }
     }
 
-    /// Keeps what a method made of a frame, if another follows it.
+    /// Keeps a method's result on a frame, if another frame follows it.
     pub fn keep(&mut self, pair: &Pair, reference: &Planes, method: &str, image: &Planes) {
         let Some(own) = self.pairs.iter().find(|other| *other == pair) else { return };
         if !self.pairs.iter().any(|other| is_next(other, pair)) {
@@ -51,14 +51,15 @@ impl<'a> Followed<'a> {
         held.images.insert(method.into(), image.clone());
     }
 
-    /// The frame before one, where the test set has it; it is asked for once.
+    /// The frame before that of `pair`, where the test set has it. Ask once for each pair: the results that
+    /// were kept are given away.
     pub fn before(&mut self, pair: &Pair) -> Option<Before<'a>> {
         let before = self.pairs.iter().find(|other| is_next(pair, other))?;
         Some(self.held.remove(before.noisy.as_path()).unwrap_or_else(|| Before::new(before, self.view_layer)))
     }
 }
 
-/// Whether a pair is the frame after another, at the same sample count.
+/// Whether `pair` is the frame right after `before` in the same scene, at the same sample count.
 pub fn is_next(pair: &Pair, before: &Pair) -> bool {
     let is_same = (&pair.scene, pair.spp) == (&before.scene, before.spp);
     is_same && follows(&pair.noisy, &before.noisy)
@@ -69,11 +70,12 @@ impl<'a> Before<'a> {
         Self { pair, view_layer, reference: None, images: HashMap::new(), loaded: None }
     }
 
-    /// The flicker of a method from this frame to the next, of which `image` is its result; none where no
-    /// pixel can be followed.
+    /// The flicker of a method from this frame to `next`, on which its result is `image`; none where no pixel
+    /// can be followed.
     ///
     /// # Errors
-    /// Says why there is none.
+    /// Why it cannot be measured: `next` has no vectors, this frame cannot be read or denoised, or it is of
+    /// another size.
     pub fn flicker(
         &mut self,
         method: &Contender,
@@ -97,7 +99,7 @@ impl<'a> Before<'a> {
         Ok(flicker(&flicker::Pair { images, references, vectors }))
     }
 
-    /// Runs a method whose row of this frame was kept from an earlier run.
+    /// Runs a method on this frame, since its row was kept from an earlier run and its image was not.
     fn make(&mut self, method: &Contender) -> Result<(), String> {
         let lost = |why: &dyn std::fmt::Display| format!("of the frame before: {why}");
         if self.loaded.is_none() {

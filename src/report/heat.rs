@@ -1,8 +1,8 @@
-//! A heat map: what each method makes of each case, as a ratio to something.
+//! A heat map: the ratio of each method's error on each case to another error, which the title names.
 //!
-//! A row is a case, a column a method, once for each group of columns (a sample count). Blue is below one,
-//! red above, on a logarithmic scale that is full at a factor of ten; each cell has its number. A frame marks
-//! what is out of bounds; a case that a method has no number for has a cross.
+//! Each row is a case and each column a method; the methods are repeated for each group of columns (a sample
+//! count). Blue is below one and red above, on a logarithmic scale whose ends are a tenth and ten; each cell
+//! has its number. A frame marks a cell that is out of bounds, and a cross one that has no number.
 
 use plotters::prelude::*;
 
@@ -23,7 +23,7 @@ const TITLE: i32 = 52;
 const GROUP: i32 = 24;
 const LABEL: Style = Style::new(13);
 const VALUE: Style = Style::new(11);
-/// The ratio at which a colour is full.
+/// The ratio at the red end of the scale; the blue end is its inverse.
 const FULL: f64 = 10.0;
 /// Ratios whose colour is light enough for dark numbers.
 const LIGHT: std::ops::RangeInclusive<f64> = 0.22..=4.5;
@@ -46,7 +46,7 @@ pub struct HeatMap {
     pub title: String,
     /// The methods, in the order of columns.
     pub methods: Vec<String>,
-    /// Names of the groups of columns; one without a name where there is nothing to part.
+    /// Names of the groups of columns; a single group may have an empty name.
     pub groups: Vec<String>,
     /// Each case with its cells, group by group, method by method.
     pub rows: Vec<(String, Vec<HeatCell>)>,
@@ -129,7 +129,7 @@ impl Figure for HeatMap {
                 }
             }
         }
-        // As lines: rectangles have no width in SVG.
+        // As lines, since plotters gives rectangles no stroke width in SVG.
         frames.into_iter().try_for_each(|corners| canvas.line(&corners, INK, 2))
     }
 }

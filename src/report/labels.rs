@@ -1,4 +1,4 @@
-//! Places for the names of points: beside each point, over nothing else.
+//! Finds places for the names of points: near each point, and where possible over nothing else.
 
 use super::{axis::Area, canvas::Style};
 
@@ -55,9 +55,9 @@ impl Rect {
     }
 }
 
-/// A box for each of `names`, the names of the points `places`, inside `area`: the nearest of some
-/// rings of places around the point that overlaps nothing `taken` and no other label, or the one that
-/// overlaps least; where it can, nearer to its own point than to any other.
+/// A box inside `area` for each of `names`, which belong to the points at `places`. Candidates lie on rings
+/// around the point. The one is taken that overlaps `taken` and the labels before it least; among equals
+/// one to which its own point is the nearest, and then the one on the smallest ring.
 pub fn place(
     places: &[(i32, i32)],
     names: &[&str],

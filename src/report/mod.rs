@@ -3,9 +3,9 @@
 //! In: pairs and methods. Out, in one folder: `scores.csv` (a row for each pair and method),
 //! `summary.csv`, the charts `speed_vs_accuracy`, `bars_relmse` and `bars_ssim` as PNG and SVG,
 //! `bars_flicker` and slices of sequences, `error_over_samples` where scenes were rendered at several sample
-//! counts, `sheets/<pair>.png`, and `report.html`, which shows it all. Rows are stored as they finish; those
-//! of earlier runs into the folder stay in `scores.csv` as long as they hold, and are not run again. All else
-//! shows what this run asked for.
+//! counts, `sheets/<pair>.png`, and `report.html`, which shows it all. Each row is stored as soon as it is
+//! finished. Rows of earlier runs into the folder stay in `scores.csv` as long as they hold, and are not
+//! measured again. All other files show only what this run asked for.
 
 mod axis;
 mod bars;
@@ -54,11 +54,11 @@ pub type MemoryProbe = Box<dyn Fn(&Path) -> Option<f64> + Send + Sync>;
 pub struct Contender {
     /// Its name in tables and charts, unique in a run.
     pub name: String,
-    /// What runs.
+    /// The method itself.
     pub denoiser: Box<dyn Denoiser>,
     /// Memory in MiB that it takes for the frame in a file, at its peak; none where that is not known.
     pub peak_mib: MemoryProbe,
-    /// Changes whenever the method might give other results: finished rows are kept while it stays.
+    /// Differs whenever the method might give other results; finished rows are kept while it is the same.
     pub stamp: String,
 }
 
@@ -67,7 +67,7 @@ pub struct Contender {
 pub struct EvalOptions {
     /// Folder for everything that is written.
     pub out: PathBuf,
-    /// Timed runs of each method and pair, each after one that warms up; their median counts.
+    /// Timed runs of each method on each pair, each after a run that warms up; their median is reported.
     pub repeats: usize,
     /// Threads that all methods use.
     pub threads: usize,

@@ -23,7 +23,8 @@ pub fn is_own(name: &str) -> bool {
     family(name) == Family::Own
 }
 
-/// The family of a method by its name; weights files are ours.
+/// The family of a method by its name. A name that is not in the catalogue is a weights file and counts as
+/// own.
 fn family(name: &str) -> Family {
     catalogue::find(name).map_or(Family::Own, |method| method.family)
 }
@@ -48,7 +49,7 @@ pub fn colours<S: AsRef<str>>(names: &[S]) -> Vec<RGBColor> {
         if family == Family::Noisy || members == 1 {
             return hue(family);
         }
-        // From 40 % towards white to 35 % towards black.
+        // The first is mixed with 40 % of white, the last with 35 % of black.
         let place = 0.4 - 0.75 * rank as f64 / (members - 1) as f64;
         let target = if place > 0.0 { RGBColor(255, 255, 255) } else { RGBColor(0, 0, 0) };
         mix(hue(family), target, place.abs())

@@ -13,12 +13,12 @@ use crate::{Error, Result};
 
 /// Widths in pixels and JPEG qualities, best first.
 const SIZES: [(u32, u8); 5] = [(1800, 80), (1600, 70), (1400, 65), (1200, 60), (900, 55)];
-/// Bytes for all sheets of a page and for one; base64 adds a third.
+/// The most bytes of JPEG for all sheets of a page, and for one sheet; base64 adds a third.
 const ALL: usize = 3_300_000;
 const ONE: usize = 450_000;
-/// Width and quality of one of many.
+/// Width in pixels and JPEG quality of a picture made by [`small`].
 const SMALL: (u32, u8) = (600, 80);
-/// However many there are, a sheet this small still shows something.
+/// Each sheet may have this many bytes, however many sheets there are: smaller, it would show nothing.
 const LEAST: usize = 60_000;
 
 /// An image inside the page.
@@ -39,7 +39,8 @@ pub fn embed(path: &Path, count: usize) -> Result<Picture> {
     let (mut jpeg, mut size) = (Vec::new(), (0, 0));
     let mut last = None;
     for (at, (width, quality)) in SIZES.into_iter().enumerate() {
-        // Bytes go about with the pixels to the power 0.8 and with the quality: skip what cannot fit.
+        // Bytes grow roughly as the number of pixels to the power 0.8, times the quality. Sizes that cannot
+        // fit are skipped.
         let hopeless = last.is_some_and(|(bytes, w, q): (usize, u32, u8)| {
             let fewer = (f64::from(width) / f64::from(w)).powf(1.6) * f64::from(quality) / f64::from(q);
             bytes as f64 * fewer > 1.2 * budget as f64
@@ -61,7 +62,7 @@ pub fn embed(path: &Path, count: usize) -> Result<Picture> {
     Ok(Picture { address: address(&jpeg), size })
 }
 
-/// One of many small pictures, as wide as half a page at most.
+/// The picture in `path`, shrunk to at most half the width of a page.
 ///
 /// # Errors
 /// The file is unreadable.

@@ -27,8 +27,8 @@ pub struct Provenance {
     pub cpu: String,
     /// Logical processors that the process may use.
     pub cores: usize,
-    /// Instructions that the kernels use, AVX-512, AVX2 or portable, and what networks round their factors
-    /// to.
+    /// Instructions that the kernels use (such as AVX-512, AVX2 or portable code), and the precision to which
+    /// networks round the factors of their convolutions.
     pub instructions: String,
     /// Operating system and architecture.
     pub system: String,
@@ -37,7 +37,7 @@ pub struct Provenance {
 }
 
 impl Provenance {
-    /// Of this process, now.
+    /// The provenance of what this process makes from now on.
     pub fn now() -> Self {
         let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs());
         Self {

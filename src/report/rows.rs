@@ -43,7 +43,7 @@ pub const COLUMNS: [&str; 24] = [
 /// What one method scored on one pair. A number that could not be measured is none; `reason` says why.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 pub struct Row {
-    /// Scene, with the frame of a sequence.
+    /// Scene, and the frame where it belongs to a sequence.
     pub scene: String,
     /// Method.
     pub model: String,
@@ -73,10 +73,10 @@ pub struct Row {
     pub smape: Option<f64>,
     /// See [`crate::metrics`].
     pub flip: Option<f64>,
-    /// See [`crate::metrics::flicker`]; none for a frame that no other frame of the test set comes before.
+    /// See [`crate::metrics::flicker`]; none where the test set does not hold the frame before this one.
     #[serde(default)]
     pub flicker: Option<f64>,
-    /// Memory that the first run added at its peak.
+    /// Memory in MiB that denoising added at its peak.
     pub peak_mib: Option<f64>,
     /// Threads used.
     pub threads: usize,
@@ -90,13 +90,13 @@ pub struct Row {
     pub reference: PathBuf,
     /// Why the method failed here, so that it is tried again; empty where all is well.
     pub reason: String,
-    /// What else a reader should know: why a score is not defined, what the method said of the frame. Of the
-    /// pair itself that is in the row of `noisy`.
+    /// What else a reader should know, such as why a score is not defined, or what the method said of the
+    /// frame. Notes on the pair itself are in the row of `noisy`.
     #[serde(default)]
     pub note: String,
 }
 
-/// What makes a row the same row in another run.
+/// What identifies a row, in other runs too: the noisy file, the reference file and the method.
 pub type Key = (PathBuf, PathBuf, String);
 
 impl Row {
@@ -112,8 +112,8 @@ impl Row {
         }
     }
 
-    /// The row as it was read, but a number that is none made empty and given as the reason, so that it is
-    /// measured again.
+    /// The row as it was read, without numbers that are not finite. If there was one, `reason` tells so, and
+    /// the row is measured again.
     fn checked(mut self) -> Self {
         let numbers = [
             &mut self.relmse,
@@ -242,7 +242,7 @@ pub fn append_row(path: &Path, cells: &[String]) -> Result<()> {
 /// short is left out.
 ///
 /// # Errors
-/// The file is unreadable or no such table.
+/// The file is unreadable or not such a table.
 pub fn read_rows(path: &Path) -> Result<Vec<Row>> {
     let mut text = match fs::read_to_string(path) {
         Ok(text) => text,
@@ -285,7 +285,7 @@ impl Table {
         Ok(())
     }
 
-    /// Rewrites the table in the order of `keys`, the other rows last, and gives the rows that were asked
+    /// Rewrites the table in the order of `keys`, the other rows last, and returns the rows that were asked
     /// for.
     pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
         let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();

@@ -1,8 +1,8 @@
 //! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
 //!
-//! On a pair each method runs first to be scored, then all take turns for the timed runs, each right after
-//! one of its own that is not timed: a machine that slows down slows them all. Memory is measured apart, once
-//! for each method and size of frame.
+//! On a pair, each method first runs once to be scored. Then the methods take turns for the timed runs, so
+//! that a machine that slows down slows them all, and each timed run follows an untimed one of the same
+//! method. Memory is measured apart, once for each method and size of frame.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -106,7 +106,8 @@ pub fn evaluate(
     now.sheets = before.sheets;
     for (pair, sheet) in pairs.iter().zip(&sheet_names) {
         let is_finished = methods.iter().all(|m| table.get(&Row::new(pair, &m.name).key()).is_some());
-        // Known again when it is drawn: a run that is killed before leaves no sheet of other rows.
+        // It is noted again when it is drawn. If this run is killed before that, the old sheet is not taken
+        // for one of the new rows.
         if !is_finished || now.sheets.get(sheet) != Some(&shows(pair)) {
             now.sheets.remove(sheet);
         }
@@ -206,14 +207,14 @@ struct Scene {
 
 /// The decoded pair.
 pub struct Loaded {
-    /// What methods are given, without half buffers.
+    /// What methods are given; its half buffers are not read yet.
     pub shot: Shot,
     /// The reference's radiance, of the same size.
     pub reference: Planes,
 }
 
 impl Loaded {
-    /// The render as stored: what `noisy` is judged by.
+    /// The render as it is stored in the file, which is scored as the method `noisy`.
     pub fn noisy(&self) -> &Planes {
         self.shot.as_stored().expect("a pair without Combined is not loaded")
     }
@@ -229,8 +230,8 @@ impl Loaded {
     }
 }
 
-/// Reads a pair of frames: of the noisy one the view layer named or the one with the most passes, of the
-/// reference its namesake.
+/// Reads a pair of frames. Of the noisy one it reads the named view layer, or by default the one with the
+/// most passes, and of the reference the view layer that corresponds to it, see [`passes::load_like`].
 ///
 /// # Errors
 /// A file is unusable or lacks Combined, or they do not hold the same pixels.
@@ -280,7 +281,7 @@ fn run_pair(
         }
     };
     let (width, height) = (loaded.noisy().width, loaded.noisy().height);
-    // Half buffers that are unusable fail those methods alone that read them.
+    // If half buffers are unusable, only the methods that read them fail.
     let halves = if methods.iter().any(|method| method.denoiser.reads_halves()) {
         attempt(&pair.noisy, || loaded.shot.read_halves()).map_err(|error| error.to_string())
     } else {
@@ -358,8 +359,9 @@ fn run_pair(
     }
 }
 
-/// A run, right after one that does not count: cores that have waited for another process are slow for some
-/// 20 ms (twice as slow in a virtual machine), which must not be put down to whichever method comes next.
+/// A timed run, right after an untimed one unless the method needs none. Cores that have waited for another
+/// process are slow for some 20 ms (twice as slow in a virtual machine), and that must not count against the
+/// method that comes next.
 fn timed_run(denoiser: &dyn Denoiser, shot: &Shot) -> Result<Run> {
     if !denoiser.is_warm() {
         denoiser.denoise(shot)?;

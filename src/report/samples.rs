@@ -1,8 +1,8 @@
 //! `error_over_samples`: RelMSE and SSIM over samples per pixel, a line for each method.
 //!
-//! Over the scenes that all methods scored at every sample count, so that a line falls for its samples and
-//! not for its scenes: geometric means of RelMSE, means of SSIM. A method that rises above the line of the
-//! input makes frames worse.
+//! Points are geometric means of RelMSE and means of SSIM over the scenes that all methods scored at every
+//! sample count, so that only the samples change along a line. A method whose RelMSE is above the noisy
+//! input's makes frames worse.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -41,7 +41,8 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// Of all rows; none where no scene was scored at several sample counts.
+    /// From all rows; none where there is only one sample count, or no scene that all methods scored at every
+    /// count.
     pub fn new(rows: &[Row], methods: &[String]) -> Option<Self> {
         type Scores = Vec<(f64, f64)>;
         let mut scored: BTreeMap<(&str, u32, &str), Scores> = BTreeMap::new();
@@ -51,7 +52,7 @@ impl Samples {
             }
         }
         let counts: Vec<u32> = rows.iter().map(|row| row.spp).collect::<BTreeSet<_>>().into_iter().collect();
-        // Methods without any score limit nobody.
+        // Methods without any score do not limit the scenes.
         let methods: Vec<&str> = methods.iter().map(String::as_str).collect();
         let drawn: Vec<&str> =
             methods.iter().copied().filter(|m| scored.keys().any(|(_, _, model)| model == m)).collect();
@@ -63,7 +64,7 @@ impl Samples {
             return None;
         }
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        // Seeds of a scene first, so that a scene with many weighs no more.
+        // The seeds of a scene are averaged first, so that a scene with many seeds weighs no more.
         let over_scenes = |spp: u32, model: &str, score: fn(&(f64, f64)) -> f64| -> Vec<f64> {
             let of_scene =
                 |scene: &&str| -> Vec<f64> { scored[&(*scene, spp, model)].iter().map(score).collect() };

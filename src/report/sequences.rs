@@ -1,8 +1,8 @@
-//! Sequences of a test set: every frame as each method shows it, to step through, and slices through time.
+//! Sequences of a test set: each method's result on every frame, to step through, and slices through time.
 //!
-//! A slice is one row of all frames, one below the other: what moves makes slanted lines, what is still
-//! upright ones, and what flickers breaks them up. In: what sheets show. Out: `frames/<pair>/<method>.png`,
-//! and `slices/<scene>_<spp>spp.png`.
+//! A slice is the same row of pixels of all frames, one below the other. Things that move make slanted lines
+//! in it, things that stand still vertical lines, and flicker breaks the lines up. In: the images of sheets.
+//! Out: `frames/<pair>/<method>.png`, and `slices/<scene>_<spp>spp.png`.
 
 use std::path::{Path, PathBuf};
 
@@ -20,9 +20,9 @@ use crate::{Result, frame::prepare_folder, planes::Planes, testset::Pair};
 
 /// Name of the reference among the methods.
 const REFERENCE: &str = "reference";
-/// Pixels that a row is enlarged to, downwards.
+/// Height in pixels of a frame's row in a slice.
 const ROW: u32 = 10;
-/// Height of a strip's name.
+/// Height in pixels of a method's name in a slice.
 const NAME: u32 = 22;
 /// Bytes that all frames to step through may take in a page.
 const MOST_BYTES: usize = 6_000_000;
@@ -49,13 +49,13 @@ pub fn sequences(pairs: &[Pair]) -> Vec<Sequence<'_>> {
     found
 }
 
-/// Where the frame of a pair lies as a method shows it.
+/// The file that shows a method's result on the frame of a pair.
 fn file(out: &Path, pair: &Pair, method: &str) -> PathBuf {
     let safe = |name: &str| name.replace(['/', '\\', ':'], "_");
     out.join("frames").join(safe(&pair.id())).join(format!("{}.png", safe(method)))
 }
 
-/// Keeps what a sheet shows of a frame.
+/// Stores each method's result on a frame, as its sheet shows it, and the reference.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -79,13 +79,14 @@ impl Sequence<'_> {
         format!("{}, {} samples per pixel", self.first().scene, self.first().spp)
     }
 
-    /// Those of the methods of which all frames were kept, the reference last.
+    /// Those of the methods whose results on all frames are stored, and the reference last.
     fn shown<'m>(&self, out: &Path, methods: &'m [String]) -> Vec<&'m str> {
         let names = methods.iter().map(String::as_str).chain([REFERENCE]);
         names.filter(|name| self.pairs.iter().all(|pair| file(out, pair, name).is_file())).collect()
     }
 
-    /// Writes the slice through the middle row; returns its path, or none where no frames were kept.
+    /// Writes the slice through the middle row; returns its path, or none where no frames are stored or their
+    /// sizes differ.
     fn slice(&self, out: &Path, methods: &[&str]) -> Result<Option<PathBuf>> {
         let mut strips = Vec::new();
         for method in methods {
@@ -170,7 +171,7 @@ pub fn section(out: &Path, pairs: &[Pair], methods: &[String]) -> Result<Option<
 
 /// Two methods side by side, and a slider over the frames.
 fn stepper(frames: &[(usize, &str, String)], methods: &[&str], count: usize) -> Markup {
-    // What one looks at first: the noisiest beside the best that is not the reference.
+    // Shown at first: the first method, which is usually `noisy`, beside the last one before the reference.
     let chosen = [0, methods.len().saturating_sub(2)];
     html! {
         div.stepper {

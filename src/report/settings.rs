@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{Result, denoise, shot, testset::Pair};
 
-/// The settings of a run, and stamps of what it read. Fields of other versions are passed over.
+/// The settings of a run, and stamps of what it read. Fields that only other versions write are ignored.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     provenance: Provenance,
@@ -32,7 +32,7 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// Those of a run about to start.
+    /// The settings of a run that is about to start.
     pub fn of(pairs: &[Pair], methods: &[Contender], options: &EvalOptions, provenance: &Provenance) -> Self {
         Self {
             provenance: provenance.clone(),
@@ -48,7 +48,7 @@ impl Settings {
         }
     }
 
-    /// Those stored in `path`; the default, with which nothing agrees, where there are none.
+    /// The settings stored in `path`; where there are none, the default, under which no row holds.
     pub fn read(path: &Path) -> Self {
         fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default()
     }
@@ -59,9 +59,10 @@ impl Settings {
         write_file(path, (text + "\n").as_bytes())
     }
 
-    /// Whether `row`, made with the settings `self`, would come out the same with `now`. What the stamp of a
-    /// method that `now` does not have would be is not known, unless it came with the program, as `noisy`
-    /// does.
+    /// Whether `row`, which was made with the settings `self`, would come out the same with `now`. Where
+    /// `now` does not ask for the row's method, its stamp of today is not known and it counts as unchanged.
+    /// But if its old stamp was the program's, which is that of `noisy`, the program's stamp of today is
+    /// compared.
     pub fn still_holds(&self, row: &Row, now: &Self) -> bool {
         let pair = self.pairs.get(&name(&row.noisy, &row.reference));
         let (before, after) = (&self.provenance, &now.provenance);
@@ -80,7 +81,7 @@ impl Settings {
             && pair == Some(&pair_stamp(&row.noisy, &row.reference))
     }
 
-    /// Takes over from `before` what a row is known by that this run does not ask for.
+    /// Takes over from `before` the stamps of a row that this run does not ask for.
     pub fn keep(&mut self, row: &Row, before: &Self) {
         let pair = name(&row.noisy, &row.reference);
         for (own, other, key) in
@@ -93,18 +94,18 @@ impl Settings {
     }
 }
 
-/// The most frames around one that a method makes use of.
+/// The most frames before a frame, and after it, that any method makes use of.
 pub const REACH: usize = 8;
 
-/// What `run.json` knows a pair by.
+/// The name of a pair in `run.json`.
 pub fn name(noisy: &Path, reference: &Path) -> String {
     format!("{} {}", noisy.display(), reference.display())
 }
 
-/// Of all files that a row of a pair may depend on.
+/// The stamp of all files that a row of a pair may depend on.
 fn pair_stamp(noisy: &Path, reference: &Path) -> String {
     let halves = shot::half_paths(noisy).into_iter().flatten();
-    // Of a frame of a sequence, those around it.
+    // For a frame of a sequence, the frames around it.
     let around = [noisy, reference].map(|file| denoise::neighbours(file, REACH)).into_iter().flatten();
     let files =
         [noisy.into(), reference.into()].into_iter().chain(halves).chain(around.map(|(_, file)| file));

@@ -21,7 +21,7 @@ use crate::{
     testset::Pair,
 };
 
-/// Columns in a band; more go below.
+/// Columns side by side; further ones go into another band below.
 const BAND: usize = 7;
 /// Width of a cell in pixels.
 const CELL: u32 = 300;
@@ -31,10 +31,10 @@ const GAP: u32 = 6;
 const TITLE: u32 = 44;
 const NAME: u32 = 26;
 const SCORES: u32 = 66;
-/// Details shown, each a sixth of the frame's sides.
+/// The number of details, each a sixth as wide and as high as the frame.
 const DETAILS: usize = 3;
 const DETAIL_SHARE: usize = 6;
-/// Frames of the details, here and in the whole image.
+/// Colours of the outlines around the details, in the whole image too.
 const DETAIL_COLOURS: [RGBColor; DETAILS] =
     [RGBColor(255, 190, 0), RGBColor(0, 200, 230), RGBColor(255, 90, 180)];
 /// Relative squared error of a pixel at the dark and the bright end of the error maps.
@@ -51,7 +51,7 @@ const ERROR_COLOURS: [[u8; 3]; 9] = [
     [249, 201, 50],
     [252, 255, 164],
 ];
-/// What lies between pictures, and text on it.
+/// Colours of what lies between pictures, and of text on it.
 pub const BACKGROUND: Rgb<u8> = Rgb([24, 24, 27]);
 pub const TEXT: RGBColor = RGBColor(235, 235, 235);
 const FAINT: RGBColor = RGBColor(165, 165, 170);
@@ -86,7 +86,7 @@ impl Shown {
     }
 }
 
-/// `image` at the exposure of the reference; at its own radiance where that is black.
+/// `image` at the display exposure of the reference, or without any where the reference is black.
 fn display_image(image: &Planes, reference: &Planes) -> RgbImage {
     let exposure = display::exposure(reference).unwrap_or(1.0);
     let n = image.pixels();
@@ -114,12 +114,12 @@ impl Detail {
     }
 }
 
-/// Up to three details, apart from each other, where the methods' errors differ most. The noisy input
-/// counts only where there is but one method beside it.
+/// Up to three details, apart from each other, where the methods' errors differ most. The noisy input counts
+/// as a method only where there are fewer than two others, or where these agree everywhere.
 fn details(images: &[Shown], width: usize, height: usize) -> Vec<Detail> {
     let methods: Vec<&Shown> = images.iter().filter(|i| i.name != NOISY).collect();
     let compared: Vec<&Shown> = if methods.len() < 2 { images.iter().collect() } else { methods };
-    // Methods that agree everywhere say nothing about each other: then the input counts too.
+    // Where the methods agree everywhere, they are compared with the input.
     let differ = compared.windows(2).any(|pair| pair[0].errors != pair[1].errors);
     let compared: Vec<&Shown> = if differ { compared } else { images.iter().collect() };
     let (w, h) = ((width / DETAIL_SHARE).max(16).min(width), (height / DETAIL_SHARE).max(9).min(height));
@@ -131,7 +131,7 @@ fn details(images: &[Shown], width: usize, height: usize) -> Vec<Detail> {
         .flat_map(|y| steps(width, w).map(move |x| Detail { x, y, width: w, height: h }))
         .map(|detail| {
             let means = compared.iter().map(|image| {
-                // Capped, so that a firefly does not draw the eye of every sheet to one spot.
+                // Errors are capped, so that a firefly does not draw the details of every sheet to itself.
                 let rows = (detail.y..detail.y + h).map(|y| &image.errors[y * width + detail.x..][..w]);
                 rows.flatten().map(|e| e.min(1.0)).sum::<f64>() / (w * h) as f64
             });
@@ -160,7 +160,7 @@ fn error_colour(error: f64) -> Rgb<u8> {
     Rgb([0, 1, 2].map(|c| (f64::from(a[c]) + (f64::from(b[c]) - f64::from(a[c])) * fraction).round() as u8))
 }
 
-/// Scales to a cell: blocks of pixels where it grows, averages where it shrinks.
+/// Scales an image to a cell: a small one by repeating pixels, a large one by averaging.
 fn to_cell(image: &RgbImage, width: u32, height: u32) -> RgbImage {
     let filter =
         if image.width() < width { imageops::FilterType::Nearest } else { imageops::FilterType::Triangle };
@@ -279,7 +279,7 @@ pub fn write(
     write_png(path, &sheet)
 }
 
-/// A time for a reader.
+/// A time in milliseconds, or in seconds from ten on.
 fn duration(seconds: f64) -> String {
     if seconds < 10.0 { format!("{:.0} ms", seconds * 1e3) } else { format!("{seconds:.1} s") }
 }

@@ -51,7 +51,8 @@ pub struct MethodSummary {
     pub model: String,
     /// Samples per pixel of the rows summarised; none for all of them.
     pub spp: Option<u32>,
-    /// Pairs that every method scored, over which the statistics run.
+    /// Pairs that the statistics are taken over: those that this method and every other but the noisy input
+    /// scored.
     pub scenes: usize,
     /// Pairs on which this method failed.
     pub failed: usize,
@@ -71,8 +72,8 @@ impl MethodSummary {
     }
 }
 
-/// Every method in `models` over the pairs that all of them scored: first over all sample counts,
-/// then, where there are several, for each. A method that scored nowhere does not limit the others.
+/// Every method in `models` over the pairs that all of them but the noisy input scored: first over all sample
+/// counts, then, where there are several, for each. A method that scored nowhere does not limit the others.
 pub fn summarise(rows: &[Row], models: &[String], baseline: &str) -> Vec<MethodSummary> {
     let counts: BTreeSet<u32> = rows.iter().map(|r| r.spp).collect();
     let mut summaries = over(rows.iter().collect(), models, baseline, None);
@@ -100,7 +101,7 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
     }
     let mut scoring = by_model.clone();
     scoring.retain(|_, of| of.values().any(|r| r.is_valid()));
-    // What spoils the input, a NaN say, takes no scene from the methods that repair it.
+    // A scene whose input has no score, because of a NaN say, still counts for methods that repair it.
     if scoring.len() > 1 {
         scoring.remove(NOISY);
     }
@@ -140,7 +141,7 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
         .collect()
 }
 
-/// The arithmetic mean; none of nothing.
+/// The arithmetic mean; none for no values.
 pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }

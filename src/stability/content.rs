@@ -1,10 +1,11 @@
 //! How methods do on each scene of a test set as it was rendered: a row for each scene, sample count and
 //! method, with the spread over noise seeds, and whether it is within the bounds.
 //!
-//! In: the rows of [`super::run`]. Renders of one scene and sample count are its seeds. Bounds: the result
-//! has at most the input's RelMSE, since a denoiser that makes a frame worse had better be off; and all light
-//! in it is within 2% of the reference's, about the least difference in brightness that an eye sees (Weber's
-//! fraction), and as much more as the input itself is off, which has fireflies or lacks what few paths find.
+//! In: the rows of [`super::run`]. Renders of one scene at one sample count count as its noise seeds. Two
+//! bounds apply. The result has at most the input's RelMSE, since a denoiser that makes a frame worse had
+//! better be off. And the sum of its light is within 2% of the reference's, about the least difference in
+//! brightness that an eye sees (Weber's fraction). This tolerance grows by as much as the input's own sum is
+//! off, since the input may have fireflies or lack light that only few paths find.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -14,7 +15,7 @@ use std::{
 use super::{Trial, TrialRow};
 use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean};
 
-/// How far the energy of a result may be from one, beside how far its input's is.
+/// How far the energy of a result may be from one, in addition to how far its input's is.
 const ENERGY: f64 = 0.02;
 
 /// Columns of `stability_scenes.csv`.
@@ -33,18 +34,18 @@ pub const COLUMNS: [&str; 12] = [
     "verdict",
 ];
 
-/// What one method made of one scene at one sample count.
+/// The results of one method on one scene at one sample count.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Case {
-    /// Scene, with the frame of a sequence.
+    /// Scene, and the frame where it belongs to a sequence.
     pub scene: String,
     /// Samples per pixel of the noisy renders.
     pub spp: u32,
     /// Method.
     pub model: String,
-    /// The renders that were scored, one for each noise seed.
+    /// The renders, one for each noise seed.
     pub seeds: Vec<PathBuf>,
-    /// Those on which the method failed.
+    /// The number of renders on which the method failed.
     pub failed: usize,
     /// Mean RelMSE over seeds.
     pub relmse: Option<f64>,
@@ -56,7 +57,7 @@ pub struct Case {
     pub to_baseline: Option<f64>,
     /// Mean SSIM over seeds.
     pub ssim: Option<f64>,
-    /// Mean over seeds of the sum of all values over the reference's.
+    /// Mean over seeds of the ratio of the sum of all values to the reference's.
     pub energy: Option<f64>,
     /// What is out of bounds; empty where all is well, and for the input itself.
     pub faults: Vec<String>,
@@ -159,7 +160,7 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
     groups.iter().map(case).collect()
 }
 
-/// The cases by methods: a group of columns for each sample count.
+/// A map of scenes by methods, with a group of columns for each sample count.
 pub fn map(title: String, methods: &[String], cases: &[Case], value: fn(&Case) -> Option<f64>) -> HeatMap {
     let counts: Vec<u32> = cases.iter().map(|case| case.spp).collect::<BTreeSet<_>>().into_iter().collect();
     let mut scenes: Vec<&str> = Vec::new();

@@ -1,12 +1,13 @@
 //! How much a method's result changes when its input is not what it should be, and on which scenes it fails
-//! as they are.
+//! without any change.
 //!
-//! Every [`Trial`] changes the noisy frames of a test set in one known way, always the same. Scene by scene
-//! the result is scored against what the reference then is, and beside the result for the frame as it was
-//! rendered: `ratio` is its RelMSE over that one's, `deviation` the RelMSE between the two. A method that is
-//! indifferent to the change has a ratio of 1 and a deviation of 0. Methods see what is in the frame alone:
-//! half buffers that lie beside it, which do not have the change, are not used, not for the frame as it was
-//! rendered either. What comes of frames as they were rendered is judged in [`content`].
+//! Every [`Trial`] changes the noisy frames of a test set in one known way that is always the same. Frame by
+//! frame, the result is compared with the reference, cropped as the trial crops the frame, and with the
+//! result for the frame as it was rendered: `ratio` is the RelMSE of the first result over that of the
+//! second, and `deviation` the RelMSE between the two. A method that is indifferent to the change has a ratio
+//! of 1 and a deviation of 0. Methods see only what is in the frame. Half buffers that lie beside it do not
+//! have the change, so they are never used, not even for the frame as it was rendered. Results for frames as
+//! they were rendered are judged in [`content`].
 
 pub mod content;
 mod page;
@@ -32,10 +33,10 @@ use content::Case;
 use trial::CORNER;
 pub use trial::Trial;
 
-/// What one method made of one changed frame.
+/// The result of one method on one changed frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrialRow {
-    /// Scene, with the frame of a sequence.
+    /// Scene, and the frame where it belongs to a sequence.
     pub scene: String,
     /// Method.
     pub model: String,
@@ -45,11 +46,11 @@ pub struct TrialRow {
     pub noisy: PathBuf,
     /// Name of the trial.
     pub trial: &'static str,
-    /// RelMSE against what of the reference is in the frame.
+    /// RelMSE against the part of the reference that the changed frame shows.
     pub relmse: Option<f64>,
-    /// SSIM against the same; see [`crate::metrics`].
+    /// SSIM against the same part; see [`crate::metrics`].
     pub ssim: Option<f64>,
-    /// The sum of all values over the reference's; none where that is not positive.
+    /// The ratio of the sum of all values to the reference's; none where the reference's is not positive.
     pub energy: Option<f64>,
     /// RelMSE over that of the frame as rendered.
     pub ratio: Option<f64>,
@@ -100,16 +101,17 @@ impl TrialRow {
     }
 }
 
-/// What is asked for.
+/// What to run, and where to write.
 #[derive(Clone, Debug)]
 pub struct StabilityOptions {
     /// Folder for everything that is written.
     pub out: PathBuf,
     /// View layer to read; by default the one with the most passes.
     pub view_layer: Option<String>,
-    /// The changes to try. Without [`Trial::AsRendered`] nothing is told of scenes as they were rendered.
+    /// The changes to try. Without [`Trial::AsRendered`] there are no ratios and no results on scenes as they
+    /// were rendered.
     pub trials: Vec<Trial>,
-    /// Method whose RelMSE `to_baseline` is over.
+    /// Method whose RelMSE is the denominator of `to_baseline`.
     pub baseline: String,
     /// How many of the worst scenes are shown with pictures.
     pub worst: usize,
@@ -117,9 +119,9 @@ pub struct StabilityOptions {
     pub threads: usize,
 }
 
-/// Runs every trial of every method on every pair. Each row is appended to `stability.csv`, then told; at the
-/// end `stability_summary.csv` (trials), `stability_scenes.csv` (scenes as rendered), their maps and
-/// `stability.html` are written. A pair or method that fails has rows that say why.
+/// Runs every trial of every method on every pair. Each row is appended to `stability.csv` and then given to
+/// `on`; at the end `stability_summary.csv` (trials), `stability_scenes.csv` (scenes as rendered), their maps
+/// and `stability.html` are written. Rows of a pair or method that fails say why.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -217,7 +219,7 @@ fn show(
     page::write(&options.out, &maps, cases, &worst)
 }
 
-/// Rows are trials, by what they cost.
+/// A map whose rows are trials and whose values are ratios: RelMSE over that of the frame as rendered.
 fn map_of_trials(methods: Vec<String>, trials: &[Trial], summaries: &[Summary]) -> HeatMap {
     let cells = |trial: Trial| {
         let of_trial = summaries.iter().filter(move |line| line.trial == trial);
@@ -232,7 +234,8 @@ fn map_of_trials(methods: Vec<String>, trials: &[Trial], summaries: &[Summary]) 
     }
 }
 
-/// The renders on which our own methods, or else any, do worst beside the baseline: one of each scene.
+/// The renders with the highest RelMSE over the baseline's, one of each scene. Only demc's own methods count,
+/// or all others where there is none of them.
 fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair> {
     let others = [NOISY, options.baseline.as_str()];
     let is_judged = |case: &&Case| !others.contains(&case.model.as_str());
@@ -255,8 +258,8 @@ fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair
     chosen
 }
 
-/// Fills in the numbers of one trial; `before` is the result for the frame as rendered, which the first trial
-/// leaves there.
+/// Fills in the numbers of one trial. `before` is the result for the frame as rendered, which
+/// [`Trial::AsRendered`] stores there and which therefore comes first.
 fn measure(
     trial: Trial,
     method: &Contender,
@@ -270,7 +273,7 @@ fn measure(
             format!("skipped: {}x{} pixels less leave nothing of {width}x{height}", CORNER.0, CORNER.1);
         return Ok(());
     }
-    // Half buffers beside the frame do not have the change: the shot has none.
+    // Half buffers beside the frame do not have the change, so the shot is made without them.
     let shot = Shot::new(trial.change(&loaded.shot.passes));
     let image = trial.undo(method.denoiser.denoise(&shot)?);
     let reference = trial.seen(&loaded.reference);
@@ -299,7 +302,7 @@ fn measure(
     Ok(())
 }
 
-/// What one method made of all frames changed in one way.
+/// The results of one method on all frames, changed in one way.
 struct Summary {
     model: String,
     trial: Trial,

@@ -1,5 +1,5 @@
 //! `stability.html`: the maps, what is out of bounds, and the worst scenes with pictures, on one page that
-//! needs nothing but itself.
+//! refers to no other file.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::{
     testset::Pair,
 };
 
-/// Writes the page into `out`, whose folder `worst` holds a report of the worst scenes.
+/// Writes the page into `out`. The folder `worst` in `out` holds a report of the worst scenes.
 ///
 /// # Errors
 /// A sheet cannot be read or the file not be written.

@@ -9,9 +9,9 @@ use crate::{
 /// One way to change a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trial {
-    /// Nothing changes: what the others are measured by.
+    /// Nothing changes; the other trials are compared with this one.
     AsRendered,
-    /// Radiance is a 256th: physical units, moonlight.
+    /// Radiance is a 256th, as in scenes in physical units or by moonlight.
     Darker,
     /// Radiance is 256 times as high.
     Brighter,
@@ -21,13 +21,14 @@ pub enum Trial {
     MuchBrighter,
     /// Left and right change places.
     Mirrored,
-    /// The frame begins 5 pixels further right and 3 further down: a network's grid falls elsewhere.
+    /// The frame begins 5 pixels further right and 3 further down, so that a network's pooling grid lies
+    /// elsewhere.
     Cropped,
     /// One pixel in 1024 is a firefly of 1000 times the mean radiance.
     Fireflies,
     /// One pixel in 1024 of every pass is NaN or infinite.
     NonFinite,
-    /// Guides are 2 pixels further right than radiance, as those of a compositor that moved one layer.
+    /// Guides are 2 pixels further right than radiance, as when a compositor moved one layer.
     ShiftedGuides,
     /// Guides hold nothing: all zero.
     BlankGuides,
@@ -41,22 +42,22 @@ pub enum Trial {
     WithoutAlbedo,
     /// The frame has no normals.
     WithoutNormals,
-    /// Albedo is any value in 0..1 in each pixel, as of a layer of the wrong name.
+    /// Albedo is a pseudorandom value in 0..1 in each pixel, as if another layer had its name.
     RandomAlbedo,
-    /// Albedo is twice as high, above one: of renderers that add coats to it.
+    /// Albedo is twice as high, so that it may exceed one, as from renderers that add coats to it.
     BrightAlbedo,
     /// Albedo is encoded for display by the curve of sRGB.
     SrgbAlbedo,
     /// Normals are stored in 0..1.
     UnitNormals,
-    /// Normals are of world space, and the file does not say where the camera stood.
+    /// Normals are in world space, and the file does not hold the camera's orientation.
     WorldNormals,
 }
 
-/// Factor of [`Trial::Darker`] and its inverse's of [`Trial::Brighter`].
+/// Factor of [`Trial::Darker`]; its inverse is that of [`Trial::Brighter`].
 const DARK: f32 = 1.0 / 256.0;
 
-/// Factor of [`Trial::MuchDarker`] and its inverse's of [`Trial::MuchBrighter`].
+/// Factor of [`Trial::MuchDarker`]; its inverse is that of [`Trial::MuchBrighter`].
 const VERY_DARK: f32 = 1.0 / 4096.0;
 
 /// World axes in camera space of [`Trial::WorldNormals`]: a camera that looks 30 degrees to the side and 25
@@ -64,7 +65,7 @@ const VERY_DARK: f32 = 1.0 / 4096.0;
 const WORLD_AXES: [[f32; 3]; 3] =
     [[0.866_025, -0.211_309, 0.453_154], [0.5, 0.365_998, -0.784_886], [0.0, 0.906_308, 0.422_618]];
 
-/// First column and row of [`Trial::Cropped`]; no multiple of what networks halve by.
+/// First column and row of [`Trial::Cropped`]; odd, so that pixels pair up differently where networks halve.
 pub const CORNER: (usize, usize) = (5, 3);
 
 /// Radiance of a firefly over the frame's mean.
@@ -233,7 +234,7 @@ impl Trial {
             Self::SrgbAlbedo => {
                 guides(passes, is_albedo, |planes| planes.data.iter_mut().for_each(|v| *v = srgb(*v)))
             }
-            // Files of other renderers' normals pass through this on reading; so do these.
+            // Normals of other renderers pass through `to_camera_space` when they are read, so these do too.
             Self::UnitNormals => guides(passes, is_of_camera, |planes| {
                 planes.data.iter_mut().for_each(|v| *v = *v / 2.0 + 0.5);
                 to_camera_space(planes, None);
@@ -246,7 +247,8 @@ impl Trial {
         }
     }
 
-    /// The result for the changed frame as one for the frame as it was rendered.
+    /// Turns a result for the changed frame back into one for the frame as it was rendered, by undoing the
+    /// mirroring or exposure.
     pub fn undo(self, mut image: Planes) -> Planes {
         if self == Self::Mirrored {
             image.data.chunks_mut(image.width).for_each(<[f32]>::reverse);
@@ -256,7 +258,7 @@ impl Trial {
         image
     }
 
-    /// What of an image is in the changed frame.
+    /// The part of an image that the changed frame shows.
     pub fn seen(self, image: &Planes) -> Planes {
         match self {
             Self::Cropped => {
@@ -278,7 +280,7 @@ fn is_chosen(pixel: usize) -> bool {
     hash(pixel) >> 22 == 0
 }
 
-/// A frame in which those of the passes without radiance that are chosen are changed.
+/// The frame with `change` applied to the passes without radiance that `is_it` chooses.
 fn guides(passes: &PassSet, is_it: impl Fn(Pass) -> bool, change: impl Fn(&mut Planes)) -> PassSet {
     passes.map((passes.width, passes.height), |pass, planes| {
         let mut planes = planes.clone();
@@ -289,7 +291,7 @@ fn guides(passes: &PassSet, is_it: impl Fn(Pass) -> bool, change: impl Fn(&mut P
     })
 }
 
-/// A frame that lacks those of the passes without radiance that are chosen.
+/// The frame without those passes that carry no radiance and that `is_it` chooses.
 fn without(passes: &PassSet, is_it: impl Fn(Pass) -> bool) -> PassSet {
     let mut kept = passes.clone();
     for (pass, _) in passes.iter().filter(|(pass, _)| !pass.carries_radiance() && is_it(*pass)) {
@@ -306,7 +308,7 @@ fn is_normal(pass: Pass) -> bool {
     pass.quantity() == Quantity::Direction
 }
 
-/// Normals in camera space, whose like other renderers write in ways of their own.
+/// Whether a pass holds normals in camera space, which other renderers write in other encodings.
 fn is_of_camera(pass: Pass) -> bool {
     pass == Pass::DenoisingNormal
 }

@@ -22,11 +22,12 @@ pub const CHECKPOINT: &str = "checkpoint.safetensors";
 pub struct Progress {
     /// Steps done.
     pub step: usize,
-    /// Seconds spent, over all sittings.
+    /// Seconds spent in all, before and after resuming.
     pub seconds: f64,
     /// Sum and number of training losses since the last line of the log.
     pub losses: (f64, usize),
-    /// Steps skipped since then because their gradient was not finite.
+    /// Steps skipped because their gradient was not finite, since the last line of the log before which some
+    /// step was not skipped.
     pub skipped: usize,
     /// The best validation RelMSE so far.
     pub best: Option<f64>,
@@ -59,10 +60,10 @@ pub fn save(
     weights::write(path, &metadata, &tensors, Precision::Full)
 }
 
-/// Refuses a checkpoint too small for a network before memory is set aside for that.
+/// Refuses a checkpoint that is too small for a network, before memory is set aside for the network.
 ///
 /// # Errors
-/// It is, or cannot be read.
+/// The checkpoint is too small or cannot be read, or there can be no such network.
 pub fn check_size(path: &Path, config: &Config) -> Result<()> {
     models::check(config).map_err(|reason| Error::Usage(format!("network: {reason}")))?;
     let bytes = std::fs::metadata(path).map_err(Error::io("read", path))?.len();
@@ -118,7 +119,7 @@ mod tests {
         let mut network = models::build(&config, 1);
         let mut average = network.duplicate();
         let mut optimizer = Optimizer::new(Rule::Adam, 0.0);
-        // A sum that a hasty reading of its digits misses by a bit.
+        // A sum that a parser of decimal digits misses by a bit if it does not round correctly.
         let saved = Progress { losses: (240.41605154424906, 499), ..Progress::default() };
         save(&path, &saved, &mut *network, &mut *average, &mut optimizer).unwrap();
         let held = load(&path, &mut *network, &mut *average, &mut optimizer).unwrap();

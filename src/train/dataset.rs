@@ -18,12 +18,12 @@ use crate::{
     testset::Pair,
 };
 
-/// Frames and references, decoded once and held in the precision that they mostly come in, see `Values`.
+/// Frames and references, decoded once and mostly held as half floats, see `Values`.
 pub struct Dataset {
     frames: Vec<Stored>,
-    /// Pixels of all frames up to and with each.
+    /// For each frame, the number of pixels of all frames up to and including it.
     pixels: Vec<usize>,
-    /// Of each frame the others that differ from it by their noise alone.
+    /// For each frame, the indices of the others that differ from it by their noise alone.
     seeds: Vec<Vec<usize>>,
 }
 
@@ -62,8 +62,8 @@ enum Values {
 }
 
 impl Values {
-    /// Halves, but for places and distances: far from the origin, what a half cannot tell apart is larger
-    /// than what is looked at, and no half holds the 1e10 of a ray that hits nothing.
+    /// Half floats, except for positions and depths: far from the origin, half floats lie further apart than
+    /// the details of a scene, and no half float holds the 1e10 of a ray that hits nothing.
     fn of(pass: Pass, values: &[f32]) -> Self {
         match pass {
             Pass::Position | Pass::Depth | Pass::DenoisingDepth => Self::Full(values.to_vec()),
@@ -74,7 +74,7 @@ impl Values {
         }
     }
 
-    /// Writes `out.len()` values from the one at `start`.
+    /// Fills `out` with the values from the one at `start` on.
     fn read(&self, start: usize, out: &mut [f32]) {
         match self {
             Self::Half(values) => values[start..][..out.len()].convert_to_f32_slice(out),
@@ -84,8 +84,8 @@ impl Values {
 }
 
 impl Dataset {
-    /// Decodes of every pair the passes that must be there and those that may, the `targets` of its
-    /// reference, and, if `raw_references`, what the references were before they were denoised. Frames
+    /// Decodes every pair: of the noisy frame the `passes` that must be there and those that may, of the
+    /// reference the `targets`, and if `raw_references` also the reference before it was denoised. Frames
     /// smaller than `least` in either direction are an error, since no crop fits them.
     ///
     /// # Errors
@@ -123,30 +123,30 @@ impl Dataset {
         self.frames.is_empty()
     }
 
-    /// What the user should know of pairs that do not belong together, whose file each line names.
+    /// Warnings about pairs that do not seem to belong together; each names the file.
     pub fn warnings(&self) -> impl Iterator<Item = &String> {
         self.frames.iter().filter_map(|stored| stored.warning.as_ref())
     }
 
-    /// The whole of frame `index`, and its name.
+    /// The name of frame `index`, and the whole frame.
     pub fn frame(&self, index: usize) -> (String, Sample) {
         let stored = &self.frames[index];
         (stored.pair.id(), stored.crop(0, 0, stored.width, stored.height))
     }
 
-    /// The side of a step's crops: `most` pixels, or as many as a frame drawn by `rng` holds, down to a
-    /// multiple of `multiple`.
+    /// The side of a step's crops in pixels: `most`, or if less, the largest multiple of `multiple` that fits
+    /// into a frame drawn by `rng`.
     pub fn draw_side(&self, most: usize, multiple: usize, rng: &mut Rng) -> usize {
         let side = self.draw_frame(rng).1.side();
         most.min(side / multiple * multiple)
     }
 
-    /// A random square crop of `side` pixels, augmented; all of it decided by `rng`. A frame is drawn as
-    /// often as it is large, one that is too small never. Where there are more renders of it with as many
-    /// samples, each pixel comes from one of two: Cycles draws the samples of each pixel apart, so that is a
-    /// render with a seed of its own, and no network gets to learn the noise of those that there are by
-    /// heart. `guide_dropout` is the share of crops that lack guides. A frame of `side` pixels must be there,
-    /// as it is for a side from [`Self::draw_side`].
+    /// A random square crop of `side` pixels, augmented; `rng` decides all of it. Frames are drawn in
+    /// proportion to their pixels, and never where they are too small. Where other renders of the frame have
+    /// as many samples, each pixel comes from one of two renders: Cycles draws the samples of each pixel
+    /// independently, so the mixture is a render with a seed of its own, and no network can learn the noise
+    /// of the stored renders by heart. `guide_dropout` is the share of crops that lack guides. The dataset
+    /// must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
     pub fn draw(&self, side: usize, guide_dropout: f64, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
@@ -171,7 +171,7 @@ impl Dataset {
         }
     }
 
-    /// A frame and its index, drawn as often as it is large.
+    /// A frame and its index, drawn in proportion to its pixels.
     fn draw_frame(&self, rng: &mut Rng) -> (usize, &Stored) {
         let pixel = rng.below(*self.pixels.last().expect("nothing is drawn from an empty dataset"));
         let index = self.pixels.partition_point(|&end| end <= pixel);
@@ -179,7 +179,7 @@ impl Dataset {
     }
 }
 
-/// Of each frame the others that have its reference, its number of samples and its passes.
+/// For each frame, the indices of the others that have the same reference, number of samples and passes.
 fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     let key = |frame: &Stored| {
         let passes: Vec<Pass> = frame.passes.iter().map(|(pass, _)| *pass).collect();
@@ -194,8 +194,7 @@ fn seeds(frames: &[Stored]) -> Vec<Vec<usize>> {
     frames.iter().enumerate().map(others).collect()
 }
 
-/// Puts what [stands in](stand_in) for them in the place of the albedo, the normal, or both, of a share of
-/// crops.
+/// In a share of crops, replaces the albedo, the normal, or both by what [stands in](stand_in) for them.
 fn drop_guides(passes: &mut PassSet, share: f64, rng: &mut Rng) {
     if share == 0.0 || f64::from(rng.uniform()) >= share {
         return;
@@ -268,7 +267,7 @@ impl Stored {
         })
     }
 
-    /// Of the largest square crop.
+    /// The side of the largest square crop.
     fn side(&self) -> usize {
         self.width.min(self.height)
     }
@@ -371,7 +370,7 @@ mod tests {
             assert_eq!(depth.len(), side * side);
             assert!(side == 8 || depth[0] == 2.0, "a frame of 12x12 holds no crop of 16x16");
         }
-        // By area 144 to 400 are drawn first: 106 of 400 steps.
+        // The areas are 144 and 400, so the smaller frame is drawn first in 106 of 400 steps.
         assert!((80..132).contains(&sides[0]), "{sides:?}");
     }
 
@@ -387,7 +386,7 @@ mod tests {
         }
     }
 
-    /// [`room`], the noisy frame of which `folder` gets with another layer: each channel is `values`.
+    /// [`room`], with a copy of its noisy frame in `folder` that has another layer; each channel is `values`.
     fn room_with(folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> Pair {
         let mut pair = room();
         let mut frame = Frame::read(&pair.noisy).unwrap();
@@ -416,7 +415,7 @@ mod tests {
     #[test]
     fn places_far_from_the_origin_and_misses_stay_what_they_are() {
         let folder = tempfile::tempdir().unwrap();
-        // A hundredth apart, where halves are 1 to 2 apart.
+        // They are a hundredth apart, where half floats are 1 to 2 apart.
         let places: Vec<f32> = (0..128 * 128).map(|i| 2000.0 + 0.01 * i as f32).collect();
         let pair = room_with(folder.path(), "Position", ["X", "Y", "Z"], &places);
         assert_eq!(only(pair, Pass::Position).passes.get(Pass::Position).unwrap().channel(2), places);

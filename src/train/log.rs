@@ -1,4 +1,4 @@
-//! `log.csv`: one row an interval of steps.
+//! `log.csv`: one row for each interval of steps.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::{Error, Result, frame::atomically};
 pub struct LogRow {
     /// Steps done.
     pub step: usize,
-    /// Seconds of training, over all sittings.
+    /// Seconds of training in all, before and after resuming.
     pub seconds: f64,
     /// Learning rate of the last step.
     pub lr: f64,

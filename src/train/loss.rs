@@ -30,16 +30,16 @@ pub enum Loss {
     Smape,
     /// The sum of both: what RelMSE measures, with the steadier gradient of the bounded error.
     Both,
-    /// [`Loss::Both`] and the error of the differences between neighbouring pixels, relative to their
-    /// brightness: steps in a smooth gradient and soft edges weigh little as errors of pixels, but are what
-    /// people see first (and what SSIM measures).
+    /// The sum of [`Loss::Both`] and the error of the differences between neighbouring pixels, relative to
+    /// their brightness. Steps in a smooth gradient and soft edges weigh little as errors of pixels, but are
+    /// what people see first (and what SSIM measures).
     Edges,
-    /// Mean over images of `ln(1 + RelMSE / 0.0002)`, for the geometric mean over scenes by which methods are
-    /// compared. A plain mean is all but made of the noisiest images; what is left to gain on even walls
-    /// counts for nothing in it.
+    /// Mean over images of `ln(1 + RelMSE / 0.0002)`, as methods are compared by the geometric mean over
+    /// scenes. In a plain mean the noisiest images count for nearly all, and what is left to gain on even
+    /// walls for nothing.
     Geomean,
-    /// [`Loss::Geomean`] and ten times `1 - SSIM` of what a display would show, at each image's exposure,
-    /// against the clean reference: 1% of RelMSE for 0.001 of SSIM.
+    /// The sum of [`Loss::Geomean`] and ten times `1 - SSIM` of what a display would show, at each image's
+    /// exposure, against the clean reference. So 0.001 of SSIM counts as much as 1% of RelMSE.
     Ssim,
 }
 
@@ -61,23 +61,23 @@ impl Loss {
     pub const ALL: [Loss; 6] =
         [Loss::Relmse, Loss::Smape, Loss::Both, Loss::Edges, Loss::Geomean, Loss::Ssim];
 
-    /// Rows and columns that an image must have for it, at least.
+    /// The least number of rows, and of columns, that an image must have for it.
     pub fn least_side(self) -> usize {
         if self == Loss::Ssim { ssim::WINDOW } else { 1 }
     }
 
-    /// Whether it compares images as a display would show them, which must be radiance, (N, 3, H, W).
+    /// Whether it compares images as a display would show them; they must then be radiance, (N, 3, H, W).
     pub fn needs_radiance(self) -> bool {
         self == Loss::Ssim
     }
 
-    /// The loss of `image` against `reference`, same shape and scale.
+    /// The loss of `image` against `reference`, which has the same shape and scale.
     ///
-    /// Squared errors are against `raw` where it is given, with the denominators of `reference`: noise in the
-    /// target of a squared error changes no gradient on average (Lehtinen et al. 2018, "Noise2Noise"), which
-    /// noise in a denominator would, and what a denoiser got wrong in `reference` is not learned. `scale` is
-    /// each image's scene radiance over network radiance: the epsilon of the relative error is meant in scene
-    /// radiance.
+    /// Where `raw` is given, squared errors are taken against it, with the denominators of `reference`. Noise
+    /// in the target of a squared error does not change the gradient on average (Lehtinen et al. 2018,
+    /// "Noise2Noise"), while noise in a denominator would; and what a denoiser got wrong in `reference` is
+    /// not learned. `scale` is the ratio of scene radiance to network radiance of each image, since the
+    /// epsilon of the relative error is meant in scene radiance.
     pub fn of(
         self,
         image: Images<Taped>,
@@ -105,11 +105,11 @@ impl Loss {
     }
 }
 
-/// A firefly in a raw reference counts as this many times the clean one at most (and one more, in network
-/// radiance, where that is dark).
+/// A value of a raw reference, which may be a firefly, counts as at most this many times the clean value plus
+/// one, in network radiance.
 const RAW_LIMIT: f32 = 8.0;
 
-/// What SSIM counts beside the logarithm of RelMSE.
+/// The weight of `1 - SSIM` beside the logarithm of RelMSE.
 const SSIM_WEIGHT: f32 = 10.0;
 
 /// A RelMSE below which there is little left to gain.
@@ -125,8 +125,9 @@ fn relmse(
     weighted_error(image, reference, raw, weight)
 }
 
-/// The logarithm's gradient by way of weights: those of each image divided by its error. That is against the
-/// clean reference: the noise of a raw one would make every image look as bad.
+/// The gradient of the logarithm is that of a weighted error in which the weights of each image are divided
+/// by the image's error. That error is taken against the clean reference, since the noise of a raw one would
+/// make all images look equally bad.
 fn geomean(
     image: Images<Taped>,
     reference: &[f32],
@@ -146,13 +147,13 @@ fn geomean(
     });
     let logarithms: Vec<f32> = logarithms.collect(); // in the order of images, whatever the threads do
     let loss = weighted_error(image, reference, raw, weight);
-    // Same gradient, but the value of the logarithm.
+    // Adding a constant keeps the gradient and gives the loss the value of the logarithm.
     let value = logarithms.iter().sum::<f32>() / images as f32;
     let shift = value - loss.as_vec()[0];
     loss + shift
 }
 
-/// What squared errors count: the inverse of `r^2 + 0.001` in scene radiance.
+/// The weights of squared errors: the inverse of `r^2 + 0.001` in scene radiance.
 fn weights(reference: &[f32], scale: &[f32]) -> Vec<f32> {
     let of_image = reference.chunks(reference.len() / scale.len()).zip(scale);
     of_image
@@ -217,8 +218,8 @@ fn edges(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, Cpu, Tap
     })
 }
 
-/// Mean of `1 - SSIM` of the images as a display would show them, exposed by their references; of a black
-/// reference, 0.
+/// Mean of `1 - SSIM` of the images as a display would show them at the exposure of their references; 0 where
+/// a reference is black.
 fn dissimilarity(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, Cpu, Taped> {
     let &(n, c, h, w) = image.shape();
     let exposures: Vec<Option<f64>> = reference
@@ -238,8 +239,8 @@ fn dissimilarity(image: Images<Taped>, reference: &[f32]) -> Tensor<Rank0, f32, 
     })
 }
 
-/// The sum over planes of what `of` makes of the number, the image and the reference of one, a sum and its
-/// gradient by the image's pixels, divided by `count`: one operation on the tape.
+/// A sum over all planes, divided by `count`, as one operation on the tape. From the index of a plane, its
+/// image and its reference, `of` makes the plane's share of the sum and its gradient by the image's pixels.
 fn mean_of_planes(
     image: Images<Taped>,
     reference: &[f32],

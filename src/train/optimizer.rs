@@ -17,10 +17,10 @@ pub enum Rule {
     /// Adam (Kingma and Ba 2015), by dfdx's own update: what the papers' networks were trained with.
     #[default]
     Adam,
-    /// Muon (Jordan et al. 2024) for the weights of convolutions, seen as matrices of outputs by inputs and
-    /// taps: momentum, made orthogonal, so that no few directions take all of a step. Updates have the size
-    /// of Adam's (Liu et al. 2025), so the same learning rates serve. Adam for biases and for the heads,
-    /// whose outputs are no features.
+    /// Muon (Jordan et al. 2024) for the weights of hidden convolutions, seen as matrices of outputs by
+    /// inputs and taps: the momentum is made orthogonal, so that a few directions cannot take up a whole
+    /// step. Updates have the size of Adam's (Liu et al. 2025), so the same learning rates serve. Biases, and
+    /// heads, whose outputs are not features, are updated by Adam.
     Muon,
 }
 
@@ -43,7 +43,7 @@ pub struct Optimizer {
     rule: Rule,
     weight_decay: f64,
     first: Gradients<f32, Cpu>,
-    /// Stays zero where Muon needs none.
+    /// Stays zero for parameters that Muon updates, which needs no second moments.
     second: Gradients<f32, Cpu>,
 }
 
@@ -60,9 +60,9 @@ const UPDATE_SIZE: f32 = 0.2;
 const CPU: &str = "the CPU allocates or aborts";
 
 impl Optimizer {
-    /// One that has seen nothing. Each step takes `weight_decay` times the learning rate of the hidden
-    /// convolutions' weights away (Loshchilov and Hutter 2019): Muon's updates are as long where a gradient
-    /// is all noise, and what they add up to there would never go.
+    /// An optimiser whose moments are zero. Each step takes the share `weight_decay` times the learning rate
+    /// off the weights of hidden convolutions (Loshchilov and Hutter 2019). Without that, what Muon's updates
+    /// add up to where a gradient is nothing but noise would stay, since they are equally long there.
     pub fn new(rule: Rule, weight_decay: f64) -> Self {
         Self { rule, weight_decay, first: Gradients::leaky(), second: Gradients::leaky() }
     }
@@ -100,8 +100,9 @@ impl Optimizer {
                     MOMENTUM * *m + g
                 });
                 let direction = nesterov.collect();
-                // Where nothing is learned, as when all that a layer feeds is cut off by ReLUs, momentum
-                // fades but keeps its direction, in which steps of full length would lead ever on.
+                // Where the gradient is zero, as when ReLUs cut off all that a layer feeds, there is no step:
+                // momentum fades but keeps its direction, and steps of full length would go on that way for
+                // ever.
                 if gradient.iter().any(|g| *g != 0.0) {
                     matrices.push((param, direction));
                 }
@@ -142,8 +143,9 @@ impl Optimizer {
     }
 }
 
-/// Roughly the orthogonal matrix nearest to a row-major one: every singular value becomes one of about 0.7 to
-/// 1.2, by the Newton and Schulz iteration with Jordan's coefficients, which grow small ones fastest.
+/// Roughly the orthogonal matrix nearest to a row-major one. The Newton-Schulz iteration with Jordan's
+/// coefficients, which make small singular values grow fastest, brings every singular value to about 0.7 to
+/// 1.2.
 fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
     const ITERATIONS: usize = 5;
     const COEFFICIENTS: [f32; 3] = [3.4445, -4.7750, 2.0315];
@@ -151,7 +153,7 @@ fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
     let transposed = |m: Matrix| m.permute::<_, Axes2<1, 0>>();
     let norm = matrix.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
     let mut x: Matrix = Cpu::default().tensor_from_vec(matrix, (rows, columns)) / norm;
-    // The products are smaller on the shorter side.
+    // The matrix products are smaller where the matrix has no more rows than columns.
     let tall = rows > columns;
     if tall {
         x = transposed(x);

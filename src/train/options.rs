@@ -15,8 +15,8 @@ use crate::{
     testset::Pair,
 };
 
-/// Everything that decides a run's result. Written to the run folder as `config.json` once all pairs were
-/// read: a folder without one is free.
+/// Everything that decides a run's result. It is written to the run folder as `config.json` once all pairs
+/// have been read, so a folder without that file is free for a new run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainOptions {
     /// The network.
@@ -27,11 +27,12 @@ pub struct TrainOptions {
     pub validation: Vec<Pair>,
     /// Steps in all.
     pub steps: usize,
-    /// Crops a step, if they are as large as can be; of smaller ones as many as have no more pixels.
+    /// Crops in a step, if they have `patch` rows and columns; of smaller crops, as many as have no more
+    /// pixels in all.
     pub batch: usize,
     /// Rows and columns of a crop, unless the frame that is drawn first for its step is smaller.
     pub patch: usize,
-    /// Largest learning rate, and that of the last step, to which it falls along a line.
+    /// The largest learning rate, and that of the last step, to which it falls linearly.
     pub lr: (f64, f64),
     /// What is minimised.
     pub loss: Loss,
@@ -69,27 +70,27 @@ pub struct TrainOptions {
 /// A setting that no run can have.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    /// As `config.json` names it.
+    /// Its name in `config.json`.
     pub setting: &'static str,
     /// What is wrong with it, and what it may be.
     pub reason: String,
 }
 
-/// Most crops a step, and most rows and columns of one: what is beyond is a typing error that would take all
-/// memory.
+/// The most crops in a step, and the most rows and columns of one. More is taken for a typing error, which
+/// would take all memory.
 const MOST: usize = 4096;
 
 impl TrainOptions {
     /// Whether a run can have these settings, before any file is read.
     ///
     /// # Errors
-    /// Names the first that it cannot.
+    /// Names the first setting that no run can have.
     pub fn check(&self) -> Result<(), Refusal> {
         let refuse = |setting, reason: String| Err(Refusal { setting, reason });
         if let Err(reason) = models::check(&self.network) {
             return refuse("network", reason);
         }
-        // What is asked of it does not depend on widths.
+        // What is asked of the network below does not depend on its widths, so the narrowest is built.
         let Config { architecture, widths, prefilter } = self.network.clone();
         let narrowest =
             Config { architecture, widths: vec![1; widths.len()], prefilter: vec![1; prefilter.len()] };
@@ -151,8 +152,8 @@ impl TrainOptions {
     }
 }
 
-/// Keeps all parameters as they are but those that one of `names` matches, in which `*` stands for any part
-/// of a name; with none, changes nothing.
+/// Trains only the parameters whose names one of `names` matches, in which `*` stands for any part of a name;
+/// without `names`, changes nothing.
 ///
 /// # Errors
 /// One of `names` is no pattern, or matches nothing that is trained.

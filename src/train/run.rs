@@ -32,7 +32,7 @@ use crate::{
     rng::Rng,
 };
 
-/// What the caller hears of.
+/// What a run tells its caller.
 #[derive(Clone, Debug)]
 pub enum TrainEvent {
     /// Something the user should know of the data, or of how training goes.
@@ -44,19 +44,20 @@ pub enum TrainEvent {
         /// Its loss.
         loss: f64,
     },
-    /// A row was added to the log, which is given whole.
+    /// A row was added to the log; all rows are given.
     Logged(Vec<log::LogRow>),
 }
 
-/// Steps in a row that may be skipped before a run is given up.
+/// A run is given up where a row of the log is due and at least this many steps in a row were skipped.
 const MOST_SKIPPED: usize = 10;
 
-/// Seconds between checkpoints: what a kill costs at most.
+/// Seconds between checkpoints, which is about the most that is lost when a run is killed.
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
 /// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
-/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint follows a
-/// step that was skipped: where all are, the weights of the one before are good.
+/// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint is written
+/// after a skipped step unless it is the last: where all steps are skipped, the weights of the checkpoint
+/// before are still good.
 ///
 /// # Errors
 /// A pair is unusable, the run folder cannot be read or written, or step after step had no finite gradient.
@@ -101,7 +102,8 @@ pub fn run(
     if !resume {
         let config = out.join("config.json");
         let text = serde_json::to_string_pretty(options).expect("options serialise");
-        // First what the other promises: --resume needs none of the files that this run began with.
+        // The checkpoint comes first: config.json promises that --resume needs none of the files that this
+        // run began with.
         checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
         atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
     }
@@ -165,11 +167,11 @@ pub fn run(
     Ok(())
 }
 
-/// Warns of steps that were skipped beside the `taken` ones since the last row of the log before which some
-/// were.
+/// Warns of skipped steps. `skipped` and `taken` count the steps since the last row of the log before which
+/// some step was taken.
 ///
 /// # Errors
-/// None was taken, in [`MOST_SKIPPED`] steps or more.
+/// No step was taken, and at least [`MOST_SKIPPED`] were skipped.
 fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(TrainEvent)) -> Result<()> {
     if taken == 0 && skipped >= MOST_SKIPPED {
         return Err(Error::invalid(
@@ -189,8 +191,8 @@ fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(T
     Ok(())
 }
 
-/// Gives a network its prefilter: the one asked for, the one it began with, or else the built-in one of those
-/// widths.
+/// Gives a network its prefilter: the one asked for, else the one of the weights it began with, else the
+/// built-in one of the same widths.
 fn set_prefilter(network: &mut dyn Network, options: &TrainOptions) -> Result<()> {
     let wanted = &options.network.prefilter;
     if wanted.is_empty() {
@@ -223,17 +225,20 @@ fn draw(dataset: &Dataset, options: &TrainOptions, multiple: usize, step: usize)
     (0..count as u64).into_par_iter().map(crop).collect()
 }
 
-/// Steps in which the learning rate grows to its largest, a tenth of all at most: moments are young then.
+/// Steps in which the learning rate grows to its largest, at most a tenth of all: the optimiser's moments are
+/// averages over few steps then.
 const WARM_UP: usize = 100;
 
-/// Falls along a line from the first step to the last (Defazio et al. 2023), but for the first few.
+/// The learning rate of a step. It falls linearly from the first step to the last (Defazio et al. 2023), but
+/// grows over the first few.
 fn learning_rate((largest, last): (f64, f64), steps: usize, step: usize) -> f64 {
     let done = step as f64 / (steps.max(2) - 1) as f64;
     let warmed = (step + 1) as f64 / WARM_UP.min(steps / 10).max(1) as f64;
     warmed.min(1.0) * (largest + (last - largest) * done)
 }
 
-/// One optimiser step. Returns the loss, and whether it and its gradient were finite: else nothing changed.
+/// One optimiser step. Returns the loss, and whether it and its gradient were finite; if not, nothing
+/// changed.
 fn step(
     network: &mut dyn Network,
     optimizer: &mut Optimizer,
@@ -273,7 +278,7 @@ fn step(
     Ok((value, norm.is_finite()))
 }
 
-/// Moves the averaged weights towards the current ones; young averages forget faster.
+/// Moves the averaged weights towards the current ones, faster in the first steps.
 fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step: usize) {
     let decay = decay.min((1 + step) as f64 / (10 + step) as f64) as f32;
     for (average, current) in average.params().into_iter().zip(network.params()) {

@@ -29,17 +29,17 @@ const NAMES: [&str; 7] = [
     "chrome",
     "microsoft-edge",
 ];
-/// Where installers put it beside the PATH.
+/// Where installers put the browser outside the PATH.
 const PLACES: [&str; 3] = [
     "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
     "/Applications/Chromium.app/Contents/MacOS/Chromium",
     r"C:\Program Files\Google\Chrome\Application\chrome.exe",
 ];
-/// Debian packages that hold one, smallest first.
+/// Debian packages that hold a browser, smallest first.
 const PACKAGES: [&[&str]; 2] = [&["chromium-headless-shell"], &["chromium"]];
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// The program, installed first if need be.
+/// The browser's program, which is installed first if need be.
 fn program() -> PathBuf {
     if let Some(named) = std::env::var_os("DEMC_BROWSER") {
         let named = PathBuf::from(named);
@@ -79,7 +79,7 @@ pub struct Record {
     pub requests: Vec<String>,
 }
 
-/// A browser with one open page. Ends with its value.
+/// A browser with one open page. It ends when this value is dropped.
 pub struct Browser {
     child: Child,
     /// Dropped after the browser was asked to end.
@@ -117,7 +117,7 @@ impl Browser {
         let mut said = BufReader::new(child.stderr.take().expect("stderr is piped"));
         let address = listen_address(&mut said)
             .unwrap_or_else(|said| panic!("{}: no DevTools address:\n{said}", program.display()));
-        // Whatever it says later must not fill the pipe and stop it.
+        // Its output is read to the end, since a full pipe would stop it.
         std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
         let (socket, _) = tungstenite::connect(address.as_str()).expect("DevTools listens");
         if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
@@ -145,7 +145,7 @@ impl Browser {
         browser
     }
 
-    /// Opens a file and waits until it and all that it holds are loaded.
+    /// Opens a file and waits until the page and all that it holds are loaded.
     pub fn open(&mut self, path: &Path) {
         let path = fs::canonicalize(path).unwrap();
         self.record = Record::default();
@@ -166,7 +166,7 @@ impl Browser {
 
     /// Errors and requests since the page was opened.
     pub fn record(&mut self) -> &Record {
-        // Events arrive in order: an answer now comes after all that happened before.
+        // Events arrive in order, so the answer to this comes after all that happened before.
         self.eval("0");
         &self.record
     }
@@ -258,7 +258,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // Asked, it ends all its processes; killed, a wrapper script would leave them behind.
+        // A browser that is asked to close ends all its processes; a killed wrapper script would leave them.
         let close = json!({ "id": u32::MAX, "method": "Browser.close" });
         let _ = self.socket.send(Message::text(close.to_string()));
         for _ in 0..200 {
@@ -272,7 +272,7 @@ impl Drop for Browser {
     }
 }
 
-/// Ends every process of a group, those that a wrapper script left behind too.
+/// Ends every process of a group when it is dropped, those that a wrapper script left behind too.
 struct Group(u32);
 
 impl Drop for Group {

@@ -1,10 +1,11 @@
-//! Programs of Debian's packages, installed where a test may: as root, where there is `apt-get`.
+//! Installs programs of Debian's packages where a test may do so: as root, on a system with `apt-get`.
 
 use std::process::{Command, Stdio};
 
-/// Whether one of the choices could be installed; each is the packages that go together.
+/// Installs the first choice that can be installed; returns whether there was one. A choice is one or more
+/// packages that go together.
 pub fn install(choices: &[&[&str]]) -> bool {
-    // An old list of packages names files that are gone; a failed update may still leave a good one.
+    // An old list of packages names files that are gone. If the update fails, the list may still be good.
     let _ = apt(&["update"]);
     choices.iter().any(|packages| {
         let mut arguments = vec!["install", "--no-install-recommends"];

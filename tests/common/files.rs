@@ -65,7 +65,7 @@ pub fn write_render(path: &Path, width: usize, height: usize, value: impl Fn(&st
     Image::from_layer(layer).write().to_file(path).unwrap();
 }
 
-/// Parts of 4x3 pixels of these names, whose channels are called R, G and B and no more.
+/// Writes parts of 4x3 pixels with these names, whose channels are called just R, G and B.
 pub fn write_bare_parts(path: &Path, names: &[&str]) {
     let part = |name: &&str| {
         let list = ["R", "G", "B"].map(|c| AnyChannel::new(c, FlatSamples::F32(vec![0.5; 12])));
@@ -77,7 +77,7 @@ pub fn write_bare_parts(path: &Path, names: &[&str]) {
     Image::from_layers(shared, parts).write().to_file(path).unwrap();
 }
 
-/// Name, type and value.
+/// The name, type and value of an attribute.
 pub type Stored = (String, String, Vec<u8>);
 
 /// The attributes of a file's first part in their order, and where the header ends.

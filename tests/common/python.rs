@@ -15,7 +15,7 @@ use std::{
 
 /// The only Python that bpy 4.5 and 5.0 install on.
 const VERSION: &str = "3.11";
-/// Written last: an environment without it is unfinished and made anew.
+/// A file that is written last; an environment without it is unfinished and made anew.
 const MARKER: &str = "complete";
 
 /// An installed environment.
@@ -51,12 +51,12 @@ pub fn environment() -> &'static Environment {
     ENVIRONMENT.get_or_init(|| environment_of("requirements.txt"))
 }
 
-/// Its interpreter.
+/// The interpreter of [`environment`].
 pub fn python() -> PathBuf {
     environment().python()
 }
 
-/// The Pythons whose bpy all must hold on.
+/// The Pythons with the versions of bpy on which the scripts must work.
 pub fn blenders() -> Vec<PathBuf> {
     let older = std::env::var_os("DEMC_BPY45").map(PathBuf::from);
     if older.is_none() {
@@ -65,7 +65,7 @@ pub fn blenders() -> Vec<PathBuf> {
     [python()].into_iter().chain(older).collect()
 }
 
-/// One of its programs: `idiff`, `oiiotool`.
+/// A program of [`environment`]: `idiff`, `oiiotool`.
 pub fn program(name: &str) -> PathBuf {
     environment().program(name)
 }
@@ -132,7 +132,7 @@ fn find_python() -> PathBuf {
         })
 }
 
-/// Runs to success and returns stdout; panics with the program's own words otherwise.
+/// Runs a command that must succeed and returns its stdout; panics with the program's own words otherwise.
 pub fn run(command: &mut Command) -> String {
     let output = output(command);
     assert!(

@@ -45,7 +45,7 @@ fn span(text: &str) -> Result<Span, String> {
         Some((frames, step)) => (frames, number(step)?),
         None => (text, 1),
     };
-    // A minus in front is the number's own.
+    // A minus in front belongs to the number.
     let (first, last) = match frames.get(1..).and_then(|rest| rest.find('-')) {
         Some(at) => (number(&frames[..=at])?, number(&frames[at + 2..])?),
         None => (number(frames)?, number(frames)?),
@@ -69,7 +69,7 @@ impl Frames {
         frame_number(&input.file).is_some_and(|frame| self.contains(frame))
     }
 
-    /// The files of these frames. Single frames asked for that no file is of are told.
+    /// The files of these frames. Warns of single frames that were asked for and have no file.
     ///
     /// # Errors
     /// There is no such file.

@@ -177,7 +177,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         None => Work::of(&args, &search)?,
         Some(idle) => Work::Watch(watch(&args, search, idle)?, idle),
     };
-    // Before anything runs in parallel, as opening a model does.
+    // This comes before anything runs in parallel, as opening a model does.
     if let Some(threads) = args.threads {
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads.into())
@@ -264,7 +264,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     })
 }
 
-/// Adds a frame to the list of expected errors; what was there already has noted its own.
+/// Adds a frame to the list of expected errors. A result that existed already has noted its own.
 fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
     let (errors, samples): (Vec<f64>, _) = match outcome {
         Outcome::Done(report) => (report.expected_error.into_iter().collect(), report.samples),
@@ -280,11 +280,11 @@ fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
     }
 }
 
-/// What there is to do.
+/// The work of a batch.
 enum Work {
     /// Files that are there, and inputs that name none.
     List { jobs: Vec<Job>, unusable: Vec<(PathBuf, Error)> },
-    /// Files that are coming in, and for how many seconds none may before it ends.
+    /// Files that are coming in, and after how many seconds without a new one it ends.
     Watch(Watch, Option<u32>),
 }
 
@@ -299,11 +299,11 @@ impl Work {
     }
 }
 
-/// A watch over the inputs, for files that are there and others that come.
+/// A watch over the inputs, for files that exist and others that are to come.
 ///
 /// # Errors
-/// Of what is there already, two results would have one path, or one that of its input; or a glob is
-/// malformed.
+/// Among the files that exist, two results would have the same path, or a result that of its input; or a glob
+/// is malformed.
 fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
     let (inputs, frames, out) = (args.inputs.clone(), args.frames.clone(), args.out.clone());
     let is_wanted = move |input: &denoise::Input| frames.as_ref().is_none_or(|frames| frames.has(input));

@@ -58,7 +58,7 @@ struct Details<'a> {
     light_groups: &'a [String],
     /// Samples of a pixel; null where the file does not tell.
     samples: Option<u32>,
-    /// Whether Blender had denoised Combined, and its pass Noisy Image was taken.
+    /// Whether Blender had denoised Combined, so that its pass Noisy Image was denoised instead.
     was_denoised: bool,
     /// The result's expected RelMSE; null where the model does not tell.
     expected_error: Option<f64>,
@@ -110,7 +110,7 @@ impl Progress {
         self.bar.set_position(count as u64);
         let pace = self.pace(count);
         self.bar.set_prefix(pace.clone());
-        // A terminal has it in its bar.
+        // On a terminal the bar shows the pace.
         let pace = if self.bar.is_hidden() { pace } else { String::new() };
         let place = match self.total {
             Some(1) => String::new(),
@@ -142,7 +142,7 @@ impl Progress {
         }
     }
 
-    /// Frames a second so far, of those that were denoised: those there already take no time.
+    /// Frames a second so far. Results that existed already take no time and do not count.
     fn speed(&self) -> Option<f64> {
         (self.done > 0).then(|| self.done as f64 / self.start.elapsed().as_secs_f64().max(1e-3))
     }
@@ -162,7 +162,7 @@ impl Progress {
                     summary += &format!(", {count} {what}");
                 }
             }
-            // Of a watch it would tell how fast frames come in.
+            // For a watch the speed would tell how fast frames come in.
             if let (Some(speed), Some(_)) = (self.speed(), self.total) {
                 summary += &format!(" ({speed:.2} frames/s)");
             }

@@ -28,7 +28,7 @@ pub struct FileReport {
     pub expected_errors: Vec<ExpectedError>,
     /// What is wrong with the file, or with the shot that it belongs to.
     pub findings: Vec<Finding>,
-    /// The first view layer with a beauty, to be held against that of the frame that follows.
+    /// The trace of the first view layer with a beauty, for comparison with the frame that follows.
     #[serde(skip)]
     pub trace: Option<Trace>,
 }
@@ -46,7 +46,7 @@ pub struct PartReport {
     pub height: usize,
     pub compression: &'static str,
     pub tiles: Option<(usize, usize)>,
-    /// Kept as it is, and not decoded.
+    /// Whether the part is deep, so that it is kept as it is and not decoded.
     pub deep: bool,
     pub bytes: usize,
     pub channels: usize,
@@ -84,7 +84,7 @@ pub struct PassReport {
 #[derive(Serialize)]
 pub struct ModelReport {
     pub model: String,
-    /// Whether it can denoise the layer: what is missing it can do without.
+    /// Whether it can denoise the layer, since it can do without the passes that are missing.
     pub works: bool,
     pub missing: Vec<Missing>,
 }
@@ -179,7 +179,7 @@ fn windows(frame: &Frame) -> Vec<Finding> {
     differing.into_iter().map(warn).collect()
 }
 
-/// What is listed but cannot be denoised, each kind once.
+/// Findings on parts that are listed but cannot be denoised, each kind once.
 fn undecodable(frame: &Frame) -> Vec<Finding> {
     let mut told = HashSet::new();
     let mut findings = Vec::new();

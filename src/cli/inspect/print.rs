@@ -62,7 +62,7 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
         let zero = if pass.all_zero == Some(true) { "  all zero" } else { "" };
         writeln!(out, "    {:<22}{:<7}{}{alias}{zero}", pass.pass, pass.kind, pass.compression)?;
     }
-    // By layer, not by channel: `ViewLayer.Mist`, not `ViewLayer.Mist.Z`.
+    // Layers are listed, not channels: `ViewLayer.Mist`, not `ViewLayer.Mist.Z`.
     let mut others: Vec<&str> = layer
         .unrecognised
         .iter()
@@ -76,7 +76,8 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
     write_findings(out, "    ", &layer.findings)
 }
 
-/// Models that are ready in one line, then what each of the others misses, those alike together.
+/// Writes the models that are ready in one line, then what the others lack; models that lack the same share a
+/// line.
 fn write_models(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
     let mut groups: Vec<(Vec<&str>, &ModelReport)> = Vec::new();
     for model in &layer.models {

@@ -1,8 +1,8 @@
-//! `report.html`: everything of a run on one page that needs nothing but itself.
+//! `report.html`: everything of a run on one page, which refers to no other file.
 //!
 //! In: rows, summaries, charts and sheets. Out: an HTML document with its style, script, charts (SVG)
-//! and sheets (JPEG) inside; its policy forbids the browser to fetch anything. Text is escaped by
-//! `maud`, whatever scenes and files are called.
+//! and sheets (JPEG) inside; its policy forbids the browser to fetch anything. `maud` escapes all text, so
+//! scenes and files may have any name.
 
 mod table;
 
@@ -43,11 +43,11 @@ pub struct Page<'a> {
     pub provenance: &'a Provenance,
 }
 
-/// Fetch nothing, whatever the page holds.
+/// The content security policy: the browser fetches nothing, whatever the page holds.
 const POLICY: &str =
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
 
-/// A page of that title, which is its first heading too, with the style, script and policy of all.
+/// A page whose title is also its first heading, with the style, script and policy that all pages share.
 pub fn document(title: &str, body: &Markup) -> Markup {
     html! {
         (DOCTYPE)
@@ -151,7 +151,7 @@ impl Page<'_> {
         self.summaries.iter().filter(|s| s.spp.is_none())
     }
 
-    /// Who wins, before any table.
+    /// The best methods by RelMSE, SSIM and time, which the page names before any table.
     fn best(&self) -> Markup {
         let winner = |value: fn(&MethodSummary) -> Option<f64>, sign: f64| {
             let scored = self.overall().filter(|s| s.model != NOISY);
@@ -291,12 +291,12 @@ impl Page<'_> {
     }
 }
 
-/// Where the page holds a pair; pairs may share a name.
+/// The anchor of a pair in the page, which is a number because pairs may share a name.
 fn anchor(index: usize) -> String {
     format!("scene-{}", index + 1)
 }
 
-/// A statistic of a metric of the summary.
+/// A column of the summary that shows one statistic of one metric.
 macro_rules! statistic {
     ($heading:literal, $hint:literal, $better:ident, $show:ident, $metric:literal, $field:ident) => {
         Column {
@@ -361,7 +361,7 @@ const SUMMARY: [Column<MethodSummary>; 14] = [
     },
 ];
 
-/// A column of a scene's table, named like the field of the row.
+/// A column of a scene's table that shows one field of the row.
 macro_rules! cell {
     ($heading:literal, $better:ident, $show:ident, $field:ident) => {
         Column {

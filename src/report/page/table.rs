@@ -5,12 +5,12 @@ use plotters::prelude::RGBColor;
 
 use crate::report::NOISY;
 
-/// Which end of a column is the better one, and comes first when it is sorted.
+/// Which values of a column are better, and come first when the page is sorted by it.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Better {
     Low,
     High,
-    /// A fact, not a merit.
+    /// The column is a fact, such as a count, in which no value is better.
     Neither,
 }
 
@@ -112,7 +112,7 @@ pub fn ratio(value: f64) -> String {
     format!("{value:.2} ×")
 }
 
-/// A whole number; below ten, with a digit more.
+/// A whole number, or one decimal for fractions below ten.
 pub fn whole(value: f64) -> String {
     if value.abs() < 10.0 && value.fract() != 0.0 { format!("{value:.1}") } else { format!("{value:.0}") }
 }
