@@ -2,8 +2,8 @@
 //! beside its inverse) and on how a frame is padded to what a network can halve.
 //!
 //! Whoever changes what a network reads changes
-//! [`Architecture::inputs`](crate::models::network::Architecture::inputs) with it, by which weights trained
-//! on something else are refused.
+//! [`Architecture::inputs`](crate::models::network::Architecture::inputs) with it, so that weights trained on
+//! something else are refused.
 
 mod black;
 mod fireflies;

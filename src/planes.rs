@@ -191,7 +191,7 @@ pub fn mirror_beyond(row: &mut [f32], width: usize) {
     beyond.iter_mut().zip(width..).for_each(|(out, x)| *out = inside[mirrored(x, width)]);
 }
 
-/// The index, of `n`, that index `i` falls on where indices run to and fro between the first and the last.
+/// The index below `n` that index `i` falls on when indices run to and fro between the first and the last.
 pub fn mirrored(i: usize, n: usize) -> usize {
     let period = (2 * n).saturating_sub(2).max(1);
     (i % period).min(period - i % period)

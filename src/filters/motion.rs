@@ -1,8 +1,8 @@
 //! Where the content of a frame lies in other frames of its sequence, and planes sampled there.
 //!
 //! In: Vector passes as Cycles writes them. They count rows upwards and frames point at both neighbours: with
-//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before, and will be at (x - Z, y
-//! + W) one frame later. Steps can be chained: each uses the vectors of the frame in which the step before it
+//! rows counted downwards, what is at (x, y) was at (x + X, y - Y) one frame before. One frame later it will
+//! be at (x - Z, y + W). Steps can be chained: each uses the vectors of the frame in which the step before it
 //! ended. Vectors are those of the surface that the camera sees first; what mirrors and glass show, and
 //! shadows, move otherwise.
 

@@ -191,8 +191,8 @@ impl Input<'_> {
                 }
                 add(channels, &[1.0; LANES]);
                 if self.influence {
-                    // The prediction at q is b^T A^-1 (... + w b colour_q): it follows the colour at q by w
-                    // |L^-1 b|^2.
+                    // The prediction at q is b^T A^-1 (... + w b colour_q), so it follows colour_q by
+                    // w |L^-1 b|^2.
                     matrix.forward(&mut basis);
                     let mut value = [0.0; LANES];
                     for b in &basis {

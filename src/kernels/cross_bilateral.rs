@@ -74,8 +74,8 @@ impl CrossBilateral<'_> {
         });
     }
 
-    /// Backpropagates the output's gradient, (3, H, W), to the precisions and adds the result to `into`, (2 +
-    /// groups, H, W). `output` and `total` are those of [`CrossBilateral::apply`].
+    /// Backpropagates the output's gradient, (3, H, W), to the precisions. The result, (2 + groups, H, W), is
+    /// added to `into`. `output` and `total` are those of [`CrossBilateral::apply`].
     ///
     /// # Panics
     /// If lengths do not fit the size.

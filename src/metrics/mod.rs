@@ -1,10 +1,10 @@
 //! How far an image is from its reference: pure functions on linear radiance, (3, H, W).
 //!
-//! Each family of metrics is one file with its formulas, constants and sources: [`error`]
-//! (RelMSE, RMSE, maximum error, SMAPE), [`ssim`] on the display image of [`display`], and [`flip`] for what
-//! an eye notices. [`score`] computes all of these. [`flicker`] is measured on a sequence, from two frames
-//! and the motion between them. [`pairing`] tells whether an image and its reference belong together. Sums
-//! run in f64 row by row in a fixed order, so the number of threads does not change a digit.
+//! Each family of metrics is one file with its formulas, constants and sources: [`error`] (RelMSE, RMSE,
+//! maximum error, SMAPE), [`ssim`] on the display image of [`display`], and [`flip`] for what an eye notices.
+//! [`score`] computes all of these. [`flicker`] is measured on a sequence, from two frames and the motion
+//! between them. [`pairing`] tells whether an image and its reference belong together. Sums run in f64 row by
+//! row in a fixed order, so the number of threads does not change a digit.
 
 use std::fmt;
 

@@ -2,12 +2,12 @@
 //! object moved between the two, the difference counts as an error of every method, and teaches a network to
 //! blur.
 //!
-//! If they do, the mean luminances of their squares of 16x16 pixels differ by noise alone. Noise with few
-//! bright samples leaves some squares too dark and hardly one too bright. Another texture or place makes some
-//! squares brighter and others darker, and another exposure changes nearly all of them in one direction. So
-//! two shares of the squares are tested: the smaller one of those too bright and those too dark, and the
-//! larger one, which has to be most of the picture. This is the project's own test; on 300 pairs that belong
-//! together the two are at most 0.5% and 17%.
+//! If they show the same scene, the mean luminances of their squares of 16x16 pixels differ by noise alone.
+//! Noise with few bright samples leaves some squares too dark and hardly one too bright. Another texture or
+//! place makes some squares brighter and others darker, and another exposure changes nearly all of them in
+//! one direction. So two shares of the squares are tested: the smaller one of those too bright and those too
+//! dark, and the larger one, which has to be most of the picture. This is the project's own test; on 300
+//! pairs that belong together the two are at most 0.5% and 17%.
 
 use std::fmt::Display;
 

@@ -128,7 +128,7 @@ pub trait Denoiser: Send + Sync {
     }
 }
 
-/// Fails if there are companions. For methods that take none.
+/// Fails if there are companions; called by methods that take none.
 pub(super) fn refuse_companions(name: &str, companions: &[Companion]) -> Result<()> {
     if companions.is_empty() {
         return Ok(());

@@ -327,7 +327,7 @@ pub struct Prediction<T> {
     pub corners: Field<T>,
 }
 
-/// What the head of full resolution predicts besides the kernels of its level.
+/// What the head of full resolution predicts besides the [`Prediction`] of its level.
 pub struct Finish<T> {
     /// Logits of the gains, (N, 3, H, W).
     pub gain: Field<T>,
