@@ -9,9 +9,9 @@ r the frame's reference and t that reference denoised in the same way, and <a, b
 RelMSE of Open Image Denoise:
 - <x, x>, which is the ratio of the two RelMSE;
 - <x, t>, the noise of the reference: the error that even a frame without any noise would have, plus the
-detail that x and t both lack;
+  detail that x and t both lack;
 - <x, y>, the error that both have in common: noise of the reference, what the samples do not tell, and what
-both blur.
+  both blur.
 
 The last line holds geometric means.
 """

@@ -44,7 +44,7 @@ def _upsampling(inputs, outputs):
 
 
 def filtered(image, logits, confidence):
-    """Filters an image by softmax kernels. `logits`, (N, k*k, H, W), get each neighbour's confidence added."""
+    """Filters an image by softmax kernels. To `logits`, (N, k*k, H, W), confidence is added."""
     n, channels, h, w = image.shape
     k = math.isqrt(logits.shape[1])
     pad = (k // 2,) * 4
