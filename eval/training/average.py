@@ -3,8 +3,8 @@
 
     average.py A.safetensors B.safetensors ... --out FILE
 
-All files hold the same tensors in half precision (what `demc train` writes); the metadata is that of the
-last, with the largest range that any of them knows for a layer. Needs numpy.
+All files hold the same tensors in half precision, as `demc train` writes them. The metadata is that of the
+last file, with the largest range that any of the files holds for a layer. Needs numpy.
 """
 
 import argparse

@@ -1,12 +1,13 @@
-"""Copies a test set with its guides denoised: what a better filter of the albedo could gain, at most.
+"""Copies a test set with its guides denoised, which shows how much a better filter of the albedo could gain
+at most.
 
     python clean_guides.py '../shared/data/val/*_0004spp.exr' OUT --oidn PATH/oidnDenoise --guides albedo
 
-The noisy frames keep their Combined pass; the passes named by --guides are replaced by what Open Image
-Denoise, quality high, makes of them; with --spp N by those of a render with as many samples, where
-<scene>_<N>spp.exr lies beside the frame, and other frames are left out. References are copied. With
---keep-quotient, Combined is scaled by clean over noisy albedo, so that a model that divides by the albedo
-it is given divides by the noisy one in effect.
+The noisy frames keep their Combined pass. The passes named by --guides are replaced by what Open Image
+Denoise, quality high, makes of them. With --spp N they are replaced by those of a render with N samples,
+<scene>_<N>spp.exr beside the frame, and frames without such a render are left out. References are copied.
+With --keep-quotient, Combined is scaled by the ratio of clean to noisy albedo, so that a model that divides
+it by the clean albedo gets what the original gives when divided by the noisy one.
 """
 
 import argparse

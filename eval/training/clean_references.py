@@ -2,11 +2,12 @@
 
     python clean_references.py PAIRS OUT --oidn PATH/oidnDenoise
 
-Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high, with its own albedo and normal
-as guides, or those of the scene's noisy frame where it has none, denoised first, and keeps what it was as
-Noisy Image. Noisy frames are copied as they are. What is there already is kept. With --join N, the reference
-is first averaged with the scene's frame of N samples, for references that have as many: that frame is then no
-longer one of the pairs, since a network would learn to keep the noise that both share.
+Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high. Its guides, which are denoised
+first, are its own albedo and normal, or those of the scene's noisy frame where it has none. The reference as
+rendered is kept in it as Noisy Image. Noisy frames are copied as they are, and files that exist already are
+kept. With --join N, for references of N samples, the reference is first averaged with the scene's frame of N
+samples. That frame is then no longer one of the pairs, since a network would learn to keep the noise that
+both share.
 """
 
 import argparse
@@ -26,18 +27,18 @@ from demc_blender import exr
 
 
 def pairs(folder):
-    """(scene, reference, its noisy frames) of a folder, frame by frame of sequences."""
+    """Each (scene, reference, its noisy frames) of a folder; every frame of a sequence is one."""
     folder = glob.escape(folder)
     for reference in sorted(glob.glob(os.path.join(folder, "*_ref.exr")) + glob.glob(os.path.join(folder, "*_ref.*.exr"))):
         scene, frame = re.fullmatch(r"(.+)_ref((?:\.-?\d+)?)\.exr", os.path.basename(reference)).groups()
-        # Half buffers and further noise seeds of a still go with it.
+        # Half buffers and further noise seeds of a still are among its noisy frames.
         ending = f"*{glob.escape(frame)}.exr" if frame else "*.exr"
         noisy = glob.glob(os.path.join(folder, glob.escape(scene) + "_[0-9]*spp" + ending))
         yield scene + frame, reference, sorted(noisy)
 
 
 def planes(channels, ending, letters):
-    """The channels of the one pass whose name ends so, (height, width, 3)."""
+    """The channels of the only pass whose name ends in `ending`, (height, width, 3), and their names."""
     found = [[c for c in channels if c.endswith(f"{ending}.{letter}")] for letter in letters]
     if any(len(names) != 1 for names in found):
         raise ValueError(f"no single pass {ending}")
@@ -66,8 +67,8 @@ def read_pfm(path):
 
 
 def denoise(oidn, folder, output, *flags, **images):
-    """What oidnDenoise, quality high, makes of the images of some options (`--hdr`, `--alb`, `--nrm`), as an
-    image and as `output`.pfm in `folder`; an image may be the name of such a file."""
+    """Runs oidnDenoise, quality high, on images given by their options (`--hdr`, `--alb`, `--nrm`). An image
+    may be the name of a PFM file in `folder`. Returns the result, which also stays there as `output`.pfm."""
     path = lambda name: os.path.join(folder, name + ".pfm")
     arguments = []
     for option, image in images.items():
@@ -81,7 +82,7 @@ def denoise(oidn, folder, output, *flags, **images):
 
 
 def clean(oidn, folder, radiance, frame):
-    """Radiance without its noise; `frame` are the channels of the frame whose guides help."""
+    """Denoised radiance; `frame` holds the channels of the frame from which the guides are taken."""
     albedo, _ = planes(frame, "Denoising Albedo", "RGB")
     normal, _ = planes(frame, "Denoising Normal", "XYZ")
     denoise(oidn, folder, "albedo", **{"--alb": albedo})
@@ -91,7 +92,7 @@ def clean(oidn, folder, radiance, frame):
 
 
 def joined(noisy, samples):
-    """Of a scene's noisy frames, those to copy, and those of so many samples."""
+    """Splits a scene's noisy frames into those to copy and those of `samples` samples."""
     is_joined = lambda path: samples is not None and re.search(rf"_0*{samples}spp\b", os.path.basename(path))
     return [path for path in noisy if not is_joined(path)], [path for path in noisy if is_joined(path)]
 

@@ -3,11 +3,12 @@ of a manifest.
 
     python distance.py MANIFEST --model WEIGHTS --oidn PATH/oidnDenoise [--demc PATH/demc] [--most 110]
 
-Pairs of 4 samples whose references were denoised and keep what they were as Noisy Image. Printed for all
-of them and for each third, ordered by the RelMSE of Open Image Denoise: the geometric mean of the ratio of
-RelMSE, both against the denoised reference, and the median of (ours - its) / ours with both taken against
-the noisy one. The former favours whoever errs as the denoiser of the references does; the noise of the
-latter is the same for both and cancels.
+It reads pairs of 4 samples whose references were denoised and keep the reference as rendered as Noisy Image.
+For all of them, and for each third in the order of Open Image Denoise's RelMSE, it prints two numbers. The
+first is the geometric mean of the ratio of RelMSE, both against the denoised reference; it favours whoever
+errs as the denoiser of the references does. The second is the median of (ours - its) / ours, where the
+difference is of errors against the noisy reference, whose noise is the same for both and cancels, and the
+denominator is our RelMSE against the denoised one.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from methods import add_options, both
 
 
 def errors(ours, theirs, denoised, raw):
-    """RelMSE of both against a denoised reference, and the difference of both against a noisy one."""
+    """RelMSE of both against a denoised reference, and the difference of their errors against a noisy one."""
     weight = 1 / (denoised**2 + 1e-3)
     relmse = [float(((image - denoised) ** 2 * weight).mean()) for image in (ours, theirs)]
     return *relmse, float(((ours - theirs) * (ours + theirs - 2 * raw) * weight).mean())

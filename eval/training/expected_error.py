@@ -1,18 +1,18 @@
-"""Trains what tells how far off a denoised frame is: src/filters/shrinkage/expected.rs.
+"""Trains the perceptron that tells how far off a denoised frame is: src/filters/shrinkage/expected.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m  (others likewise)
     python expected_error.py FEATURES/* --hold-out --out ../../src/filters/shrinkage/expected.safetensors
 
 With --hold-out it reports what it reaches on views that it did not see: the rank correlation with the true
-error over squares of 8x8 pixels, and for each tenth of them, ordered by what was expected, the true error
-over the expected one.
+error over squares of 8x8 pixels, and for each tenth of them, ordered by the expected error, the ratio of the
+true error to the expected one.
 
-What is learned is the mean of the squared error over squares of 4x4 pixels, relative to the reference's
-squared light: what is made least is the deviance of a gamma distribution, t / e + ln(e) for an error t and an
-expected e, which an e equal to the mean of t makes least however wide t is spread. The product of the
-differences to two references that share no noise is, in the mean, the squared error without their noise. So a
-pair is listed twice, the second time with `_b` after its scene's name and another reference; of a pair that
-is listed once, the reference as rendered and as it was denoised serve as two. Needs torch and safetensors.
+It learns the mean of the squared error over squares of 4x4 pixels, relative to the reference's squared light.
+The loss is the deviance of a gamma distribution, t / e + ln(e) for an error t and an expected error e. It is
+least where e equals the mean of t, however widely t is spread. The product of the differences to two
+references that share no noise is, in the mean, the squared error without their noise. So a pair is listed
+twice, the second time with `_b` after its scene's name and another reference. Of a pair that is listed once,
+the reference as rendered and the denoised reference serve as the two. Needs torch and safetensors.
 """
 
 import argparse
@@ -29,16 +29,16 @@ from torch.nn import functional as F
 import perceptron
 from perceptron import KNOWN, SAMPLES, Perceptron, Standard
 
-# As in features.rs, expected.rs and mod.rs beside it.
+# The same constants as in features.rs, expected.rs and mod.rs of src/filters/shrinkage.
 SQUARE = 4
 FLOOR, BLACK, TINY, LARGEST_CHANGE, LEAST, MOST = 0.02, 0.001, 1e-8, 100.0, -14.0, 4.0
 WINDOW = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0])
 
-# Added to both errors: what is smaller counts as alike.
+# Added to the true and to the expected error, so that smaller errors count as alike.
 SMALL = 2e-6
 BATCH, HELD_OUT = 32, 5
 
-# A squared relative error that is none, added to both where their quotient is reported.
+# A squared relative error that counts as none, added to both where their quotient is reported.
 NO_ERROR = 1e-4
 
 
@@ -55,7 +55,7 @@ def around(squares):
 
 
 def read(folders):
-    """All frames as they were rendered: features (38, h, w), errors (1, h, w) and facts (scene, samples), each."""
+    """All frames as they were rendered, each as (features (38, h, w), errors (1, h, w), scene, samples)."""
     paths = {}
     for path in sorted(path for folder in folders for path in glob.glob(os.path.join(folder, "*_0.safetensors"))):
         scene, again, samples = re.match(r"\d+_(.+?)(_b)?_(\d+)spp_0", os.path.basename(path)).groups()
@@ -87,7 +87,7 @@ class Expecting(Perceptron):
 
 
 def train(frames, steps, seed):
-    """The perceptron, and what standardises its features."""
+    """Returns the trained perceptron and what standardises its features."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     features = torch.stack([frame[0] for frame in frames])
@@ -97,7 +97,7 @@ def train(frames, steps, seed):
     model = Expecting(features.shape[1], [-6.0])
     optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
-    # Each number of samples is drawn as often as any other, however many frames it has.
+    # Each number of samples is drawn equally often, unless it has fewer than 20 frames.
     of_count = {count: sum(frame[3] == count for frame in frames) for count in {frame[3] for frame in frames}}
     weights = torch.tensor([1 / max(of_count[frame[3]], 20) for frame in frames])
     for step in range(steps):
@@ -107,7 +107,7 @@ def train(frames, steps, seed):
         blurred = (logs[at] + 0.4 * torch.randn(BATCH, generator=generator)).clamp_min(0)
         seen[:, SAMPLES], seen[:, KNOWN] = (blurred * known).view(-1, 1, 1), known.view(-1, 1, 1)
         expected = model(standardise(seen)).exp()
-        # Over squares of 8x8, by which it is judged; the largest ones count by their logarithm.
+        # The loss is over squares of 8x8, by which it is judged; the largest errors count by their logarithm.
         expected, error = (F.avg_pool2d(planes, 2) + SMALL for planes in (expected, errors[at]))
         ratio = error / expected
         ratio = torch.where(ratio > 30, 30 + 30 * torch.log(ratio.clamp_min(1) / 30), ratio).clamp_min(-3)
@@ -119,12 +119,12 @@ def train(frames, steps, seed):
 
 
 def ranks(values):
-    """The place of each value in their order."""
+    """The rank of each value."""
     return np.argsort(np.argsort(values))
 
 
 def report(name, frames, model, standardise):
-    """Prints how what is expected of frames goes with what is true."""
+    """Prints how the expected errors of frames agree with the true ones."""
     if not frames:
         return
     pairs = []

@@ -1,5 +1,5 @@
-"""Reads and writes manifests of pairs as demc does: CSV with the header scene,noisy,reference,spp, its
-paths relative to it."""
+"""Reads and writes manifests of pairs as demc does: CSV with the header scene,noisy,reference,spp and paths
+relative to the manifest."""
 
 import csv
 import os
@@ -8,7 +8,7 @@ HEADER = ("scene", "noisy", "reference", "spp")
 
 
 def read(path):
-    """The rows of a manifest, a dictionary each, with paths that hold in the working directory.
+    """The rows of a manifest, a dictionary each, with paths as seen from the working directory.
 
     Lines that begin with # are comments.
     """
@@ -22,7 +22,7 @@ def read(path):
 
 
 def write(path, rows):
-    """Writes (scene, noisy, reference, spp) rows, whose paths hold in the working directory."""
+    """Writes (scene, noisy, reference, spp) rows, whose paths are as seen from the working directory."""
     folder = os.path.dirname(path) or "."
     rows = [(scene, relative(noisy, folder), relative(reference, folder), spp) for scene, noisy, reference, spp in rows]
     with open(path, "w", encoding="utf-8", newline="") as file:
@@ -30,9 +30,9 @@ def write(path, rows):
 
 
 def relative(path, folder):
-    """A file's path from a folder on.
+    """A file's path relative to a folder.
 
-    Links to folders are followed first, for which `..` is another place; the file keeps its name.
+    Links to folders are resolved first, since `..` behind a link leads elsewhere; the file keeps its name.
     """
     place, name = os.path.split(path)
     return os.path.normpath(os.path.join(os.path.relpath(os.path.realpath(place), os.path.realpath(folder)), name))

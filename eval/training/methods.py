@@ -1,4 +1,4 @@
-"""What demc and Open Image Denoise make of a frame, for the scripts that compare them."""
+"""Denoises a frame by demc and by Open Image Denoise, for the scripts that compare them."""
 
 import os
 import subprocess
@@ -14,14 +14,14 @@ def add_options(parser):
 
 
 def demc(program, model, path, folder):
-    """What `demc denoise` makes of a frame, (height, width, 3), by way of `folder`."""
+    """The result of `demc denoise` on a frame, (height, width, 3); its file is written into `folder`."""
     out = os.path.join(folder, "out")
     subprocess.run([program, "denoise", path, "--model", model, "--out", out, "--overwrite"], check=True, capture_output=True)
     return planes(exr.read(os.path.join(out, os.path.basename(path))), "Denoised", "RGB")[0]
 
 
 def both(options, path, folder):
-    """What the model makes of a frame, and Open Image Denoise, quality high with guides denoised first."""
+    """The results of the model and of Open Image Denoise, quality high with guides denoised first."""
     frame = exr.read(path)
     theirs = clean(options.oidn, folder, planes(frame, "Combined", "RGB")[0], frame)
     return demc(options.demc, options.model, path, folder), theirs

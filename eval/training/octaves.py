@@ -3,9 +3,9 @@ denoised first.
 
     python octaves.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise
 
-The error over the reference is parted into what squares of 2, 4, ... 64 pixels differ by from those twice
-as large, and the rest. Printed is, for each, its share of Open Image Denoise's squared error (the mean
-over frames), and the geometric mean of the ratio.
+The error relative to the reference is split into octaves: the differences between squares of 1, 2, ... 32
+pixels and those twice as large, and the rest. For each octave it prints its share of Open Image Denoise's
+squared error (the mean over frames), and the geometric mean of the ratio of the model's to it.
 """
 
 import argparse
@@ -21,7 +21,7 @@ OCTAVES = 6
 
 
 def energies(error):
-    """Mean square of each octave of a (height, width, 3) image, finest first, then of what is left."""
+    """Mean square of each octave of a (height, width, 3) image, finest first, then of the rest."""
     found = []
     for _ in range(OCTAVES):
         height, width = (n // 2 * 2 for n in error.shape[:2])

@@ -5,10 +5,10 @@ from safetensors.numpy import save_file
 from torch import nn
 from torch.nn import functional as F
 
-# As in perceptron.rs.
+# The same constants as in perceptron.rs.
 HIDDEN, LEAK = 24, 0.1
 
-# Where the number of samples stands among the features: its logarithm to base 2, and whether it is known.
+# Indices of two features: the logarithm to base 2 of the number of samples, and whether that is known.
 SAMPLES, KNOWN = 34, 35
 
 
@@ -23,16 +23,16 @@ class Perceptron(nn.Module):
         self.last.bias.data = torch.tensor(biases)
 
     def outputs(self, standard):
-        """What the last layer says."""
+        """The outputs of the last layer."""
         hidden = F.leaky_relu(self.second(F.leaky_relu(self.first(standard), LEAK)), LEAK)
         return self.last(hidden)
 
 
 class Standard:
-    """Takes the mean off features and divides them by their deviation."""
+    """Subtracts the mean from features and divides them by their standard deviation."""
 
     def __init__(self, features):
-        """Of features (N, features, h, w)."""
+        """Takes mean and deviation from features (N, features, h, w)."""
         self.mean, self.deviation = features.mean((0, 2, 3)), features.std((0, 2, 3)) + 1e-3
         for column, (mean, deviation) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
             self.mean[column], self.deviation[column] = mean, deviation

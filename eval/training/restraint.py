@@ -1,4 +1,5 @@
-"""Trains what decides how much of the render a denoised frame keeps: src/filters/shrinkage/perceptron.rs.
+"""Trains the perceptron that decides how much of the render a denoised frame keeps:
+src/filters/shrinkage/perceptron.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
     python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 \\
@@ -6,11 +7,11 @@
 
 With --hold-out it reports what it reaches on views that it did not see.
 
-What is made least is the squared error of the mixture, relative to the brightness of the place, against
-references that need not be clean: their noise adds the same to every mixture. Each frame counts by how well
-it can be done. Frames with a part of their noise (restraint_features.rs) teach that what has none is kept.
-The number of samples is left out or blurred at random, so that what is measured decides. Needs torch and
-safetensors.
+The loss is the squared error of the mixture, relative to the brightness of the place. References need not be
+clean, since their noise adds the same to every mixture. The loss of each frame is divided by the error that a
+mixture can be expected to reach there. Frames with only a part of their noise (restraint_features.rs) teach
+that a render without noise is kept. The number of samples is left out or blurred at random, so that mostly
+the measured features decide. Needs torch and safetensors.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from torch.nn import functional as F
 import perceptron
 from perceptron import KNOWN, SAMPLES, Perceptron, Standard
 
-# As in restraint.rs and mod.rs beside it.
+# The same constants as in restraint.rs and mod.rs of src/filters/shrinkage.
 SQUARE = 4
 FLOOR, OWN_FLOOR, OWN_RANGE, SNAP, LARGEST_CHANGE = 0.02, 1e-6, 3.0, 1 / 64, 1.5
 
@@ -35,7 +36,7 @@ CROP, BATCH, HELD_OUT = 64, 24, 5
 
 
 class Frames:
-    """All frames of some folders, (N, channels, 128, 128); what is relative is so to the brightness of the
+    """All frames of some folders, (N, channels, 128, 128). Differences are relative to the brightness of the
     place."""
 
     def __init__(self, folders):
@@ -53,7 +54,8 @@ class Frames:
         place = 0.5 * (light + around.clamp_min(0)) + floor
         self.render = ((render - denoised) / place).clamp(-4, 4)
         self.truth = ((truth - denoised) / place).clamp(-4, 4)
-        # The least that a mixture can be expected to reach; the noise of the truth is in both.
+        # The error that a mixture can be expected to reach: that of the better of result and render, less the
+        # noise of the truth, which is in both and is taken for half of it.
         error = lambda image: ((image - self.truth) ** 2).mean((1, 2, 3))
         self.errors = torch.stack([error(0 * self.render), error(self.render)])
         noise_of_truth = self.errors.min(0).values * 0.5
@@ -75,15 +77,15 @@ class Sharing(Perceptron):
 
 
 def weights_of(frames):
-    """How often each frame is drawn: half are whole renders of 8 and more samples, a sixth renders of
-    fewer."""
+    """How often each frame is drawn: half of the draws are renders with all their noise of 8 samples or more,
+    15 % such of fewer samples, and the rest frames with a part of their noise."""
     kind = torch.where(frames.noise < 1, 0, torch.where(frames.samples >= 8, 1, 2))
     share = torch.tensor([0.35, 0.5, 0.15]) / torch.bincount(kind, minlength=3).clamp_min(1)
     return share[kind]
 
 
 def known_samples(samples, noise, generator):
-    """What the perceptron is told of the number of samples: (logarithm, whether it is known)."""
+    """What the perceptron is told of the number of samples: (logarithm to base 2, whether it is known)."""
     draw = torch.rand(len(samples), generator=generator)
     fewer_noise = samples / noise.clamp_min(1 / 64) ** 2
     other = 2 ** (12 * torch.rand(len(samples), generator=generator))
@@ -94,7 +96,7 @@ def known_samples(samples, noise, generator):
 
 
 def train(frames, chosen, steps, seed):
-    """The perceptron, and what standardises its features."""
+    """Returns the trained perceptron and what standardises its features."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     standardise = Standard(frames.features[chosen])
@@ -122,8 +124,8 @@ def train(frames, chosen, steps, seed):
 
 
 def report(frames, chosen, model, standardise):
-    """Mean squared errors on frames that were not trained on, less the noise of the reference as far as it is
-    known."""
+    """Prints mean squared errors on frames that were not trained on, less that of the render, in which the
+    noise of the reference is the same."""
     kinds = sorted({(float(frames.noise[at]), float(frames.samples[at])) for at in chosen})
     print("noise, samples: frames; error less that of the render, in 1e-4: denoised, mixed, mixed without samples; worse than the render")
     for noise, samples in kinds:

@@ -3,13 +3,14 @@ common with it.
 
     python shared_error.py '../shared/data/val/*_0004spp.exr' --model WEIGHTS --oidn PATH/oidnDenoise
 
-With x and y what the two make of a frame (Open Image Denoise: quality high, guides denoised first), r its
-reference and t that reference denoised in the same way, and <a, b> the mean of (a - r) (b - r) / (r^2 +
-0.001), printed is for each frame, over RelMSE <y, y>:
-- <x, x>, the ratio of the two;
-- <x, t>, noise of the reference: what a frame without any noise would still be charged with, plus the
+Let x be the model's result on a frame and y that of Open Image Denoise (quality high, guides denoised first),
+r the frame's reference and t that reference denoised in the same way, and <a, b> the mean of
+(a - r) (b - r) / (r^2 + 0.001). Three numbers are printed for each frame, as ratios to <y, y>, which is the
+RelMSE of Open Image Denoise:
+- <x, x>, which is the ratio of the two RelMSE;
+- <x, t>, the noise of the reference: the error that even a frame without any noise would have, plus the
   detail that x and t both lack;
-- <x, y>, what is wrong with both alike: noise of the reference, what the samples do not tell, and what
+- <x, y>, the error that both have in common: noise of the reference, what the samples do not tell, and what
   both blur.
 
 The last line holds geometric means.

@@ -3,9 +3,9 @@
 python split.py TRAIN.csv HELD_OUT.csv FOLDER... [--pairs FOLDER]
 
 A FOLDER holds manifest.csv (scene, noisy, reference, spp). A scene is held out, with all its views, if the
-CRC-32 of its name up to the seed ("s28136" of "s28136_skin") is a multiple of 12; of its pairs only the
-first noise at 4 spp is scored. A folder after --pairs holds NAME_0004spp.exr and NAME_ref.exr, views
-that are all trained on.
+CRC-32 of its name up to the seed ("s28136" of "s28136_skin") is a multiple of 12; of its pairs only the one
+with the first noise seed at 4 spp is scored. A folder after --pairs holds NAME_0004spp.exr and NAME_ref.exr,
+and all of its views are trained on.
 """
 import argparse, re, zlib
 from pathlib import Path

@@ -7,12 +7,12 @@ import numpy as np
 
 _KEY = "demc"  # src/nn/weights.rs
 
-# What the names of a prefilter's layers begin with in the network that holds it: src/models/pyramid.rs.
+# Prefix of the names of a prefilter's layers in the network that holds it: src/models/pyramid.rs.
 PREFILTER = "prefilter."
 
 
 def read(path):
-    """The facts (network, training, ranges), and the tensors by name in the file's order."""
+    """Returns the facts (network, training, ranges), and the tensors by name in the file's order."""
     data = open(path, "rb").read()
     end = 8 + struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8:end])
@@ -24,7 +24,7 @@ def read(path):
 
 
 def write(path, facts, tensors):
-    """What `read` gives, its tensors in any precision."""
+    """Writes what `read` returns; the tensors may have any precision."""
     header, values = {"__metadata__": {_KEY: json.dumps(facts, separators=(",", ":"))}}, b""
     for name, tensor in tensors.items():
         offsets = [len(values), len(values) + 2 * tensor.size]

@@ -1,4 +1,4 @@
-"""Gives a network the prefilter in another weights file, in the place of its own.
+"""Replaces the prefilter of a network by that of another weights file.
 
     with_prefilter.py NETWORK.safetensors PREFILTER.safetensors OUT.safetensors
 

@@ -1,8 +1,9 @@
-"""Compares the twin with what the crate made of the same frame (tests/twin.rs writes that file).
+"""Compares the twin's results with the crate's on the same frame (tests/twin.rs writes the file FACTS).
 
     python check.py WEIGHTS FACTS LOSS
 
-Inputs, image and loss to 1e-3, gradients to 1e-2, each as the root of summed squares relative to the crate's.
+Inputs, image and loss must agree to 1e-3, gradients to 1e-2. Each difference is measured as the root of its
+summed squares, relative to that of the crate's values.
 """
 
 import sys

@@ -12,8 +12,8 @@ LEAST = 16  # sides are multiples of this
 
 
 class Frames:
-    """The pairs of some packs that are `least` rows and columns large, and where `guides` are asked for those
-    whose references keep them; on a device, in half precision."""
+    """The pairs of some packs that have at least `least` rows and columns, on a device, in half precision.
+    With `guides`, only those whose references keep their guides."""
 
     def __init__(self, paths, device, least, guides):
         self.guides = guides
@@ -33,7 +33,7 @@ class Frames:
         return len(self.pairs)
 
     def whole(self, index):
-        """A pair cut to sides the network can halve, a batch of one."""
+        """A pair, cut to sides that the network can halve, as a batch of one."""
         view, which = self.pairs[index]
         parts, spp = self.views[view]["parts"], self.views[view]["spp"][which]
         h, w = (side // LEAST * LEAST for side in parts["reference"].shape[1:])
@@ -42,7 +42,7 @@ class Frames:
 
     def draw(self, rng, count, side):
         """A batch of augmented crops: noisy (N, 9, S, S), reference and raw (N, 3, S, S), and the guides of
-        the reference, (N, 6, S, S), where they are kept, else nothing."""
+        the reference, (N, 6, S, S), or (N, 0, S, S) where `guides` were not asked for."""
         batch = []
         for view, which in rng.choices(self.pairs, self.sizes, k=count):
             parts, spp = self.views[view]["parts"], self.views[view]["spp"]
@@ -61,8 +61,8 @@ class Frames:
 
 
 def _augmented(planes, rng):
-    """Flipped, turned, colours in another order, brighter or darker. Channels: radiance, albedo, normal,
-    reference, raw reference, and maybe the albedo and normal of the reference."""
+    """Flips and turns a crop, permutes its colours and makes it brighter or darker. Channels: radiance,
+    albedo, normal, reference, raw reference, and maybe the albedo and normal of the reference."""
     order = list(rng.choice(_ORDERS))
     exposure = 2 ** rng.uniform(-_STOPS, _STOPS)
     flip, turns = rng.random() < 0.5, rng.randrange(4)

@@ -23,17 +23,17 @@ _RIDGE, _LEAST_VARIANCE, _BRIGHTEST, _LARGEST_SHADING = 0.02, 1e-4, 0.75, 1.0
 
 
 def encode(light):
-    """Radiance as the encoders read it: 0 of 0, 1 of 1, a logarithm above a sixteenth."""
+    """Radiance as the encoders read it: 0 stays 0, 1 stays 1, and above a sixteenth it is a logarithm."""
     return torch.log1p(STEEPNESS * light) / math.log1p(STEEPNESS)
 
 
 def divisor(albedo):
-    """What radiance is divided by."""
+    """The albedo by which radiance is divided."""
     return albedo.clamp(0, 1) + ALBEDO_FLOOR
 
 
 def luminance(radiance):
-    """Rec. 709, (N, 1, H, W)."""
+    """The luminance of Rec. 709, (N, 1, H, W)."""
     return (radiance * radiance.new_tensor(_LUMINANCE).view(1, 3, 1, 1)).sum(1, keepdim=True)
 
 
@@ -58,7 +58,7 @@ def tame_fireflies(radiance, floor):
 
 
 def window_sums(planes, weights):
-    """Sums over 4x4 squares, then weighted sums over the squares around each; beyond the frame is nothing."""
+    """Weighted sums over the 4x4 squares around each; beyond the frame, squares count as zero."""
     squares = F.avg_pool2d(planes, SQUARE) * SQUARE**2
     n, c, h, w = squares.shape
     kernel, reach = planes.new_tensor(weights), len(weights) // 2
@@ -73,8 +73,8 @@ def interpolate(squares):
 
 
 def shading(radiance, albedo, normal, exposed):
-    """How much brighter each pixel should be for its normal, a natural logarithm, (N, 1, H, W): a fit of
-    encoded light over the three components of the normal."""
+    """The natural logarithm of how much brighter each pixel should be for its normal, (N, 1, H, W), by a fit
+    of encoded light over the three components of the normal."""
     normal = normal.clamp(-1, 1)
     light = (radiance.clamp(min=0) * exposed / (3 * divisor(albedo))).sum(1, keepdim=True)
     light = encode(light).clamp(max=_BRIGHTEST)

@@ -10,7 +10,7 @@ _TARGET, _CAP, _GAMMA, _DARK = 0.35, 0.98, 2.2, 0.005
 
 
 def _weights(reference, exposed):
-    """What squared errors count: the inverse of r^2 + 0.001 in scene radiance."""
+    """The weights of squared errors: the inverse of r^2 + 0.001 in scene radiance."""
     return 1 / (reference * reference + _EPSILON * exposed * exposed)
 
 
@@ -20,8 +20,8 @@ def relmse(image, reference, exposed=1.0):
 
 
 def geomean(image, reference, raw, exposed):
-    """Mean over images of ln(1 + RelMSE / 0.0002); its gradient is that against the `raw` reference, as noise
-    in the target of a squared error changes no gradient on average."""
+    """Mean over images of ln(1 + RelMSE / 0.0002). Its gradient is taken against the `raw` reference, if
+    there is one, since noise in the target of a squared error does not change the gradient on average."""
     weight, error = _weights(reference, exposed), relmse(image.detach(), reference, exposed)
     target = reference if raw is None else torch.minimum(raw, _RAW_LIMIT * reference + 1)
     loss = (weight / (error + _SMALL) * (image - target) ** 2).mean()
@@ -30,7 +30,7 @@ def geomean(image, reference, raw, exposed):
 
 
 def display_exposure(reference):
-    """What brings each image's mean luminance, its brightest 2 % capped, to 0.35; 0 for a black one."""
+    """The factor that brings each image's mean luminance, its brightest 2 % capped, to 0.35; 0 if black."""
     values = luminance(reference).flatten(1)
     capped = torch.minimum(values, values.quantile(_CAP, 1, keepdim=True)).mean(1)
     return torch.where(capped > 0, _TARGET / capped.clamp(min=1e-30), 0).view(-1, 1, 1, 1)

@@ -15,7 +15,7 @@ LEVELS = 4
 KERNEL, FULL_KERNEL = 5, 3
 _DECODER_EXTRA, _HEAD_GAIN, _LIMIT = 16, 0.3, 40.0
 _BILINEAR = (0.5625, 0.1875, 0.1875, 0.0625)
-INPUTS = "guides/logarithm/1"  # what weights files say the network reads
+INPUTS = "guides/logarithm/1"  # the name in weights files of what the network reads
 
 SIZES = {
     "demc-s": {"widths": [16, 48, 64, 64], "prefilter": [16, 24, 32, 40]},
@@ -32,7 +32,7 @@ def _convolution(inputs, outputs, k, gain=1.0):
 
 
 def _upsampling(inputs, outputs):
-    """A transposed convolution that begins bilinear."""
+    """A transposed convolution whose initial weights are bilinear interpolation."""
     layer = nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1)
     line = torch.tensor((0.25, 0.75, 0.75, 0.25))
     with torch.no_grad():
@@ -44,7 +44,7 @@ def _upsampling(inputs, outputs):
 
 
 def filtered(image, logits, confidence):
-    """Softmax kernels, (N, k*k, H, W), over neighbours that say themselves how far they are to be trusted."""
+    """Filters an image by softmax kernels. To `logits`, (N, k*k, H, W), confidence is added."""
     n, channels, h, w = image.shape
     k = math.isqrt(logits.shape[1])
     pad = (k // 2,) * 4
@@ -61,7 +61,8 @@ def reduced(image, confidence):
 
 
 def upsampled(coarse, corners):
-    """Each fine pixel from the four coarse ones nearest to it: bilinear weights times exponentials."""
+    """Doubles an image. Each fine pixel is the mean of the four nearest coarse ones, weighted by bilinear
+    weights times exponentials of `corners`."""
     padded = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
     h, w = coarse.shape[2:]
     total, weights = 0, 0
@@ -79,7 +80,7 @@ def upsampled(coarse, corners):
 
 
 def filter_levels(image, levels):
-    """Filters an image by what is predicted for every level of its pyramid, full resolution first."""
+    """Filters an image by what was predicted for every level of its pyramid, full resolution first."""
     pyramid = []
     for level, predicted in enumerate(levels):
         pyramid.append(image)
@@ -146,11 +147,11 @@ class Trunk(nn.Module):
         self.head = nn.ModuleDict(heads)
 
     def hidden(self):
-        """The weights of layers between others, which Muon trains."""
+        """The weights of hidden layers, which Muon trains."""
         return [p for name, p in self.named_parameters() if p.dim() == 4 and "head." not in name]
 
     def predict(self, radiance, guide):
-        """What the heads say of every level, full resolution first, and what the first says besides."""
+        """The outputs of the heads by level, full resolution first, and the further outputs of the first."""
         with torch.autocast(radiance.device.type, torch.bfloat16, enabled=self.narrow):
             skips = [
                 self.encoder[name](F.pixel_unshuffle(planes, 2).contiguous(memory_format=torch.channels_last))
@@ -190,8 +191,8 @@ class Prefilter(Trunk):
         return {"architecture": "prefilter", "widths": self.widths}
 
     def forward(self, noisy, learn_guides=True):
-        """What training compares with `target`, (N, 6, H, W): the divisor, and the normal times 0.1; and the
-        exposure of that, which is none. `noisy` are radiance, albedo and normal, (N, 9, H, W)."""
+        """What training compares with `target`, (N, 6, H, W): the divisor, and the normal times 0.1; and its
+        exposure, which is 1. `noisy` holds radiance, albedo and normal, (N, 9, H, W)."""
         made = self.denoise(noisy[:, 3:6], noisy[:, 6:9])
         return made, torch.ones_like(made[:, :1, :1, :1])
 
@@ -204,7 +205,7 @@ class Prefilter(Trunk):
 
     @staticmethod
     def target(reference, guides):
-        """What its output is to be: of the guides of a reference, (N, 6, H, W)."""
+        """The output that training aims at, (N, 6, H, W), from the guides of a reference."""
         albedo, normal = guides[:, :3], guides[:, 3:]
         return torch.cat((features.divisor(albedo), normal.clamp(-1, 1) * features.NORMAL_SCALE), 1)
 
@@ -230,8 +231,8 @@ class Pyramid(Trunk):
         return {"architecture": "pyramid", "widths": self.widths, "prefilter": self.prefilter_widths}
 
     def forward(self, noisy, learn_guides=False):
-        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1), of noisy radiance, albedo
-        and normal, (N, 9, H, W). The prefilter learns along only where that is asked for."""
+        """Denoised exposed radiance, (N, 3, H, W), and the exposure, (N, 1, 1, 1), from noisy radiance,
+        albedo and normal, (N, 9, H, W). The prefilter learns too only if `learn_guides`."""
         radiance, albedo, normal = noisy.split(3, 1)
         with torch.set_grad_enabled(learn_guides and torch.is_grad_enabled()):
             clean = self.prefilter.clean(albedo, normal)
@@ -240,11 +241,11 @@ class Pyramid(Trunk):
 
     @staticmethod
     def target(reference, guides):
-        """What its output is to be, before the exposure."""
+        """The output that training aims at, before the exposure."""
         return reference
 
     def denoise(self, light, divided, encoded, guide, ratio, shade, normal):
-        """The network by itself, on its inputs."""
+        """Runs the network and the refit on the network's inputs; returns denoised exposed radiance."""
         levels, rest = self.predict(encoded, guide)
         gain, divisor, follow = rest[:, :3], rest[:, 3:4], rest[:, 4:5]
         image = light * (ratio * divisor.clamp(-_LIMIT, _LIMIT).sigmoid()).exp()

@@ -1,4 +1,4 @@
-"""Muon for the weights of layers between others, Adam for the rest: as src/train/optimizer.rs has them."""
+"""Muon for the weights of hidden layers and Adam for the rest, as in src/train/optimizer.rs."""
 
 import torch
 
@@ -19,7 +19,7 @@ def orthogonal(matrix):
 
 
 class Optimizer:
-    """Takes steps for all parameters that want gradients; `hidden` are those that Muon moves."""
+    """Updates all parameters that want gradients; `hidden` are those that Muon updates."""
 
     def __init__(self, parameters, hidden, weight_decay):
         learned = [p for p in parameters if p.requires_grad]
@@ -31,7 +31,7 @@ class Optimizer:
 
     @torch.no_grad()
     def step(self, lr):
-        """One step; without a finite gradient it is skipped, and False returned."""
+        """One step. Without a finite gradient it is skipped, and False is returned."""
         norm = torch.nn.utils.clip_grad_norm_(self.learned, _CLIP)
         if not torch.isfinite(norm):
             return False

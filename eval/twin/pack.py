@@ -6,9 +6,9 @@ read.
 MANIFEST is what generate_scenes.py or export_passes.py writes (scene,noisy,reference,spp). Views, which share
 a reference, are taken in an order drawn from the seed, from number --from on, until the pack is full; the
 line it prints names the number that the next pack begins with. Of each view at most --frames noisy frames are
-taken, spread over its sample counts. A pack holds of every noisy frame Combined, Denoising Albedo and
-Denoising Normal; of every reference Combined, where it was denoised also what it was before, and the guides
-where it keeps them. SHA-256 of every entry is checked when a pack is read. Needs numpy alone.
+taken, spread over its sample counts. A pack holds Combined, Denoising Albedo and Denoising Normal of every
+noisy frame. Of every reference it holds Combined, also as it was before it was denoised where it was, and the
+guides where it keeps them. SHA-256 of every entry is checked when a pack is read. Needs numpy alone.
 """
 
 import argparse
@@ -34,14 +34,14 @@ _LISTING = "listing.json"
 
 
 def squeeze(values):
-    """Half floats as bytes: all high bytes first, which repeat, then the low ones."""
+    """Half floats as compressed bytes: all high bytes first, which often repeat, then the low ones."""
     values = np.nan_to_num(np.asarray(values, "f4"), nan=0.0, posinf=_HALF_MAX, neginf=-_HALF_MAX)
     halves = np.clip(values, -_HALF_MAX, _HALF_MAX).astype("<f2")
     return zlib.compress(np.ascontiguousarray(halves.view("u1").reshape(-1, 2).T).tobytes(), 6)
 
 
 def unsqueeze(data, shape):
-    """The half floats again."""
+    """The half floats that `squeeze` made bytes of."""
     pairs = np.frombuffer(zlib.decompress(data), "u1").reshape(2, -1).T
     return np.ascontiguousarray(pairs).view("<f2").reshape(shape)
 
@@ -57,7 +57,7 @@ def _planes(channels, passes):
 
 
 def _entries(reference, noisy):
-    """What a pack holds of some noisy frames and their reference."""
+    """The parts that a pack holds of some noisy frames and their reference."""
     channels = exr.read(reference)
     parts = {"reference": _planes(channels, NOISY[:1])}
     if parts["reference"] is None:
@@ -72,7 +72,7 @@ def _entries(reference, noisy):
 
 
 def _chosen(rows, most):
-    """At most so many frames, spread over the sample counts; seeds of one count stay together."""
+    """At most `most` frames, spread over the sample counts and in their order."""
     rows = sorted(rows, key=lambda row: int(row["spp"]))
     if len(rows) <= most:
         return rows

@@ -17,8 +17,8 @@ _LEAST_COUNT, _LEAST_NOISE, _LEAST_LEVEL = 1e-2, 1e-3, 0.3
 
 @torch.no_grad()
 def factors(image, light, normal, albedo):
-    """What each value of `image` is multiplied by, all (N, 3, H, W): the denoised image, the noisy light
-    (exposed and divided by albedo), the clean normal and the divisor."""
+    """The factors by which the values of `image` are multiplied. They and all arguments are (N, 3, H, W): the
+    denoised image, the noisy light (exposed and divided by albedo), the clean normal and the divisor."""
     denoised = image.clamp(min=0) / albedo
     weight = 1 / (1 + (denoised.mean(1, keepdim=True) / _BRIGHT) ** 4)
     guides = [*normal.split(1, 1), *albedo.log().split(1, 1)]

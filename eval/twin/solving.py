@@ -2,13 +2,14 @@
 
 import torch
 
-_MIN_PIVOT = 1e-5  # of the diagonal it came from: below it the unknown is what others say already
+_MIN_PIVOT = 1e-5  # share of its diagonal; below it the unknown hardly differs from a sum of others
 _TINY = 1.18e-38
 
 
 def cholesky(matrix):
-    """The factors of matrices given as lower triangles, `matrix[row][column]` a tensor each; their diagonals
-    hold the inverse of the pivot's root. A zero matrix gives zero solutions."""
+    """The Cholesky factors of matrices, which are given as lower triangles with a tensor for each
+    `matrix[row][column]`. Their diagonals hold the inverse of the pivot's root. A zero matrix gives zero
+    solutions."""
     factor = []
     for i, row in enumerate(matrix):
         factor.append([])
@@ -26,7 +27,7 @@ def cholesky(matrix):
 
 
 def solve(factor, right):
-    """The solutions for a list of right-hand sides' rows."""
+    """The solutions of the systems, for right-hand sides that are given as a list of rows."""
     size, values = len(factor), list(right)
     for i in range(size):
         for k in range(i):

@@ -1,12 +1,12 @@
-"""Trains a built-in network, or its prefilter, with PyTorch: for a GPU lent for minutes, or a processor.
+"""Trains a built-in network, or its prefilter, with PyTorch, on a GPU that is lent for minutes or on a CPU.
 
     python train.py --model prefilter --data *.pack --val dev.pack --minutes 3 --out prefilter
     python train.py --model demc-m --prefilter prefilter/last.safetensors --data *.pack --val dev.pack \\
         --minutes 10 --out run
 
 The folder holds last.safetensors (averaged weights, which the crate reads), log.csv, and checkpoint.pt, from
-which --resume goes on with the same command. The learning rate falls along a line over --steps, or over
---minutes where those are given; a run ends with whichever is over first, and always saves. `demc train
+which --resume goes on with the same command. The learning rate falls linearly over --steps, or over
+--minutes where those are given. A run ends with whichever is over first, and always saves. `demc train
 --init` measures the ranges that 8-bit arithmetic needs.
 """
 
@@ -102,7 +102,7 @@ def validate(net, frames, options):
 
 
 def follow(average, net, decay, step):
-    """Moves the averaged weights towards the current ones; young averages forget faster."""
+    """Moves the averaged weights towards the current ones, faster in the first steps."""
     decay = min(decay, (1 + step) / (10 + step))
     with torch.no_grad():
         for kept, current in zip(average.parameters(), net.parameters()):
