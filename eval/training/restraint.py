@@ -1,4 +1,4 @@
-"""Trains what decides how much of the render a denoised frame keeps: src/filters/shrinkage/perceptron.rs.
+"""Trains what decides how much of the render a denoised frame keeps: src/filters/perceptron.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
     python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 \\

@@ -30,6 +30,31 @@ impl Temporal {
     }
 }
 
+impl Temporal {
+    /// A window around a frame with the neighbours that the shot has.
+    fn window(&self, shot: &Shot) -> Window {
+        let mut window = Window::new(self.reach);
+        let reach = self.reach as i32;
+        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
+            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
+        }
+        let mut own = Shot::new(shot.passes.clone());
+        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
+        window.enter_shot(0, own, &*self.model);
+        window
+    }
+
+    /// What training of the weights of neighbours learns from: what the model makes of the frame, (3, H, W),
+    /// and for each neighbour whose result is averaged with it that result, moved to where its content lies in
+    /// the frame, and its [features](crate::filters::temporal::likeness::Own::features).
+    ///
+    /// # Errors
+    /// The model cannot denoise a frame.
+    pub fn candidates(&self, shot: &Shot) -> Result<(Planes, Vec<[Planes; 2]>)> {
+        self.window(shot).candidates(0, &*self.model)
+    }
+}
+
 impl Denoiser for Temporal {
     fn name(&self) -> &str {
         &self.name
@@ -56,15 +81,7 @@ impl Denoiser for Temporal {
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
-        let mut window = Window::new(self.reach);
-        let reach = self.reach as i32;
-        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
-            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
-        }
-        let mut own = Shot::new(shot.passes.clone());
-        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
-        window.enter_shot(0, own, &*self.model);
-        window.denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
+        self.window(shot).denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
     }
 
     fn is_warm(&self) -> bool {

@@ -20,7 +20,7 @@ use crate::{
     filters::{
         agreement::{Evidence, Look, TOLERANCES},
         motion::{Direction, Flow},
-        temporal::{self, Link},
+        temporal::{self, Link, likeness},
     },
     models::Denoiser,
     passes::{Layer, Pass, PassSet},
@@ -166,6 +166,19 @@ impl Window {
         })
     }
 
+    /// See [`super::Temporal::candidates`], of a frame that [`Window::enter_shot`] took in.
+    ///
+    /// # Errors
+    /// The model cannot denoise a frame.
+    pub fn candidates(&mut self, number: i64, model: &dyn Denoiser) -> Result<(Planes, Vec<[Planes; 2]>)> {
+        let view = ViewKey::default();
+        self.gather(number, &view, model, &Options::default(), &mut Report::default())?;
+        let (image, radiance, others) = self.gathered(number, &view, model)?;
+        let own = likeness::Own::of(image, radiance, exposure(radiance));
+        let features = others.iter().map(|(other, link)| own.features(other, link).into()).collect();
+        Ok((image.clone(), features))
+    }
+
     fn view(
         &mut self,
         number: i64,
@@ -174,29 +187,49 @@ impl Window {
         options: &Options,
         report: &mut Report,
     ) -> Result<Planes> {
+        self.gather(number, view, model, options, report)?;
+        let (image, radiance, others) = self.gathered(number, view, model)?;
+        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+    }
+
+    /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
+    fn gather(
+        &mut self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+        options: &Options,
+        report: &mut Report,
+    ) -> Result<()> {
         let [renders, results] = self.reaches;
-        let neighbours = offsets(results);
         for offset in offsets(renders.max(results)) {
             self.connect(number, view, offset);
         }
         self.explain(number, view, report);
         self.infer(number, view, model, options, report)?;
-        let linked: Vec<i32> =
-            neighbours.filter(|offset| self.link(number, view, *offset).is_some()).collect();
-        for &offset in &linked {
-            self.infer(number + i64::from(offset), view, model, options, report)?;
+        for offset in offsets(results) {
+            if self.link(number, view, offset).is_some() {
+                self.infer(number + i64::from(offset), view, model, options, report)?;
+            }
         }
+        Ok(())
+    }
+
+    /// What the model made of a frame, the frame as rendered, and what it made of neighbours in reach.
+    #[allow(clippy::type_complexity, reason = "named where it is taken apart")]
+    fn gathered(
+        &self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+    ) -> Result<(&Planes, &Planes, Vec<(&Planes, &Link)>)> {
         let own = self.moment(number, view).expect("its views have entered");
-        let image = own.result.as_ref().expect("inferred above");
-        let others: Vec<(&Planes, &Link)> = linked
-            .iter()
-            .filter_map(|&offset| {
-                let other = self.moment(number + i64::from(offset), view)?;
-                Some((other.result.as_ref()?, self.link(number, view, offset)?))
-            })
-            .collect();
-        let radiance = own.shot.passes.require(Pass::Combined, model.name())?;
-        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+        let image = own.result.as_ref().expect("the model ran over it");
+        let others = offsets(self.reaches[1]).filter_map(|offset| {
+            let other = self.moment(number + i64::from(offset), view)?;
+            Some((other.result.as_ref()?, self.link(number, view, offset)?))
+        });
+        Ok((image, own.shot.passes.require(Pass::Combined, model.name())?, others.collect()))
     }
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.

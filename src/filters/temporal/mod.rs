@@ -4,7 +4,10 @@
 //! In: planes of a frame and of its neighbours. Out: the frame's, less noisy and steadier. Sums run in the
 //! order of the neighbours: the same window gives the same bits.
 
-use super::motion::{Flow, nearest, sharp};
+pub mod likeness;
+
+use self::likeness::Own;
+use super::motion::{Flow, nearest};
 use crate::planes::Planes;
 
 /// What is known of a neighbour of a frame: where its content lies there, and how far to believe it.
@@ -18,26 +21,6 @@ pub struct Link {
 
 /// The weight in a merger of a neighbour that agrees entirely: what no comparison finds costs less than at 1.
 const TRUST: f32 = 0.7;
-
-/// Exposed radiance that is added to what is denoised before differences are divided by it.
-const FLOOR: f32 = 0.02;
-
-/// Two results agree where the square of their relative difference, averaged over 3x3 pixels before it is
-/// squared, is below this, or below this share of the noise: the mean squared relative difference of render
-/// and result over 7x7.
-const SAME: f32 = 0.002;
-const NOISE_SHARE: f32 = 0.08;
-
-/// In units of the above, how much larger a difference makes the weight smaller by e.
-const DIFFERENT: f32 = 2.0;
-
-/// Squared relative differences of render and result count no more than this: one firefly is not the noise
-/// around it.
-const LARGEST: f32 = 4.0;
-
-/// Pixels on each side over which differences, and noise, are averaged.
-const REACH_OF_DIFFERENCE: usize = 1;
-const REACH_OF_NOISE: usize = 3;
 
 /// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the
 /// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
@@ -83,9 +66,8 @@ pub fn gain(links: &[&Link]) -> f32 {
     1.0 + TRUST * links.iter().map(mean).sum::<f64>() as f32
 }
 
-/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, where these agree
-/// within what denoising leaves of the noise. `radiance` is the frame as rendered, `exposure` what brings it
-/// to middle grey.
+/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, as far as each is
+/// [alike](Own). `radiance` is the frame as rendered, `exposure` what brings it to middle grey.
 ///
 /// # Panics
 /// If sizes differ.
@@ -95,100 +77,23 @@ pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&P
     if neighbours.is_empty() {
         return image.clone();
     }
-    let floor = FLOOR / exposure;
-    let row = |planes: &'_ Planes, c: usize, y: usize| c * planes.pixels() + y * size.0;
-    let noise = box_mean(
-        &Planes::from_rows(1, size, |_, y, out| {
-            out.fill(0.0);
-            for c in 0..3 {
-                let image = &image.data[row(image, c, y)..][..size.0];
-                let rendered = &radiance.data[row(radiance, c, y)..][..size.0];
-                for (out, (image, rendered)) in out.iter_mut().zip(image.iter().zip(rendered)) {
-                    let relative = (rendered.max(0.0) - image) / (image.max(0.0) + floor);
-                    *out += (relative * relative).min(LARGEST) * (1.0 / 3.0);
-                }
-            }
-        }),
-        REACH_OF_NOISE,
-    );
+    let own = Own::of(image, radiance, exposure);
     let mut mean = image.clone();
     let mut sums = Planes::from_rows(1, size, |_, _, out| out.fill(1.0));
+    let at = |c: usize, y: usize| (c * size.1 + y) * size.0;
     for (other, link) in neighbours {
         assert!((other.width, other.height) == size && link.flow.size() == size, "frames of one size");
-        let there = fetch(image, other, link);
-        let apart = box_mean(
-            &Planes::from_rows(3, size, |c, y, out| {
-                let image = &image.data[row(image, c, y)..][..size.0];
-                let there = &there.data[row(&there, c, y)..][..size.0];
-                for (out, (image, there)) in out.iter_mut().zip(image.iter().zip(there)) {
-                    *out = (there - image) / (image.max(0.0) + floor);
-                }
-            }),
-            REACH_OF_DIFFERENCE,
-        );
-        let weights = Planes::from_rows(1, size, |_, y, out| {
-            let lines = [0, 1, 2].map(|c| &apart.data[row(&apart, c, y)..][..size.0]);
-            let (noise, weights) = (&noise.data[y * size.0..], &link.weights.data[y * size.0..]);
-            for (x, out) in out.iter_mut().enumerate() {
-                let squared = lines.iter().map(|line| line[x] * line[x]).sum::<f32>() * (1.0 / 3.0);
-                let unlike = (squared / (SAME + NOISE_SHARE * noise[x]) - 1.0).max(0.0) / DIFFERENT;
-                *out = if weights[x] > 0.0 { weights[x] * (-unlike).exp() } else { 0.0 };
-            }
-        });
+        let (there, weights) = own.weigh(other, link);
         mean = Planes::from_rows(3, size, |c, y, out| {
-            let at = row(&mean, c, y);
-            let both = mean.data[at..].iter().zip(&there.data[at..]).zip(&weights.data[y * size.0..]);
+            let both =
+                mean.data[at(c, y)..].iter().zip(&there.data[at(c, y)..]).zip(&weights.data[at(0, y)..]);
             out.iter_mut().zip(both).for_each(|(out, ((sum, there), weight))| *out = sum + weight * there);
         });
         sums.data.iter_mut().zip(&weights.data).for_each(|(sum, weight)| *sum += weight);
     }
     Planes::from_rows(3, size, |c, y, out| {
-        let both = mean.data[row(&mean, c, y)..].iter().zip(&sums.data[y * size.0..]);
+        let both = mean.data[at(c, y)..].iter().zip(&sums.data[at(0, y)..]);
         out.iter_mut().zip(both).for_each(|(out, (mean, sum))| *out = mean / sum);
-    })
-}
-
-/// The neighbour's image at the places where the content of the frame lies in it; the frame's own where
-/// nothing agrees.
-fn fetch(own: &Planes, other: &Planes, link: &Link) -> Planes {
-    let (width, height) = link.flow.size();
-    // Rows of all three channels at once, (H, C, W): their places are the same.
-    let lines = Planes::from_rows(1, (3 * width, height), |_, y, out| {
-        let (columns, rows) = link.flow.row(y);
-        for x in 0..width {
-            let at = y * width + x;
-            let colours = if link.weights.data[at] > 0.0 {
-                sharp(other, (columns[x], rows[x]))
-            } else {
-                [0, 1, 2].map(|c| own.channel(c)[at])
-            };
-            colours.into_iter().enumerate().for_each(|(c, colour)| out[c * width + x] = colour);
-        }
-    });
-    Planes::from_rows(3, (width, height), |c, y, out| {
-        out.copy_from_slice(&lines.data[(3 * y + c) * width..][..width]);
-    })
-}
-
-/// The mean over the pixels of the frame that are at most `reach` rows and columns away.
-fn box_mean(planes: &Planes, reach: usize) -> Planes {
-    let (width, height) = (planes.width, planes.height);
-    let span = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
-    let down = Planes::from_rows(planes.channels, (width, height), |c, y, out| {
-        out.fill(0.0);
-        let rows = span(y, height);
-        let share = 1.0 / rows.len() as f32;
-        for row in rows {
-            let line = &planes.channel(c)[row * width..][..width];
-            out.iter_mut().zip(line).for_each(|(sum, v)| *sum += share * v);
-        }
-    });
-    Planes::from_rows(planes.channels, (width, height), |c, y, out| {
-        let line = &down.channel(c)[y * width..][..width];
-        for (x, out) in out.iter_mut().enumerate() {
-            let near = &line[span(x, width)];
-            *out = near.iter().sum::<f32>() / near.len() as f32;
-        }
     })
 }
 

@@ -1,5 +1,5 @@
-//! The perceptrons that judge a place by what was summed up there: two hidden layers, computed for a row of
-//! squares at a time.
+//! The perceptrons that judge a place of a frame by its features: two hidden layers, computed for a row of
+//! places (pixels, or squares of them) at a time.
 
 use safetensors::SafeTensors;
 
