@@ -136,7 +136,7 @@ fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
     }
     findings.push(Finding::new(
         "wide-filter",
-        "no edge of the guides is sharp: the pixel filter is 3 pixels wide or more, and what it blurred stays blurred",
+        "no edge of the guides is sharp: the pixel filter is several pixels wide, and what it blurred stays blurred",
         "set Render Properties > Film > Pixel Filter > Width to 1.5 px (the default)",
     ));
 }
