@@ -57,7 +57,9 @@ def set_up(edits, stage, threads=None, finished=False, size=None):
 def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
     """Places the camera where it sees enough and exposes the scene; returns the crops, X,Y,W,H each, or
     raises Unseen where three tries find none. Without a size the whole frame is the crop. Of several frames
-    it is the middle one that is looked at, and the current one afterwards."""
+    it is the middle one that is looked at, and it stays the current one."""
+    if frames > 1:
+        stage.scene.frame_set(moving.middle(frames))
     reason = "no place for a camera"
     for _ in range(3):
         camera = place_camera()
@@ -67,7 +69,7 @@ def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
             width, _ = rendering.frame_size(stage.scene)
             rendering.set_resolution(edits, stage.scene, (width, width // 2))
         if not finished:
-            views.lens_effects(stage, camera)
+            views.lens_effects(stage, camera, blurs=frames == 1)
         guides = views.probe(stage.scene)
         reason = views.refusal(guides, stage.dark)
         if reason:
@@ -80,7 +82,6 @@ def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
             if not finished:
                 views.expose(stage.rng, stage.scene, guides[0])
             if frames > 1:
-                stage.scene.frame_set(moving.middle(frames))
                 moving.animate(stage, camera, frames)
             return regions
         reason = "featureless"

@@ -65,8 +65,8 @@ def around_camera(stage, center, radius, height, lens=(28, 70), spread=0.25):
     return None
 
 
-def lens_effects(stage, camera):
-    """Depth of field on what the middle of the view shows, and motion blur now and then."""
+def lens_effects(stage, camera, blurs=True):
+    """Depth of field on what the middle of the view shows, and motion blur now and then where it `blurs`."""
     rng, scene = stage.rng, stage.scene
     if rng.random() < stage.defocus and not stage.panorama:
         direction = camera.matrix_world.to_quaternion() @ Vector((0, 0, -1))
@@ -77,7 +77,7 @@ def lens_effects(stage, camera):
         # Nearer subjects are stopped down, or all but a sliver of the frame would be blur.
         camera.data.dof.aperture_fstop = rng.choice((1.4, 2.0, 2.8, 5.6)) * max(1.0, 1.5 / max(focus, 0.1))
         camera.data.dof.aperture_blades = rng.choice((0, 0, 6))
-    if rng.random() < 0.1:
+    if blurs and rng.random() < 0.1:
         scene.render.use_motion_blur = True
         scene.render.motion_blur_shutter = rng.uniform(0.2, 0.8)
         movers = [o for o in scene.objects if o.type == "MESH" and 0.02 < max(o.dimensions) < 5]
