@@ -1,5 +1,5 @@
 //! Convolutions whose factors are narrower than f32 ([`Format`]) and whose sums are not. Memory traffic is a
-//! half or a quarter of that in f32, and the arithmetic rate twice or four times that in f32, or sixteen
+//! half or a quarter of that in f32, and the arithmetic rate twice or four times that in f32, or 16 or 32
 //! times where the processor multiplies matrix tiles (AMX).
 //!
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
