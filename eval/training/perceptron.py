@@ -1,4 +1,4 @@
-"""The perceptrons of src/filters/shrinkage/perceptron.rs, as restraint.py and expected_error.py train them."""
+"""The perceptrons of src/filters/perceptron.rs, as restraint.py and expected_error.py train them."""
 
 import torch
 from safetensors.numpy import save_file
@@ -34,8 +34,9 @@ class Standard:
     def __init__(self, features):
         """Takes mean and deviation from features (N, features, h, w)."""
         self.mean, self.deviation = features.mean((0, 2, 3)), features.std((0, 2, 3)) + 1e-3
-        for column, (mean, deviation) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
-            self.mean[column], self.deviation[column] = mean, deviation
+        if features.shape[1] > KNOWN:
+            for column, (mean, deviation) in {SAMPLES: (4.0, 4.0), KNOWN: (0.5, 0.5)}.items():
+                self.mean[column], self.deviation[column] = mean, deviation
 
     def __call__(self, features):
         return (features - self.mean.view(-1, 1, 1)) / self.deviation.view(-1, 1, 1)

@@ -1,5 +1,5 @@
 """Trains the perceptron that decides how much of the render a denoised frame keeps:
-src/filters/shrinkage/perceptron.rs.
+src/filters/perceptron.rs.
 
     cargo run --release --example restraint_features -- demc-m PAIRS.csv FEATURES/m      (demc-s likewise)
     python restraint.py FEATURES/m FEATURES/s --hold-out --steps 6000 \\

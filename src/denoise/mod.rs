@@ -27,6 +27,7 @@ pub use plan::{Input, Plan, plan, plan_tree};
 pub use sequence::{follows, neighbours};
 pub use temporal::{SUFFIX as TEMPORAL, Temporal};
 pub use watch::{Look, Watch};
+pub use window::{Candidate, Candidates};
 pub use wrap::Wrap;
 
 pub use crate::frame_number::frame_number;

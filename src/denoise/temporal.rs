@@ -5,7 +5,7 @@
 
 use super::{
     Options, Report,
-    window::{PASSES, Window},
+    window::{Candidates, PASSES, Window},
 };
 use crate::{Result, models::Denoiser, passes::Pass, planes::Planes, shot::Shot};
 
@@ -27,6 +27,29 @@ impl Temporal {
         let wanted = PASSES.into_iter().filter(|pass| !known.contains(pass));
         let optional = model.optional_passes().iter().copied().chain(wanted).collect();
         Self { name: format!("{}{SUFFIX}", model.name()), model, reach, optional }
+    }
+}
+
+impl Temporal {
+    /// A window around a frame with the neighbours that the shot has.
+    fn window(&self, shot: &Shot) -> Window {
+        let mut window = Window::new(self.reach);
+        let reach = self.reach as i32;
+        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
+            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
+        }
+        let mut own = Shot::new(shot.passes.clone());
+        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
+        window.enter_shot(0, own, &*self.model);
+        window
+    }
+
+    /// What training of the weights of neighbours learns from.
+    ///
+    /// # Errors
+    /// The model cannot denoise a frame.
+    pub fn candidates(&self, shot: &Shot) -> Result<Candidates> {
+        self.window(shot).candidates(0, &*self.model)
     }
 }
 
@@ -56,15 +79,7 @@ impl Denoiser for Temporal {
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
-        let mut window = Window::new(self.reach);
-        let reach = self.reach as i32;
-        for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
-            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
-        }
-        let mut own = Shot::new(shot.passes.clone());
-        (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
-        window.enter_shot(0, own, &*self.model);
-        window.denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
+        self.window(shot).denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
     }
 
     fn is_warm(&self) -> bool {

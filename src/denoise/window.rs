@@ -18,9 +18,9 @@ use crate::{
     Error, Result,
     features::exposure,
     filters::{
-        agreement::{Evidence, Look, TOLERANCES},
+        agreement::{Evidence, Look},
         motion::{Direction, Flow},
-        temporal::{self, Link},
+        temporal::{self, Link, likeness},
     },
     models::Denoiser,
     passes::{Layer, Pass, PassSet},
@@ -38,16 +38,21 @@ pub const PASSES: [Pass; 6] = [
     Pass::Depth,
 ];
 
+/// Normals and depths, the better ones first.
+const NORMALS: [Pass; 2] = [Pass::DenoisingNormal, Pass::Normal];
+const DEPTHS: [Pass; 2] = [Pass::DenoisingDepth, Pass::Depth];
+
 /// How many frames away the renders are, at most, that are averaged: of those further away, what no
 /// comparison finds costs more than they bring (docs/decisions.md).
 const RENDERS: usize = 1;
 
-/// Two frames of which less than this share agrees, of all that both show, are of two shots.
-const CUT: f32 = 0.05;
+/// Two frames are of two shots where the mean weight of all that both show is less than this. Where they show
+/// the same, it is about a half.
+const CUT: f32 = 0.03;
 
-/// Where vectors are zero everywhere and less than this share agrees, things move, and the vectors are
+/// Where vectors are zero everywhere and the mean weight is less than this, things move, and the vectors are
 /// missing.
-const STILL: f32 = 0.5;
+const STILL: f32 = 0.3;
 
 /// Name of a view layer, and the stereo view.
 type ViewKey = (String, Option<String>);
@@ -69,6 +74,33 @@ struct Moment {
     links: BTreeMap<i32, Result<Link, Gap>>,
     /// What the model makes of it and its neighbours' renders.
     result: Option<Planes>,
+}
+
+/// A frame whose result is averaged with another's.
+struct Neighbour<'a> {
+    moment: &'a Moment,
+    result: &'a Planes,
+    link: &'a Link,
+}
+
+/// What training of the weights of neighbours learns from.
+pub struct Candidates {
+    /// The frame as rendered, (3, H, W).
+    pub render: Planes,
+    /// What the model makes of it and of its neighbours' renders, (3, H, W).
+    pub result: Planes,
+    /// Of each frame whose render and result are averaged with these.
+    pub neighbours: Vec<Candidate>,
+}
+
+/// What is known of a neighbour where the content of a frame lies in it.
+pub struct Candidate {
+    /// 1 where that is inside of the neighbour, elsewhere 0, (1, H, W).
+    pub inside: Planes,
+    /// Its render there, (3, H, W), and the [features](Look::features) of every row.
+    pub render: [Planes; 2],
+    /// Its result there, (3, H, W), and the [features](likeness::Own::features) of every row.
+    pub result: [Planes; 2],
 }
 
 /// What is in memory of a file.
@@ -166,6 +198,33 @@ impl Window {
         })
     }
 
+    /// See [`super::Temporal::candidates`], of a frame that [`Window::enter_shot`] took in.
+    ///
+    /// # Errors
+    /// The model cannot denoise a frame.
+    pub fn candidates(&mut self, number: i64, model: &dyn Denoiser) -> Result<Candidates> {
+        let view = ViewKey::default();
+        self.gather(number, &view, model, &Options::default(), &mut Report::default())?;
+        let (result, render, others) = self.gathered(number, &view, model)?;
+        let own = self.moment(number, &view).expect("it has entered");
+        let likeness = likeness::Own::of(result, render, exposure(render));
+        let neighbours = others.iter().map(|Neighbour { moment, result, link }| {
+            let radiance = moment.shot.passes.require(Pass::Combined, model.name())?;
+            let passes = [own, moment].map(|moment| evidence(&moment.shot.passes));
+            let features = own.look.features(&moment.look, &link.flow, &passes[0], &passes[1]);
+            Ok(Candidate {
+                inside: link.inside(),
+                render: [link.nearest(radiance), features],
+                result: likeness.features(result, link).into(),
+            })
+        });
+        Ok(Candidates {
+            neighbours: neighbours.collect::<Result<_>>()?,
+            render: render.clone(),
+            result: result.clone(),
+        })
+    }
+
     fn view(
         &mut self,
         number: i64,
@@ -174,29 +233,53 @@ impl Window {
         options: &Options,
         report: &mut Report,
     ) -> Result<Planes> {
+        self.gather(number, view, model, options, report)?;
+        let (image, radiance, others) = self.gathered(number, view, model)?;
+        let others: Vec<(&Planes, &Link)> = others.iter().map(|of| (of.result, of.link)).collect();
+        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+    }
+
+    /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
+    fn gather(
+        &mut self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+        options: &Options,
+        report: &mut Report,
+    ) -> Result<()> {
         let [renders, results] = self.reaches;
-        let neighbours = offsets(results);
         for offset in offsets(renders.max(results)) {
             self.connect(number, view, offset);
         }
         self.explain(number, view, report);
         self.infer(number, view, model, options, report)?;
-        let linked: Vec<i32> =
-            neighbours.filter(|offset| self.link(number, view, *offset).is_some()).collect();
-        for &offset in &linked {
-            self.infer(number + i64::from(offset), view, model, options, report)?;
+        for offset in offsets(results) {
+            if self.link(number, view, offset).is_some() {
+                self.infer(number + i64::from(offset), view, model, options, report)?;
+            }
         }
+        Ok(())
+    }
+
+    /// What the model made of a frame, the frame as rendered, and what it made of neighbours in reach.
+    fn gathered(
+        &self,
+        number: i64,
+        view: &ViewKey,
+        model: &dyn Denoiser,
+    ) -> Result<(&Planes, &Planes, Vec<Neighbour<'_>>)> {
         let own = self.moment(number, view).expect("its views have entered");
-        let image = own.result.as_ref().expect("inferred above");
-        let others: Vec<(&Planes, &Link)> = linked
-            .iter()
-            .filter_map(|&offset| {
-                let other = self.moment(number + i64::from(offset), view)?;
-                Some((other.result.as_ref()?, self.link(number, view, offset)?))
+        let image = own.result.as_ref().expect("the model ran over it");
+        let others = offsets(self.reaches[1]).filter_map(|offset| {
+            let moment = self.moment(number + i64::from(offset), view)?;
+            Some(Neighbour {
+                moment,
+                result: moment.result.as_ref()?,
+                link: self.link(number, view, offset)?,
             })
-            .collect();
-        let radiance = own.shot.passes.require(Pass::Combined, model.name())?;
-        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+        });
+        Ok((image, own.shot.passes.require(Pass::Combined, model.name())?, others.collect()))
     }
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
@@ -292,7 +375,12 @@ impl Window {
             moves |= vectors.data.iter().any(|v| *v != 0.0);
             flow.step(vectors, direction);
         }
-        let weights = own.look.agreement(&other.look, &flow, &TOLERANCES);
+        let weights = own.look.agreement(
+            &other.look,
+            &flow,
+            &evidence(&own.shot.passes),
+            &evidence(&other.shot.passes),
+        );
         let (mut sum, mut inside) = (0.0, 0usize);
         for y in 0..weights.height {
             let row = &weights.data[y * weights.width..][..weights.width];
@@ -348,20 +436,26 @@ impl Window {
 
 impl Moment {
     fn new(mut shot: Shot, model: &dyn Denoiser) -> Self {
-        let set = &shot.passes;
-        let either = |first, second| set.get(first).or_else(|| set.get(second));
-        let look = Look::of(&Evidence {
-            radiance: set.get(Pass::Combined).expect("a frame is not loaded without it"),
-            albedo: set.get(Pass::DenoisingAlbedo),
-            normal: either(Pass::DenoisingNormal, Pass::Normal),
-            depth: either(Pass::DenoisingDepth, Pass::Depth),
-        });
-        // From here on, the model's passes and the motion are all that is needed.
-        let keeps = |pass: &Pass| {
-            *pass == Pass::Vector || [model.passes(), model.optional_passes()].concat().contains(pass)
-        };
-        PASSES.iter().filter(|pass| !keeps(pass)).for_each(|pass| drop(shot.passes.remove(*pass)));
+        let look = Look::of(&evidence(&shot.passes));
+        // Of two passes that tell the same, the first is enough.
+        for [first, second] in [NORMALS, DEPTHS] {
+            let is_read = [model.passes(), model.optional_passes()].concat().contains(&second);
+            if shot.passes.get(first).is_some() && !is_read {
+                drop(shot.passes.remove(second));
+            }
+        }
         Self { shot, look, links: BTreeMap::new(), result: None }
+    }
+}
+
+/// What tells whether two frames show the same.
+fn evidence(set: &PassSet) -> Evidence<'_> {
+    let either = |[first, second]: [Pass; 2]| set.get(first).or_else(|| set.get(second));
+    Evidence {
+        radiance: set.get(Pass::Combined).expect("a frame is not loaded without it"),
+        albedo: set.get(Pass::DenoisingAlbedo),
+        normal: either(NORMALS),
+        depth: either(DEPTHS),
     }
 }
 
@@ -386,8 +480,8 @@ fn average(own: &PassSet, others: &[(&PassSet, &Link)]) -> PassSet {
         temporal::merge(planes, &of_others)
     });
     set.origin = own.origin;
-    let links: Vec<&Link> = others.iter().map(|(_, link)| *link).collect();
-    let gain = temporal::gain(&links);
-    set.samples = own.samples.map(|samples| (samples as f32 * gain).round() as u32);
+    // Fireflies are spread over more pixels, but not rarer than in the frame alone. Told that there are more
+    // samples, the shrinkage would take them for detail.
+    set.samples = own.samples;
     set
 }

@@ -15,6 +15,7 @@ pub mod blocks;
 pub mod motion;
 pub mod nl_means;
 mod padded;
+mod perceptron;
 pub mod refit;
 pub mod regression;
 pub mod shrinkage;

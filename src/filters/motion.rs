@@ -105,20 +105,45 @@ pub fn nearest((x, y): (f32, f32), (width, height): (usize, usize)) -> Option<us
     })
 }
 
+/// How far a place is from the centre of the nearest pixel, in pixels; 0 for a place of NaN.
+pub fn aside(x: f32, y: f32) -> f32 {
+    let [x, y] = [x, y].map(|v| v - (v + MARGIN).floor());
+    let distance = (x * x + y * y).sqrt();
+    if distance.is_nan() { 0.0 } else { distance }
+}
+
 /// The value of a plane at a place between its pixels. Beyond the outermost pixels their values are repeated.
 /// A place of NaN gives NaN.
 pub fn bilinear(plane: &[f32], (width, height): (usize, usize), (x, y): (f32, f32)) -> f32 {
     if x.is_nan() || y.is_nan() {
         return f32::NAN;
     }
-    let (left, right, across) = between(x, width);
-    let (above, below, down) = between(y, height);
-    let row = |y: usize| {
-        let (a, b) = (plane[y * width + left], plane[y * width + right]);
-        a + (b - a) * across
-    };
-    let (a, b) = (row(above), row(below));
-    a + (b - a) * down
+    Between::new((x, y), (width, height)).of(plane)
+}
+
+/// The four pixels around a place, and how far it lies between them.
+pub struct Between {
+    corners: [[usize; 2]; 2],
+    across: f32,
+    down: f32,
+}
+
+impl Between {
+    /// Of a place that is not NaN. Beyond the outermost pixels their values are repeated.
+    pub fn new((x, y): (f32, f32), (width, height): (usize, usize)) -> Self {
+        let (left, right, across) = between(x, width);
+        let (above, below, down) = between(y, height);
+        Self { corners: [above, below].map(|row| [left, right].map(|x| row * width + x)), across, down }
+    }
+
+    /// The value of a plane there.
+    pub fn of(&self, plane: &[f32]) -> f32 {
+        let [a, b] = self.corners.map(|[left, right]| {
+            let (a, b) = (plane[left], plane[right]);
+            a + (b - a) * self.across
+        });
+        a + (b - a) * self.down
+    }
 }
 
 /// The two of `n` that a place lies between, and how far it is from the first.

@@ -12,10 +12,12 @@ use rayon::prelude::*;
 use super::{
     FLOOR, Render,
     features::{FEATURES, TINY, WINDOWS, each_row},
-    perceptron::Perceptron,
 };
 use crate::{
-    filters::squares::{self, SQUARE},
+    filters::{
+        perceptron::Perceptron,
+        squares::{self, SQUARE},
+    },
     kernels::{exponential::exp, logarithm::ln},
     metrics::error::RELMSE_EPSILON,
     planes::Planes,

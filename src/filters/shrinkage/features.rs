@@ -1,4 +1,4 @@
-//! Features that the [perceptrons](super::perceptron) read, made of the sums over squares of pixels:
+//! Features that the [perceptrons](crate::filters::perceptron) read, made of the sums over squares of pixels:
 //! logarithms of mean squares and correlations, over three neighbourhoods of each square.
 
 use rayon::prelude::*;

@@ -20,7 +20,6 @@
 
 mod expected;
 mod features;
-mod perceptron;
 mod restraint;
 mod seen;
 mod sums;

@@ -9,8 +9,8 @@ use std::sync::LazyLock;
 use super::{
     Render,
     features::{FEATURES, each_row},
-    perceptron::Perceptron,
 };
+use crate::filters::perceptron::Perceptron;
 
 /// Values of a square: the logit of the share; the slope of that logit over the logarithm of a pixel's own
 /// squared residual; and the logarithm of the mean squared residual near by, with which the pixel's own is

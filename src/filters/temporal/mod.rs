@@ -1,0 +1,164 @@
+//! Averages over frames of a sequence, along motion and weighted by [agreement](super::agreement): before a
+//! denoiser, of what was rendered, and after it, of what was denoised.
+//!
+//! In: planes of a frame and of its neighbours. Out: the frame's, less noisy and steadier. Sums run in the
+//! order of the neighbours: the same window gives the same bits.
+
+pub mod likeness;
+
+use self::likeness::Own;
+use super::motion::{Flow, nearest};
+use crate::planes::Planes;
+
+/// What is known of a neighbour of a frame: where its content lies there, and how far to believe it.
+#[derive(Clone, Debug)]
+pub struct Link {
+    /// From each pixel of the frame.
+    pub flow: Flow,
+    /// From 0 to 1, (1, H, W).
+    pub weights: Planes,
+}
+
+impl Link {
+    /// 1 where the frame's content lies inside of the neighbour, elsewhere 0, (1, H, W).
+    pub fn inside(&self) -> Planes {
+        Planes::from_rows(1, self.flow.size(), |_, y, out| {
+            let columns = self.flow.row(y).0;
+            out.iter_mut().zip(columns).for_each(|(out, x)| *out = if x.is_nan() { 0.0 } else { 1.0 });
+        })
+    }
+
+    /// Planes of the neighbour at the pixel that is nearest to where the frame's content lies; 0 where that is
+    /// outside.
+    pub fn nearest(&self, planes: &Planes) -> Planes {
+        let size = self.flow.size();
+        Planes::from_rows(planes.channels, size, |c, y, out| {
+            let (columns, rows) = self.flow.row(y);
+            for (out, place) in out.iter_mut().zip(columns.iter().zip(rows)) {
+                *out = nearest((*place.0, *place.1), size).map_or(0.0, |at| planes.channel(c)[at]);
+            }
+        })
+    }
+}
+
+/// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the
+/// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
+///
+/// # Panics
+/// If sizes differ.
+pub fn merge(own: &Planes, neighbours: &[(&Planes, &Link)]) -> Planes {
+    let size = (own.width, own.height);
+    for (planes, link) in neighbours {
+        assert!((planes.width, planes.height) == size && link.flow.size() == size, "frames of one size");
+        assert_eq!(planes.channels, own.channels, "planes of one pass");
+    }
+    Planes::from_rows(own.channels, size, |c, y, out| {
+        out.copy_from_slice(&own.channel(c)[y * size.0..][..size.0]);
+        let of_neighbours: Vec<_> = neighbours
+            .iter()
+            .map(|(planes, link)| {
+                (planes.channel(c), link.flow.row(y), &link.weights.data[y * size.0..][..size.0])
+            })
+            .collect();
+        for (x, out) in out.iter_mut().enumerate() {
+            let mut sum = 1.0;
+            for (plane, (columns, rows), weights) in &of_neighbours {
+                let weight = weights[x];
+                if weight > 0.0
+                    && let Some(there) = nearest((columns[x], rows[x]), size)
+                {
+                    *out += weight * plane[there];
+                    sum += weight;
+                }
+            }
+            *out /= sum;
+        }
+    })
+}
+
+/// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, as far as each is
+/// [alike](Own). `radiance` is the frame as rendered, `exposure` what brings it to middle grey.
+///
+/// # Panics
+/// If sizes differ.
+pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&Planes, &Link)]) -> Planes {
+    let size = (image.width, image.height);
+    assert!((radiance.width, radiance.height) == size, "a frame and its denoised image");
+    if neighbours.is_empty() {
+        return image.clone();
+    }
+    let own = Own::of(image, radiance, exposure);
+    let mut mean = image.clone();
+    let mut sums = Planes::from_rows(1, size, |_, _, out| out.fill(1.0));
+    let at = |c: usize, y: usize| (c * size.1 + y) * size.0;
+    for (other, link) in neighbours {
+        assert!((other.width, other.height) == size && link.flow.size() == size, "frames of one size");
+        let (there, weights) = own.weigh(other, link);
+        mean = Planes::from_rows(3, size, |c, y, out| {
+            let both =
+                mean.data[at(c, y)..].iter().zip(&there.data[at(c, y)..]).zip(&weights.data[at(0, y)..]);
+            out.iter_mut().zip(both).for_each(|(out, ((sum, there), weight))| *out = sum + weight * there);
+        });
+        sums.data.iter_mut().zip(&weights.data).for_each(|(sum, weight)| *sum += weight);
+    }
+    Planes::from_rows(3, size, |c, y, out| {
+        let both = mean.data[at(c, y)..].iter().zip(&sums.data[at(0, y)..]);
+        out.iter_mut().zip(both).for_each(|(out, (mean, sum))| *out = mean / sum);
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{filters::motion::Direction, rng::Rng};
+
+    const SIZE: (usize, usize) = (40, 30);
+
+    fn grey(value: impl Fn(usize, usize) -> f32 + Sync) -> Planes {
+        Planes::from_rows(3, SIZE, |_, y, out| {
+            out.iter_mut().enumerate().for_each(|(x, out)| *out = value(x, y));
+        })
+    }
+
+    /// A link along a motion of whole pixels to the right, trusted everywhere inside.
+    fn link(right: f32, weight: f32) -> Link {
+        let mut flow = Flow::still(SIZE.0, SIZE.1);
+        flow.step(
+            &Planes::from_rows(4, SIZE, |c, _, out| out.fill(if c == 2 { -right } else { 0.0 })),
+            Direction::Forth,
+        );
+        let weights = Planes::from_rows(1, SIZE, |_, y, out| {
+            let columns = flow.row(y).0;
+            out.iter_mut().zip(columns).for_each(|(out, x)| *out = if x.is_nan() { 0.0 } else { weight });
+        });
+        Link { flow, weights }
+    }
+
+    #[test]
+    fn merging_follows_the_motion_and_the_weights() {
+        let own = grey(|x, y| (x + 2 * y) as f32);
+        let moved = grey(|x, y| x as f32 - 3.0 + 2.0 * y as f32 + 1.0);
+        let merged = merge(&own, &[(&moved, &link(3.0, 0.5))]);
+        for x in 0..SIZE.0 {
+            // One brighter, at half the weight; what leaves the frame is left as it was.
+            let weight = if x + 3 < SIZE.0 { 0.5 } else { 0.0 };
+            let more = weight / (1.0 + weight);
+            assert!((merged.channel(1)[x] - x as f32 - more).abs() < 1e-4, "{x}");
+        }
+        assert_eq!(merge(&own, &[]), own);
+    }
+
+    #[test]
+    fn results_that_agree_are_averaged_and_others_left_out() {
+        let mut rng = Rng::new(3, 0);
+        let noise: Vec<f32> = (0..SIZE.0 * SIZE.1).map(|_| rng.uniform()).collect();
+        let radiance = grey(|x, y| 0.6 * noise[y * SIZE.0 + x]);
+        let image = grey(|_, _| 0.3);
+        let link = link(0.0, 1.0);
+        let near = blend(&image, &radiance, 0.6, &[(&grey(|_, _| 0.31), &link)]);
+        assert!(near.data.iter().all(|v| (0.303..0.3051).contains(v)), "{}", near.data[0]);
+        let far = blend(&image, &radiance, 0.6, &[(&grey(|_, _| 0.9), &link)]);
+        assert!(far.data.iter().all(|v| (0.3..0.32).contains(v)), "{}", far.data[0]);
+        assert_eq!(blend(&image, &radiance, 0.6, &[]), image);
+    }
+}
