@@ -147,13 +147,13 @@ const STEP: usize = 4;
 fn denoise(folder: &Path, out: &Path, model: &str, more: &[&str]) -> (f64, Option<f64>) {
     let start = Instant::now();
     let mut child = Command::new(env!("CARGO_BIN_EXE_demc"))
-        .args(["denoise", "--overwrite", "--model", model])
+        .args(["denoise", "--overwrite", "--quiet", "--model", model])
         .args(more)
         .arg(folder)
         .arg("--out")
         .arg(out)
         .stdout(Stdio::null())
-        .stderr(Stdio::null())
+        .stderr(Stdio::inherit())
         .spawn()
         .expect("demc starts");
     let status_file = format!("/proc/{}/status", child.id());
@@ -304,7 +304,7 @@ fn temporal(arguments: &Arguments) {
     let rounds = if size.0 * size.1 > 1 << 22 { 1 } else { 3 };
     let (mut ratios, mut peaks) = (Vec::new(), [0.0, 0.0]);
     for _ in 0..rounds {
-        let [alone, together] = [&[][..], &["--temporal"][..]].map(|more| {
+        let [alone, together] = [&[][..], &["--temporal", "2"][..]].map(|more| {
             let (seconds, peak) = denoise(&input, &out, &arguments.model, more);
             (seconds / frames as f64, peak.unwrap_or(f64::NAN))
         });
