@@ -1,4 +1,4 @@
-"""The perceptrons of src/filters/perceptron.rs, as restraint.py and expected_error.py train them."""
+"""The perceptrons of src/filters/perceptron.rs, as restraint.py, expected_error.py and neighbours.py train them."""
 
 import torch
 from safetensors.numpy import save_file
