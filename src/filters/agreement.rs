@@ -213,25 +213,38 @@ impl Look {
     /// # Panics
     /// If sizes differ.
     pub fn features(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
-        assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
         let (width, height) = self.size;
         let of_squares = self.features_of_squares(other, flow);
-        let (columns, rows) = (self.squares.width, self.squares.height);
         Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
-            let (squares, pixels) = out.split_at_mut(OF_SQUARES * width);
-            // The middle of a square lies half a pixel before its second row.
-            let place = ((y as f32 - 0.5) / SQUARE as f32).clamp(0.0, (rows - 1) as f32);
-            let (above, down) = (place as usize, place.fract());
-            let below = (above + 1).min(rows - 1);
-            let [above, below] = [above, below]
-                .map(|row| &of_squares.data[row * OF_SQUARES * columns..][..OF_SQUARES * columns]);
-            vectorised::run(Between { above, below, down, columns, out: squares, width });
-            self.compare_pixels(y, flow, own, there, pixels);
+            self.features_of_row(y, &of_squares, flow, [own, there], out);
         })
+    }
+
+    /// The [`FEATURES`] lines of a row of pixels.
+    fn features_of_row(
+        &self,
+        y: usize,
+        of_squares: &Planes,
+        flow: &Flow,
+        [own, there]: [&Evidence; 2],
+        out: &mut [f32],
+    ) {
+        let width = self.size.0;
+        let (columns, rows) = (self.squares.width, self.squares.height);
+        let (squares, pixels) = out.split_at_mut(OF_SQUARES * width);
+        // The middle of a square lies half a pixel before its second row.
+        let place = ((y as f32 - 0.5) / SQUARE as f32).clamp(0.0, (rows - 1) as f32);
+        let (above, down) = (place as usize, place.fract());
+        let below = (above + 1).min(rows - 1);
+        let [above, below] =
+            [above, below].map(|row| &of_squares.data[row * OF_SQUARES * columns..][..OF_SQUARES * columns]);
+        vectorised::run(Between { above, below, down, columns, out: squares, width });
+        self.compare_pixels(y, flow, own, there, pixels);
     }
 
     /// Lines of a row of squares, (rows, OF_SQUARES, columns) as one plane.
     fn features_of_squares(&self, other: &Self, flow: &Flow) -> Planes {
+        assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
         let (columns, rows) = (self.squares.width, self.squares.height);
         Planes::from_rows(1, (OF_SQUARES * columns, rows), |_, row, out| {
             let from = flow.row((row * SQUARE + 1).min(self.size.1 - 1));
@@ -325,11 +338,13 @@ impl Look {
     /// # Panics
     /// If sizes differ.
     pub fn agreement(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
-        let features = self.features(other, flow, own, there);
+        let of_squares = self.features_of_squares(other, flow);
         let width = self.size.0;
+        // A row at a time: features of a whole frame would take many times its memory.
         Planes::from_rows(1, self.size, |_, y, out| {
-            let features = &features.data[y * FEATURES * width..][..FEATURES * width];
-            PERCEPTRON.apply(features, width, out);
+            let mut features = vec![0.0; FEATURES * width];
+            self.features_of_row(y, &of_squares, flow, [own, there], &mut features);
+            PERCEPTRON.apply(&features, width, out);
             vectorised::run(Weights { columns: flow.row(y).0, gate: &features[GATE * width..], out });
         })
     }

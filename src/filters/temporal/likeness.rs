@@ -77,6 +77,32 @@ impl<'a> Own<'a> {
     /// The neighbour's image where the content of this frame lies in it, and the [`FEATURES`] of every row of
     /// pixels, (H, FEATURES, W) as one plane.
     pub fn features(&self, other: &Planes, link: &Link) -> (Planes, Planes) {
+        let (there, differences) = self.compare(other, link);
+        let (width, height) = (self.image.width, self.image.height);
+        let features = Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
+            self.features_of_row(y, &differences, link, out);
+        });
+        (there, features)
+    }
+
+    /// The neighbour's image where the content of this frame lies in it, and its weight, (1, H, W); 0 where
+    /// that is outside.
+    pub fn weigh(&self, other: &Planes, link: &Link) -> (Planes, Planes) {
+        let (there, differences) = self.compare(other, link);
+        let (width, height) = (self.image.width, self.image.height);
+        // A row at a time: features of a whole frame would take many times its memory.
+        let weights = Planes::from_rows(1, (width, height), |_, y, out| {
+            let mut features = vec![0.0; FEATURES * width];
+            self.features_of_row(y, &differences, link, &mut features);
+            PERCEPTRON.apply(&features, width, out);
+            vectorised::run(Weights { columns: link.flow.row(y).0, out });
+        });
+        (there, weights)
+    }
+
+    /// The neighbour's image where the content of this frame lies in it, and how the two differ: squared at
+    /// single pixels, their mean over 3x3 and 7x7 pixels, and squared over 5x5.
+    fn compare(&self, other: &Planes, link: &Link) -> (Planes, [Planes; 4]) {
         let there = fetch(self.image, other, link);
         let floor = self.floor;
         let squared = mean_of_channels(self.image, &there, |image, there| {
@@ -87,30 +113,20 @@ impl<'a> Own<'a> {
             mean_of_channels(self.image, &there, |image, there| (there - image) / (image.max(0.0) + floor));
         let near = box_mean(&squared, 2);
         let [shift, wide_shift] = [1, 3].map(|reach| box_mean(&signed, reach));
-        let (width, height) = (self.image.width, self.image.height);
-        let features = Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
-            let (logarithms, beside) = out.split_at_mut(LOGARITHMS.len() * width);
-            let planes = [&squared, &shift, &wide_shift, &near, &self.noise, &self.activity, &link.weights];
-            for ((out, planes), of) in logarithms.chunks_exact_mut(width).zip(planes).zip(LOGARITHMS) {
-                let values = &planes.data[y * width..][..width];
-                vectorised::run(Logarithm { values, of, out });
-            }
-            let (columns, rows) = link.flow.row(y);
-            beside.iter_mut().zip(columns.iter().zip(rows)).for_each(|(out, (x, y))| *out = aside(*x, *y));
-        });
-        (there, features)
+        (there, [squared, shift, wide_shift, near])
     }
 
-    /// The neighbour's image where the content of this frame lies in it, and its weight, (1, H, W); 0 where
-    /// that is outside.
-    pub fn weigh(&self, other: &Planes, link: &Link) -> (Planes, Planes) {
-        let (there, features) = self.features(other, link);
-        let (width, height) = (self.image.width, self.image.height);
-        let weights = Planes::from_rows(1, (width, height), |_, y, out| {
-            PERCEPTRON.apply(&features.data[y * FEATURES * width..][..FEATURES * width], width, out);
-            vectorised::run(Weights { columns: link.flow.row(y).0, out });
-        });
-        (there, weights)
+    /// The [`FEATURES`] lines of a row of pixels.
+    fn features_of_row(&self, y: usize, differences: &[Planes; 4], link: &Link, out: &mut [f32]) {
+        let width = self.image.width;
+        let (logarithms, beside) = out.split_at_mut(LOGARITHMS.len() * width);
+        let planes = differences.iter().chain([&self.noise, &self.activity, &link.weights]);
+        for ((out, planes), of) in logarithms.chunks_exact_mut(width).zip(planes).zip(LOGARITHMS) {
+            let values = &planes.data[y * width..][..width];
+            vectorised::run(Logarithm { values, of, out });
+        }
+        let (columns, rows) = link.flow.row(y);
+        beside.iter_mut().zip(columns.iter().zip(rows)).for_each(|(out, (x, y))| *out = aside(*x, *y));
     }
 }
 
