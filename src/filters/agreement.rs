@@ -31,7 +31,7 @@ use crate::{
 };
 
 /// Lines of [`Look::features`] of a row of pixels. First come those of squares: logarithms of how different
-/// they are, and the logarithm of the largest weight ([`GATE`]). Then come those of single pixels: logarithms
+/// they are, and the logarithm of the largest weight. Then come those of single pixels: logarithms
 /// of how different their guides are, and how far the content lies from a pixel's centre.
 pub const FEATURES: usize = OF_SQUARES + OF_GUIDES + 1;
 const OF_SQUARES: usize = LOGARITHMS + 1;
