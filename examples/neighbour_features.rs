@@ -5,12 +5,12 @@
 //! cargo run --release --example neighbour_features -- demc-m SEQUENCES.csv OUT
 //! ```
 //!
-//! For each pair of the manifest, a frame of a sequence, a safetensors file of 32-bit floats: `truth`
-//! (3, H, W), the reference, and the same of `render`, the frame as rendered, and of `result`, what the model
-//! makes of it and its neighbours' renders: `render` and `result` (3, H, W), the frame's own; for its n-th
-//! neighbour `render_there_n` and `result_there_n` (3, H, W), where the frame's content lies in it, and what
-//! is compared: `render_features_n` and `result_features_n`, (H, features, W). Where a neighbour does not show
-//! the content, `inside_n` (1, H, W) is 0, elsewhere 1.
+//! For each pair of the manifest, a frame of a sequence, it writes a safetensors file of 32-bit floats.
+//! Images are (3, H, W): `truth` is the reference, `render` the frame as rendered, and `result` what the
+//! model makes of it and its neighbours' renders. `render_there_n` and `result_there_n` are those of the
+//! n-th neighbour, where the frame's content lies in it, and `render_features_n` and `result_features_n`,
+//! (H, features, W), are what was compared. `inside_n`, (1, H, W), is 0 where the neighbour does not show
+//! the content, and 1 elsewhere.
 
 use std::path::Path;
 
