@@ -52,6 +52,22 @@ impl Planes {
         planes
     }
 
+    /// As [`Planes::from_rows`], but `fill(row's number, rows)` writes that row of every channel.
+    pub fn from_rows_of_all(
+        channels: usize,
+        (width, height): (usize, usize),
+        fill: impl Fn(usize, &mut [&mut [f32]]) + Sync,
+    ) -> Self {
+        let mut planes = Self::unwritten(channels, width, height);
+        let mut rows: Vec<Vec<&mut [f32]>> = (0..height).map(|_| Vec::with_capacity(channels)).collect();
+        for plane in planes.data.chunks_exact_mut((width * height).max(1)) {
+            rows.iter_mut().zip(plane.chunks_exact_mut(width)).for_each(|(rows, row)| rows.push(row));
+        }
+        rows.par_iter_mut().enumerate().for_each(|(y, rows)| fill(y, rows));
+        drop(rows);
+        planes
+    }
+
     /// Pixels in one plane.
     pub fn pixels(&self) -> usize {
         self.width * self.height

@@ -52,7 +52,7 @@ fn layer(path: &Path, name: &str) -> Vec<f32> {
     };
     let read = |c: &str| {
         let (part, channel) = find(c);
-        frame.decode(part, &[&[channel]]).unwrap().remove(0)
+        frame.decode(part, &[&[channel]]).unwrap().remove(0).to_vec()
     };
     ["R", "G", "B"].map(read).concat()
 }

@@ -308,7 +308,7 @@ impl Window {
         let image = if others.is_empty() || model.reads_halves() {
             run(&own.shot, model, options, report)?
         } else {
-            let mut average = Shot::new(average(&own.shot.passes, &others));
+            let mut average = Shot::new(average(&own.shot.passes, &others, model));
             average.wraps = own.shot.wraps;
             run(&average, model, options, report)?
         };
@@ -468,17 +468,21 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
     (1..=reach).flat_map(|n| [-n, n])
 }
 
-/// A frame's passes averaged with those of its neighbours. Places and motion remain its own.
-fn average(own: &PassSet, others: &[(&PassSet, &Link)]) -> PassSet {
-    let size = (own.width, own.height);
-    let mut set = own.map(size, |pass, planes| {
-        if matches!(pass, Pass::Alpha | Pass::Vector | Pass::Depth | Pass::DenoisingDepth | Pass::Position) {
-            return planes.clone();
-        }
-        let of_others: Vec<(&Planes, &Link)> =
-            others.iter().filter_map(|(set, link)| Some((set.get(pass)?, *link))).collect();
-        temporal::merge(planes, &of_others)
-    });
+/// The passes of a frame that the model reads, averaged with those of its neighbours. Places remain its own.
+fn average(own: &PassSet, others: &[(&PassSet, &Link)], model: &dyn Denoiser) -> PassSet {
+    let read = [model.passes(), model.optional_passes()].concat();
+    let mut set = own.empty((own.width, own.height));
+    for (pass, planes) in own.iter().filter(|(pass, _)| read.contains(pass)) {
+        let is_place = matches!(pass, Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Position);
+        let average = if is_place {
+            planes.clone()
+        } else {
+            let of_others: Vec<(&Planes, &Link)> =
+                others.iter().filter_map(|(set, link)| Some((set.get(pass)?, *link))).collect();
+            temporal::merge(planes, &of_others)
+        };
+        set.insert(pass, average);
+    }
     set.origin = own.origin;
     // Fireflies are spread over more pixels, but not rarer than in the frame alone. Told that there are more
     // samples, the shrinkage would take them for detail.

@@ -15,15 +15,13 @@
 
 use std::sync::LazyLock;
 
-use rayon::prelude::*;
-
 use super::{
-    motion::{self, Flow, aside, nearest},
+    box_mean,
+    motion::{self, Aside, Flow},
     perceptron::Perceptron,
 };
 use crate::{
     kernels::{
-        exponential::exp,
         logarithm::ln,
         vectorised::{self, Vectorised},
     },
@@ -37,6 +35,10 @@ pub const FEATURES: usize = OF_SQUARES + OF_GUIDES + 1;
 const OF_SQUARES: usize = LOGARITHMS + 1;
 const LOGARITHMS: usize = 8;
 const OF_GUIDES: usize = 3;
+const NOISE: usize = 0;
+const NORMALS: usize = 3;
+const ALBEDOS: usize = 4;
+const DEPTHS: usize = 5;
 const GATE: usize = LOGARITHMS;
 
 /// Added to the values of squares before their logarithm is taken: the squared difference of the light's
@@ -74,20 +76,20 @@ const DIM: f32 = 1e-4;
 const DARK: f32 = 0.01;
 const NEAR: f32 = 1e-3;
 
-/// Logarithms of the least and the largest weight that the perceptron gives, and the least of [`GATE`].
+/// The logarithm of the least weight that the perceptron gives, and the least of [`GATE`].
 const LEAST: f32 = -8.0;
-const MOST: f32 = 0.0;
 const FARTHEST: f32 = 16.0;
 
-/// Planes of what is compared.
+/// Planes of what is compared, and the number of those that are guides.
 const LIGHT: usize = 0;
 const VARIANCE: usize = 3;
 const ALBEDO: usize = 6;
 const NORMAL: usize = 9;
 const DEPTH: usize = 12;
-const SPREAD_OF_NORMAL: usize = 13;
-const SPREAD_OF_ALBEDO: usize = 14;
+const SPREAD_OF_ALBEDO: usize = 13;
+const SPREAD_OF_NORMAL: usize = 14;
 const LINES: usize = 15;
+const GUIDES: usize = SPREAD_OF_ALBEDO - ALBEDO;
 
 static PERCEPTRON: LazyLock<Perceptron> =
     LazyLock::new(|| Perceptron::read(include_bytes!("agreement.safetensors"), FEATURES, 1));
@@ -120,90 +122,51 @@ impl Look {
     /// If the planes are empty, or their sizes or channels differ from what is told of them.
     pub fn of(frame: &Evidence) -> Self {
         let (width, height) = (frame.radiance.width, frame.radiance.height);
-        let (columns, rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
-        // A row of squares at a time, all planes of it together: the light is computed once for two of them.
-        let mut lines = vec![0.0; rows * LINES * columns];
-        lines.par_chunks_mut(LINES * columns).enumerate().for_each_init(
-            || vec![0.0; 2 * width],
-            |pixels, (row, lines)| {
-                for y in row * SQUARE..((row + 1) * SQUARE).min(height) {
-                    let mut add = |line: usize, values: &[f32]| {
-                        let line = &mut lines[line * columns..][..columns];
-                        line.iter_mut()
-                            .zip(values.chunks(SQUARE))
-                            .for_each(|(sum, v)| *sum += v.iter().sum::<f32>());
-                    };
-                    let row_of = |planes: &'_ Planes, c: usize| y * width + c * planes.pixels();
-                    for c in 0..3 {
-                        let light = &frame.radiance.data[row_of(frame.radiance, c)..][..width];
-                        let (roots, squares) = pixels.split_at_mut(width);
-                        match frame.albedo {
-                            Some(albedo) => {
-                                let albedo = &albedo.data[row_of(albedo, c)..][..width];
-                                let both = light.iter().zip(albedo);
-                                roots.iter_mut().zip(both).for_each(|(root, (light, albedo))| {
-                                    *root = (light.max(0.0) / (albedo.max(0.0) + ALBEDO_FLOOR)).sqrt().sqrt();
-                                });
-                            }
-                            None => {
-                                roots
-                                    .iter_mut()
-                                    .zip(light)
-                                    .for_each(|(root, v)| *root = v.max(0.0).sqrt().sqrt());
-                            }
-                        }
-                        squares.iter_mut().zip(&*roots).for_each(|(square, root)| *square = root * root);
-                        add(LIGHT + c, roots);
-                        add(VARIANCE + c, squares);
-                        let guides = [
-                            (frame.albedo, ALBEDO, SPREAD_OF_ALBEDO),
-                            (frame.normal, NORMAL, SPREAD_OF_NORMAL),
-                        ];
-                        for (planes, line, spread) in guides {
-                            let Some(planes) = planes else { continue };
-                            let values = &planes.data[row_of(planes, c)..][..width];
-                            add(line + c, values);
-                            squares.iter_mut().zip(values).for_each(|(square, v)| *square = v * v);
-                            add(spread, squares);
-                        }
-                    }
-                    if let Some(depth) = frame.depth {
-                        add(DEPTH, &depth.data[y * width..][..width]);
+        let size = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
+        let squares = Planes::from_rows_of_all(LINES, size, |row, lines| {
+            let mut roots = vec![0.0; width];
+            lines.iter_mut().for_each(|line| line.fill(0.0));
+            let mut add = |line: usize, values: &[f32], is_squared: bool| {
+                vectorised::run(Add { values, is_squared, sums: &mut *lines[line] });
+            };
+            let pixels = row * SQUARE..((row + 1) * SQUARE).min(height);
+            for y in pixels.clone() {
+                for c in 0..3 {
+                    let light = row_of(frame.radiance, c, y);
+                    let [albedo, normal] =
+                        [frame.albedo, frame.normal].map(|guide| guide.map(|planes| row_of(planes, c, y)));
+                    vectorised::run(Roots { light, albedo, roots: &mut roots });
+                    add(LIGHT + c, &roots, false);
+                    add(VARIANCE + c, &roots, true);
+                    let guides = [(albedo, ALBEDO, SPREAD_OF_ALBEDO), (normal, NORMAL, SPREAD_OF_NORMAL)];
+                    for (values, line, spread) in guides {
+                        let Some(values) = values else { continue };
+                        add(line + c, values, false);
+                        add(spread, values, true);
                     }
                 }
-                // Squares at the right and lower edge may be cut.
-                let tall = ((row + 1) * SQUARE).min(height) - row * SQUARE;
-                for (x, column) in (0..columns).map(|x| (x, ((x + 1) * SQUARE).min(width) - x * SQUARE)) {
-                    let share = 1.0 / (tall * column) as f32;
-                    (0..LINES).for_each(|line| lines[line * columns + x] *= share);
+                if let Some(depth) = frame.depth {
+                    add(DEPTH, row_of(depth, 0, y), false);
                 }
-            },
-        );
-        let of = |row: usize, line: usize| &lines[(row * LINES + line) * columns..][..columns];
-        let mut squares = Planes::from_rows(LINES, (columns, rows), |line, row, out| {
-            let (above, below) = (row.saturating_sub(1), (row + 1).min(rows - 1));
-            let [above, here, below] = [above, row, below].map(|row| of(row, line));
-            for (x, out) in out.iter_mut().enumerate() {
-                let (left, right) = (x.saturating_sub(1), (x + 1).min(columns - 1));
-                let sum = |line: &[f32]| line[left] + line[x] + line[right];
-                *out = (sum(above) + sum(here) + sum(below)) / 9.0;
+            }
+            // Squares at the right and lower edge may be cut.
+            let share = 1.0 / (SQUARE * pixels.len()) as f32;
+            for line in lines.iter_mut() {
+                line.iter_mut().for_each(|sum| *sum *= share);
+                line[size.0 - 1] *= SQUARE as f32 / (width - (size.0 - 1) * SQUARE) as f32;
             }
         });
-        let pixels = squares.pixels();
-        let (means, spreads) = squares.data.split_at_mut(SPREAD_OF_NORMAL * pixels);
-        for (first, spread) in [NORMAL, ALBEDO].into_iter().zip(spreads.chunks_exact_mut(pixels)) {
-            let mean = |at: usize| -> f32 {
-                (first..first + 3).map(|line| means[line * pixels + at]).map(|mean| mean * mean).sum()
-            };
-            spread
-                .par_iter_mut()
-                .enumerate()
-                .for_each(|(at, spread)| *spread = (*spread - mean(at)).max(0.0));
-        }
-        let (means, rest) = squares.data.split_at_mut(VARIANCE * pixels);
-        rest.par_iter_mut()
-            .zip(means)
-            .for_each(|(square, mean)| *square = (*square - *mean * *mean).max(0.0));
+        let squares = Planes::from_rows_of_all(LINES, size, |row, lines| {
+            for (line, out) in lines.iter_mut().enumerate() {
+                box_mean::row(squares.channel(line), size, row, 1, out);
+            }
+            let (means, spreads) = lines.split_at_mut(SPREAD_OF_ALBEDO);
+            for (spread, first) in spreads.iter_mut().zip([ALBEDO, NORMAL]) {
+                means[first..first + 3].iter().for_each(|mean| subtract_square(mean, spread));
+            }
+            let (means, variances) = means.split_at_mut(VARIANCE);
+            variances.iter_mut().zip(means).for_each(|(variance, mean)| subtract_square(mean, variance));
+        });
         Self { size: (width, height), squares }
     }
 
@@ -217,6 +180,24 @@ impl Look {
         let of_squares = self.features_of_squares(other, flow);
         Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
             self.features_of_row(y, &of_squares, flow, [own, there], out);
+        })
+    }
+
+    /// How far each pixel may be averaged with that of `other` to which the flow leads, beside 1 for its own:
+    /// from 0 to 1, (1, H, W), and 0 where the flow leads outside. `own` and `there` are what both looks were
+    /// made of.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn agreement(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
+        let of_squares = self.features_of_squares(other, flow);
+        let width = self.size.0;
+        // A row at a time: features of a whole frame would take many times its memory.
+        Planes::from_rows(1, self.size, |_, y, out| {
+            let mut features = vec![0.0; FEATURES * width];
+            self.features_of_row(y, &of_squares, flow, [own, there], &mut features);
+            let gate = &features[GATE * width..][..width];
+            PERCEPTRON.weigh(&features, LEAST, Some(gate), flow.row(y).0, out);
         })
     }
 
@@ -239,132 +220,227 @@ impl Look {
         let [above, below] =
             [above, below].map(|row| &of_squares.data[row * OF_SQUARES * columns..][..OF_SQUARES * columns]);
         vectorised::run(Between { above, below, down, columns, out: squares, width });
-        self.compare_pixels(y, flow, own, there, pixels);
+        let (guides, beside) = pixels.split_at_mut(OF_GUIDES * width);
+        compare_pixels(y, flow, own, there, guides);
+        let (columns, rows) = flow.row(y);
+        vectorised::run(Aside { columns, rows, out: beside });
     }
 
     /// Lines of a row of squares, (rows, OF_SQUARES, columns) as one plane.
-    fn features_of_squares(&self, other: &Self, flow: &Flow) -> Planes {
-        assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
-        let (columns, rows) = (self.squares.width, self.squares.height);
-        Planes::from_rows(1, (OF_SQUARES * columns, rows), |_, row, out| {
-            let from = flow.row((row * SQUARE + 1).min(self.size.1 - 1));
-            for x in 0..columns {
-                // The lower right pixel is half a pixel beside the middle of the square.
-                let at = (x * SQUARE + 1).min(self.size.0 - 1);
-                let place = [from.0[at], from.1[at]].map(|v| (v - 1.0) / SQUARE as f32);
-                let values = if place[0].is_nan() {
-                    [1.0; LOGARITHMS]
-                } else {
-                    self.compare_squares(row * columns + x, other, (place[0], place[1]))
-                };
-                values.iter().zip(TINY_OF_SQUARES).enumerate().for_each(|(line, (value, tiny))| {
-                    out[line * columns + x] = ln(value + tiny);
-                });
-                let [noise, _, _, normal, albedo, depth, ..] = values;
-                let unlike = (noise - AGREES).max(0.0) / LIGHT_DIFFERS
-                    + normal / NORMAL_DIFFERS
-                    + albedo / ALBEDO_DIFFERS
-                    + depth / DEPTH_DIFFERS;
-                out[GATE * columns + x] = -unlike.min(FARTHEST);
-            }
-        })
-    }
-
-    /// How different a square is from a place among those of another frame; see [`TINY_OF_SQUARES`].
-    fn compare_squares(&self, square: usize, other: &Self, place: (f32, f32)) -> [f32; LOGARITHMS] {
-        let size = (self.squares.width, self.squares.height);
-        let here = |line: usize| self.squares.channel(line)[square];
-        let between = motion::Between::new(place, size);
-        let there = |line: usize| between.of(other.squares.channel(line));
-        let three = |first: usize| [0, 1, 2].map(|c| (here(first + c), there(first + c)));
-        let mut light = [0.0; 3];
-        for ((a, b), (of_a, of_b)) in three(LIGHT).into_iter().zip(three(VARIANCE)) {
-            let (squared, variance) = ((a - b) * (a - b), (of_a + of_b) / PIXELS);
-            light[0] += squared / (variance + UNSEEN * a * a).max(f32::MIN_POSITIVE);
-            light[1] += squared / (a * a + b * b + DIM);
-            light[2] += variance / (a * a + DIM);
-        }
-        let [noise, relative, variance] = light.map(|sum| sum * (1.0 / 3.0));
-        let [normal, albedo] = [NORMAL, ALBEDO].map(three);
-        let depth = (here(DEPTH), there(DEPTH));
-        let bright: f32 = albedo.iter().map(|(own, _)| own * own).sum();
-        [
-            noise,
-            relative,
-            variance,
-            of_normals(normal),
-            of_albedos(albedo),
-            of_depths(depth),
-            here(SPREAD_OF_NORMAL),
-            here(SPREAD_OF_ALBEDO) / (bright + DARK),
-        ]
-    }
-
-    /// Lines of a row of pixels: how different albedo, normal and depth of each are from those of the nearest
-    /// pixel of the other frame, and how far from that pixel the content lies.
-    fn compare_pixels(&self, y: usize, flow: &Flow, own: &Evidence, there: &Evidence, out: &mut [f32]) {
-        let width = self.size.0;
-        let (columns, rows) = flow.row(y);
-        let (out, beside) = out.split_at_mut(OF_GUIDES * width);
-        let [normal, albedo] =
-            [(own.normal, there.normal), (own.albedo, there.albedo)].map(|(own, there)| own.zip(there));
-        let depth = own.depth.zip(there.depth);
-        let channels =
-            |planes: &'_ Planes, at: usize| [0, 1, 2].map(|c| planes.data[c * planes.pixels() + at]);
-        for x in 0..width {
-            let values = match nearest((columns[x], rows[x]), self.size) {
-                None => [1.0; OF_GUIDES],
-                Some(other) => {
-                    let pair = |(own, there): (&Planes, &Planes)| {
-                        let (a, b) = (channels(own, y * width + x), channels(there, other));
-                        [0, 1, 2].map(|c| (a[c], b[c]))
-                    };
-                    [
-                        normal.map_or(0.0, |both| of_normals(pair(both))),
-                        albedo.map_or(0.0, |both| of_albedos(pair(both))),
-                        depth.map_or(0.0, |(a, b)| of_depths((a.data[y * width + x], b.data[other]))),
-                    ]
-                }
-            };
-            values.into_iter().enumerate().for_each(|(line, value)| out[line * width + x] = value);
-            beside[x] = aside(columns[x], rows[x]);
-        }
-        vectorised::run(Logarithms(out));
-    }
-
-    /// How far each pixel may be averaged with that of `other` to which the flow leads, beside 1 for its own:
-    /// from 0 to 1, (1, H, W). `own` and `there` are what both looks were made of.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn agreement(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
-        let of_squares = self.features_of_squares(other, flow);
-        let width = self.size.0;
-        // A row at a time: features of a whole frame would take many times its memory.
-        Planes::from_rows(1, self.size, |_, y, out| {
-            let mut features = vec![0.0; FEATURES * width];
-            self.features_of_row(y, &of_squares, flow, [own, there], &mut features);
-            PERCEPTRON.apply(&features, width, out);
-            vectorised::run(Weights { columns: flow.row(y).0, gate: &features[GATE * width..], out });
+    fn features_of_squares(&self, other: &Self, flow: &Flow) -> Planes {
+        assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
+        let size = (self.squares.width, self.squares.height);
+        Planes::from_rows(1, (OF_SQUARES * size.0, size.1), |_, row, out| {
+            let from = flow.row((row * SQUARE + 1).min(self.size.1 - 1));
+            // The lower right pixel is half a pixel beside the middle of the square.
+            let pixel = |x: usize| (x * SQUARE + 1).min(self.size.0 - 1);
+            let columns: Vec<f32> = (0..size.0).map(|x| from.0[pixel(x)]).collect();
+            let places: Vec<motion::Between> = (0..size.0)
+                .map(|x| [from.0, from.1].map(|places| (places[pixel(x)] - 1.0) / SQUARE as f32))
+                .map(|[x, y]| motion::Between::new((x, y), size))
+                .collect();
+            let mut there = vec![0.0; SPREAD_OF_ALBEDO * size.0];
+            for (line, out) in there.chunks_exact_mut(size.0).enumerate() {
+                let plane = other.squares.channel(line);
+                out.iter_mut().zip(&places).for_each(|(out, place)| *out = place.of(plane));
+            }
+            let here = std::array::from_fn(|line| row_of(&self.squares, line, row));
+            vectorised::run(CompareSquares { here, there: &there, columns: &columns, out });
         })
     }
 }
 
-/// The squared difference of two normals.
-fn of_normals(normals: [(f32, f32); 3]) -> f32 {
-    normals.iter().map(|(a, b)| (a - b) * (a - b)).sum()
+/// A row of a channel.
+fn row_of(planes: &Planes, c: usize, y: usize) -> &[f32] {
+    &planes.channel(c)[y * planes.width..][..planes.width]
 }
 
-/// The relative squared difference of two albedos.
-fn of_albedos(albedos: [(f32, f32); 3]) -> f32 {
-    let relative = |(a, b): &(f32, f32)| (a - b) * (a - b) / (a.max(*b) * a.max(*b) + DARK);
-    albedos.iter().map(relative).sum::<f32>() * (1.0 / 3.0)
+/// Lines of a row of pixels: how different albedo, normal and depth of each are from those of the nearest
+/// pixel of the other frame.
+fn compare_pixels(y: usize, flow: &Flow, own: &Evidence, there: &Evidence, out: &mut [f32]) {
+    let width = flow.size().0;
+    let stretches = flow.nearest_of_row(y);
+    let mut lines = vec![0.0; 2 * GUIDES * width];
+    let (own_lines, there_lines) = lines.split_at_mut(GUIDES * width);
+    let mut both = own_lines.chunks_exact_mut(width).zip(there_lines.chunks_exact_mut(width));
+    let of_both = [(own.albedo, there.albedo, 3), (own.normal, there.normal, 3), (own.depth, there.depth, 1)];
+    for (own, there, channels) in of_both {
+        for (c, (own_line, there_line)) in both.by_ref().take(channels).enumerate() {
+            // A guide that one of them lacks agrees.
+            let Some((own, there)) = own.zip(there) else { continue };
+            own_line.copy_from_slice(row_of(own, c, y));
+            for stretch in &stretches {
+                stretch.of_mut(there_line).copy_from_slice(stretch.of_other(there.channel(c)));
+            }
+        }
+    }
+    vectorised::run(ComparePixels { here: own_lines, there: there_lines, columns: flow.row(y).0, out });
 }
 
-/// The relative squared difference of two depths.
-fn of_depths((a, b): (f32, f32)) -> f32 {
-    let depth = (a - b) / (a.abs().max(b.abs()) + NEAR);
-    depth * depth
+/// Takes the square of a mean from the mean of squares; what is left is a variance.
+fn subtract_square(mean: &[f32], of_squares: &mut [f32]) {
+    of_squares.iter_mut().zip(mean).for_each(|(square, mean)| *square = (*square - mean * mean).max(0.0));
+}
+
+/// Fourth roots of a row of light, over the albedo.
+struct Roots<'a> {
+    light: &'a [f32],
+    albedo: Option<&'a [f32]>,
+    roots: &'a mut [f32],
+}
+
+impl Vectorised for Roots<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { light, albedo, roots } = self;
+        roots.iter_mut().zip(light).for_each(|(root, light)| *root = light.max(0.0));
+        if let Some(albedo) = albedo {
+            roots.iter_mut().zip(albedo).for_each(|(root, albedo)| *root /= albedo.max(0.0) + ALBEDO_FLOOR);
+        }
+        roots.iter_mut().for_each(|root| *root = root.sqrt().sqrt());
+    }
+}
+
+/// Adds a row of values, or their squares, to the sums of the squares of pixels that they lie in.
+struct Add<'a> {
+    values: &'a [f32],
+    is_squared: bool,
+    sums: &'a mut [f32],
+}
+
+impl Vectorised for Add<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { values, is_squared, sums } = self;
+        let pairs = values.chunks_exact(SQUARE);
+        if let ([last], Some(sum)) = (pairs.remainder(), sums.last_mut()) {
+            *sum += if is_squared { last * last } else { *last };
+        }
+        let both = sums.iter_mut().zip(pairs);
+        if is_squared {
+            both.for_each(|(sum, pair)| *sum += pair[0] * pair[0] + pair[1] * pair[1]);
+        } else {
+            both.for_each(|(sum, pair)| *sum += pair[0] + pair[1]);
+        }
+    }
+}
+
+/// Lines of features of a row of squares; see [`TINY_OF_SQUARES`] and [`GATE`].
+struct CompareSquares<'a> {
+    here: [&'a [f32]; LINES],
+    /// All but the spreads, at the places to which the flow leads.
+    there: &'a [f32],
+    /// Columns of these places, NaN outside of the frame.
+    columns: &'a [f32],
+    out: &'a mut [f32],
+}
+
+impl Vectorised for CompareSquares<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { here, there, columns, out } = self;
+        let width = columns.len();
+        let there = |line: usize| &there[line * width..][..width];
+        let (values, gate) = out.split_at_mut(LOGARITHMS * width);
+        values.fill(0.0);
+        let mut lines = values.chunks_exact_mut(width);
+        let mut next = || lines.next().expect("there is a line for each");
+        let [noise, relative, variance] = [next(), next(), next()];
+        for c in 0..3 {
+            let means = here[LIGHT + c].iter().zip(there(LIGHT + c));
+            let variances = here[VARIANCE + c].iter().zip(there(VARIANCE + c));
+            let sums = noise.iter_mut().zip(&mut *relative).zip(&mut *variance);
+            for (((a, b), (of_a, of_b)), ((noise, relative), sum)) in means.zip(variances).zip(sums) {
+                let (squared, variance) = ((a - b) * (a - b), (of_a + of_b) / PIXELS);
+                *noise += squared / (variance + UNSEEN * a * a).max(f32::MIN_POSITIVE) * (1.0 / 3.0);
+                *relative += squared / (a * a + b * b + DIM) * (1.0 / 3.0);
+                *sum += variance / (a * a + DIM) * (1.0 / 3.0);
+            }
+        }
+        let [normal, albedo, depth] = [next(), next(), next()];
+        let guides: [usize; GUIDES] = std::array::from_fn(|line| ALBEDO + line);
+        compare_guides(guides.map(|line| here[line]), guides.map(there), [normal, albedo, depth]);
+        let [of_normal, of_albedo] = [next(), next()];
+        of_normal.copy_from_slice(here[SPREAD_OF_NORMAL]);
+        of_albedo.fill(DARK);
+        for c in 0..3 {
+            of_albedo.iter_mut().zip(here[ALBEDO + c]).for_each(|(sum, v)| *sum += v * v);
+        }
+        of_albedo.iter_mut().zip(here[SPREAD_OF_ALBEDO]).for_each(|(out, spread)| *out = spread / *out);
+        for values in values.chunks_exact_mut(width) {
+            replace_outside(values, columns);
+        }
+        let of_line = |line: usize| &values[line * width..][..width];
+        gate.copy_from_slice(of_line(NOISE));
+        gate.iter_mut().for_each(|v| *v = -(*v - AGREES).max(0.0) / LIGHT_DIFFERS);
+        for (line, differs) in [(NORMALS, NORMAL_DIFFERS), (ALBEDOS, ALBEDO_DIFFERS), (DEPTHS, DEPTH_DIFFERS)]
+        {
+            gate.iter_mut().zip(of_line(line)).for_each(|(gate, v)| *gate -= v / differs);
+        }
+        gate.iter_mut().for_each(|v| *v = v.max(-FARTHEST));
+        for (values, tiny) in values.chunks_exact_mut(width).zip(TINY_OF_SQUARES) {
+            values.iter_mut().for_each(|v| *v = ln(*v + tiny));
+        }
+    }
+}
+
+/// Lines of features of a row of pixels.
+struct ComparePixels<'a> {
+    /// Guides, and those of the pixels to which the flow leads.
+    here: &'a [f32],
+    there: &'a [f32],
+    /// Columns of these pixels, NaN outside of the frame.
+    columns: &'a [f32],
+    out: &'a mut [f32],
+}
+
+impl Vectorised for ComparePixels<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { here, there, columns, out } = self;
+        let width = columns.len();
+        out.fill(0.0);
+        let mut lines = out.chunks_exact_mut(width);
+        let differences: [&mut [f32]; OF_GUIDES] =
+            std::array::from_fn(|_| lines.next().expect("there is a line for each"));
+        let [here, there] =
+            [here, there].map(|lines| std::array::from_fn(|line| &lines[line * width..][..width]));
+        compare_guides(here, there, differences);
+        for values in out.chunks_exact_mut(width) {
+            replace_outside(values, columns);
+            values.iter_mut().for_each(|v| *v = ln(*v + TINY_OF_PIXELS));
+        }
+    }
+}
+
+/// Adds the squared differences of two rows of guides: of normals, and relative ones of albedos and depths.
+#[inline(always)]
+fn compare_guides(
+    here: [&[f32]; GUIDES],
+    there: [&[f32]; GUIDES],
+    [normal, albedo, depth]: [&mut [f32]; OF_GUIDES],
+) {
+    let both = |line: usize| here[line].iter().zip(there[line]);
+    for c in 0..3 {
+        normal.iter_mut().zip(both(NORMAL - ALBEDO + c)).for_each(|(sum, (a, b))| *sum += (a - b) * (a - b));
+        albedo.iter_mut().zip(both(c)).for_each(|(sum, (a, b))| {
+            let largest = a.max(*b);
+            *sum += (a - b) * (a - b) / (largest * largest + DARK) * (1.0 / 3.0);
+        });
+    }
+    depth.iter_mut().zip(both(DEPTH - ALBEDO)).for_each(|(sum, (a, b))| {
+        let relative = (a - b) / (a.abs().max(b.abs()) + NEAR);
+        *sum += relative * relative;
+    });
+}
+
+/// Outside of the other frame, all differs as much as it can.
+#[inline(always)]
+fn replace_outside(values: &mut [f32], columns: &[f32]) {
+    values.iter_mut().zip(columns).for_each(|(v, column)| *v = if column.is_nan() { 1.0 } else { *v });
 }
 
 /// Lines of a row of pixels between two rows of squares, `down` of the way from the one `above` to the one
@@ -383,42 +459,22 @@ impl Vectorised for Between<'_> {
     fn run(self) {
         let Self { above, below, down, columns, out, width } = self;
         let lines = above.chunks_exact(columns).zip(below.chunks_exact(columns));
+        let mut line = vec![0.0; columns];
         for (out, (above, below)) in out.chunks_exact_mut(width).zip(lines) {
-            let of = |x: usize| above[x] + (below[x] - above[x]) * down;
+            let both = above.iter().zip(below);
+            line.iter_mut().zip(both).for_each(|(v, (above, below))| *v = above + (below - above) * down);
             // Pixels lie a quarter of a square before and behind its middle.
-            for (x, pair) in out.chunks_mut(SQUARE).enumerate() {
-                let [before, here, behind] = [x.saturating_sub(1), x, (x + 1).min(columns - 1)].map(of);
-                let values = [0.25 * before + 0.75 * here, 0.75 * here + 0.25 * behind];
-                pair.iter_mut().zip(values).for_each(|(out, value)| *out = value);
+            let of = |before: f32, here: f32, behind: f32| {
+                [0.25 * before + 0.75 * here, 0.75 * here + 0.25 * behind]
+            };
+            for (pair, near) in out[SQUARE.min(width)..].chunks_exact_mut(SQUARE).zip(line.windows(3)) {
+                pair.copy_from_slice(&of(near[0], near[1], near[2]));
+            }
+            for x in [0, columns - 1] {
+                let pair = of(line[x.saturating_sub(1)], line[x], line[(x + 1).min(columns - 1)]);
+                out[x * SQUARE..].iter_mut().zip(pair).for_each(|(out, v)| *out = v);
             }
         }
-    }
-}
-
-/// Takes the logarithm of what single pixels differ by.
-struct Logarithms<'a>(&'a mut [f32]);
-
-impl Vectorised for Logarithms<'_> {
-    #[inline(always)]
-    fn run(self) {
-        self.0.iter_mut().for_each(|v| *v = ln(*v + TINY_OF_PIXELS));
-    }
-}
-
-/// Weights from their logarithms, 0 where the content lies outside of the other frame.
-struct Weights<'a> {
-    columns: &'a [f32],
-    gate: &'a [f32],
-    out: &'a mut [f32],
-}
-
-impl Vectorised for Weights<'_> {
-    #[inline(always)]
-    fn run(self) {
-        self.out.iter_mut().zip(self.columns).zip(self.gate).for_each(|((out, column), gate)| {
-            let weight = exp(out.clamp(LEAST, MOST) + gate);
-            *out = if column.is_nan() { 0.0 } else { weight };
-        });
     }
 }
 

@@ -12,6 +12,7 @@
 
 pub mod agreement;
 pub mod blocks;
+mod box_mean;
 pub mod motion;
 pub mod nl_means;
 mod padded;

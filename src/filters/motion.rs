@@ -8,7 +8,13 @@
 
 use rayon::prelude::*;
 
-use crate::{kernels::memory::PlaneBuffer, planes::Planes};
+use crate::{
+    kernels::{
+        memory::PlaneBuffer,
+        vectorised::{self, Vectorised},
+    },
+    planes::Planes,
+};
 
 /// A direction in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,6 +85,27 @@ impl Flow {
         (&columns[y * self.width..][..self.width], &rows[y * self.width..][..self.width])
     }
 
+    /// The pixels of the other frame that are [`nearest`] to the places of a row of pixels of this one, as
+    /// stretches of a row in both; pixels whose place is outside are in none.
+    ///
+    /// # Panics
+    /// If the frame has more pixels than 32 bits count.
+    pub fn nearest_of_row(&self, y: usize) -> Vec<Stretch> {
+        assert!(u32::try_from(self.width * self.height).is_ok_and(|n| n < OUTSIDE), "a frame");
+        let (columns, rows) = self.row(y);
+        let mut nearest = vec![OUTSIDE; self.width];
+        vectorised::run(NearestOfRow { columns, rows, size: self.size(), out: &mut nearest });
+        let mut stretches = Vec::new();
+        let mut begins = 0;
+        for pixels in nearest.chunk_by(|here, next| *here != OUTSIDE && *next == here + 1) {
+            if pixels[0] != OUTSIDE {
+                stretches.push(Stretch { here: begins, there: pixels[0] as usize, pixels: pixels.len() });
+            }
+            begins += pixels.len();
+        }
+        stretches
+    }
+
     /// Planes of the other frame, sampled bilinearly at the place of each pixel of this one. Places outside
     /// of that frame give NaN.
     ///
@@ -105,19 +132,84 @@ pub fn nearest((x, y): (f32, f32), (width, height): (usize, usize)) -> Option<us
     })
 }
 
-/// How far a place is from the centre of the nearest pixel, in pixels; 0 for a place of NaN.
-pub fn aside(x: f32, y: f32) -> f32 {
-    let [x, y] = [x, y].map(|v| v - (v + MARGIN).floor());
-    let distance = (x * x + y * y).sqrt();
-    if distance.is_nan() { 0.0 } else { distance }
+/// Pixels that lie side by side in a row of a frame and in another frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stretch {
+    /// The first one's column.
+    pub here: usize,
+    /// Its index in the other frame.
+    pub there: usize,
+    /// How many there are.
+    pub pixels: usize,
+}
+
+impl Stretch {
+    /// The part of a row of values that lies in the stretch.
+    pub fn of<'a>(&self, row: &'a [f32]) -> &'a [f32] {
+        &row[self.here..][..self.pixels]
+    }
+
+    /// Likewise, writable.
+    pub fn of_mut<'a>(&self, row: &'a mut [f32]) -> &'a mut [f32] {
+        &mut row[self.here..][..self.pixels]
+    }
+
+    /// Its values in a plane of the other frame.
+    pub fn of_other<'a>(&self, plane: &'a [f32]) -> &'a [f32] {
+        &plane[self.there..][..self.pixels]
+    }
+}
+
+/// The index of a pixel that no frame has.
+const OUTSIDE: u32 = u32::MAX;
+
+/// The index of the pixel nearest to each place of a row, [`OUTSIDE`] where that is outside.
+struct NearestOfRow<'a> {
+    columns: &'a [f32],
+    rows: &'a [f32],
+    size: (usize, usize),
+    out: &'a mut [u32],
+}
+
+impl Vectorised for NearestOfRow<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { columns, rows, size: (width, height), out } = self;
+        for (out, (x, y)) in out.iter_mut().zip(columns.iter().zip(rows)) {
+            let is_inside =
+                *x >= -MARGIN && *x < width as f32 - MARGIN && *y >= -MARGIN && *y < height as f32 - MARGIN;
+            let [column, row] =
+                [(x, width), (y, height)].map(|(v, n)| ((v + MARGIN) as u32).min(n as u32 - 1));
+            *out = if is_inside { row * width as u32 + column } else { OUTSIDE };
+        }
+    }
+}
+
+/// How far each pixel's place in a row is from the centre of the pixel nearest to it, in pixels; 0 for a place
+/// of NaN.
+pub struct Aside<'a> {
+    /// Columns of the places.
+    pub columns: &'a [f32],
+    /// Rows of the places.
+    pub rows: &'a [f32],
+    /// The distances.
+    pub out: &'a mut [f32],
+}
+
+impl Vectorised for Aside<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.out.iter_mut().zip(self.columns.iter().zip(self.rows)).for_each(|(out, (x, y))| {
+            let [x, y] = [*x, *y].map(|v| v - (v + MARGIN).floor());
+            let distance = (x * x + y * y).sqrt();
+            *out = if distance.is_nan() { 0.0 } else { distance };
+        });
+    }
 }
 
 /// The value of a plane at a place between its pixels. Beyond the outermost pixels their values are repeated.
 /// A place of NaN gives NaN.
 pub fn bilinear(plane: &[f32], (width, height): (usize, usize), (x, y): (f32, f32)) -> f32 {
-    if x.is_nan() || y.is_nan() {
-        return f32::NAN;
-    }
     Between::new((x, y), (width, height)).of(plane)
 }
 
@@ -129,7 +221,7 @@ pub struct Between {
 }
 
 impl Between {
-    /// Of a place that is not NaN. Beyond the outermost pixels their values are repeated.
+    /// Of a place, where one of NaN gives values of NaN. Beyond the outermost pixels their values are repeated.
     pub fn new((x, y): (f32, f32), (width, height): (usize, usize)) -> Self {
         let (left, right, across) = between(x, width);
         let (above, below, down) = between(y, height);
@@ -161,16 +253,19 @@ pub fn sharp(planes: &Planes, (x, y): (f32, f32)) -> [f32; 3] {
     let (rows, down) = spline(y, height);
     [0, 1, 2].map(|c| {
         let plane = planes.channel(c);
-        let (mut sum, mut least, mut greatest) = (0.0, f32::INFINITY, f32::NEG_INFINITY);
+        let (mut sums, mut least, mut greatest) = ([0.0; 4], f32::INFINITY, f32::NEG_INFINITY);
         for (j, (&row, down)) in rows.iter().zip(down).enumerate() {
             let line = &plane[row * width..][..width];
-            let values = columns.map(|column| line[column]);
-            sum += down * values.iter().zip(across).map(|(value, weight)| value * weight).sum::<f32>();
+            // Far from the edges the four lie side by side.
+            let near = line[columns[0]..].first_chunk().filter(|_| columns[3] == columns[0] + 3);
+            let values: [f32; 4] = near.copied().unwrap_or_else(|| columns.map(|column| line[column]));
+            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += down * value);
             if j == 1 || j == 2 {
                 least = least.min(values[1]).min(values[2]);
                 greatest = greatest.max(values[1]).max(values[2]);
             }
         }
+        let sum: f32 = sums.iter().zip(across).map(|(sum, weight)| sum * weight).sum();
         sum.clamp(least, greatest)
     })
 }
@@ -225,6 +320,16 @@ mod tests {
                 let other = picture((by * motion.0, by * motion.1));
                 let (mut inside, here) = (0, picture((0.0, 0.0)));
                 let sampled = flow.bilinear(&other);
+                for y in 0..SIZE.1 {
+                    let (columns, rows) = flow.row(y);
+                    let want: Vec<_> =
+                        columns.iter().zip(rows).map(|(x, y)| nearest((*x, *y), SIZE)).collect();
+                    let mut found = [None; SIZE.0];
+                    for Stretch { here, there, pixels } in flow.nearest_of_row(y) {
+                        (0..pixels).for_each(|i| found[here + i] = Some(there + i));
+                    }
+                    assert_eq!(found[..], want);
+                }
                 for y in 1..SIZE.1 - 1 {
                     let (columns, rows) = flow.row(y);
                     for x in 1..SIZE.0 - 1 {
@@ -253,6 +358,7 @@ mod tests {
         flow.step(&vectors((30.0, 0.0)), Direction::Forth);
         flow.step(&vectors((-30.0, 0.0)), Direction::Forth);
         assert!(flow.bilinear(&picture((0.0, 0.0))).data.iter().all(|v| v.is_nan()));
+        assert!((0..SIZE.1).all(|y| flow.nearest_of_row(y).is_empty()));
         assert_eq!(nearest((-0.5, 0.0), SIZE), Some(0));
         assert_eq!(nearest((23.4, 16.4), SIZE), Some(SIZE.0 * SIZE.1 - 1));
         for outside in [(-0.6, 0.0), (0.0, -0.6), (23.5, 0.0), (0.0, 16.5), (f32::NAN, 0.0)] {

@@ -3,7 +3,10 @@
 
 use safetensors::SafeTensors;
 
-use crate::kernels::vectorised::{self, Vectorised};
+use crate::kernels::{
+    exponential::exp,
+    vectorised::{self, Vectorised},
+};
 
 /// Units of both hidden layers.
 const HIDDEN: usize = 24;
@@ -13,13 +16,13 @@ const LEAK: f32 = 0.1;
 
 /// A perceptron.
 pub struct Perceptron {
-    first: Weights,
-    second: Weights,
-    last: Weights,
+    first: Layer,
+    second: Layer,
+    last: Layer,
 }
 
 /// Weights of a layer, outputs by inputs, and biases.
-struct Weights(Vec<f32>, Vec<f32>);
+struct Layer(Vec<f32>, Vec<f32>);
 
 impl Perceptron {
     /// Reads the perceptron of a weights file that is part of the program.
@@ -36,10 +39,7 @@ impl Perceptron {
             values
         };
         let layer = |name: &str, inputs: usize, outputs: usize| {
-            Weights(
-                tensor(format!("{name}.weight"), inputs * outputs),
-                tensor(format!("{name}.bias"), outputs),
-            )
+            Layer(tensor(format!("{name}.weight"), inputs * outputs), tensor(format!("{name}.bias"), outputs))
         };
         Self {
             first: layer("first", inputs, HIDDEN),
@@ -48,10 +48,48 @@ impl Perceptron {
         }
     }
 
+    /// The weights of a row of places of a neighbour of a frame: the exponential of what the perceptron, which
+    /// has one output, makes of `features`, kept between `least` and 0, and with `gate`, if there is one,
+    /// added to it; 0 where `columns`, those of the places, are NaN.
+    pub fn weigh(
+        &self,
+        features: &[f32],
+        least: f32,
+        gate: Option<&[f32]>,
+        columns: &[f32],
+        out: &mut [f32],
+    ) {
+        self.apply(features, columns.len(), out);
+        vectorised::run(Weights { least, gate, columns, out });
+    }
+
     /// Computes its outputs for a row of places. `input` and `output` hold a line for each input and each
     /// output.
     pub fn apply(&self, input: &[f32], places: usize, output: &mut [f32]) {
         vectorised::run(Row { perceptron: self, input, output, places });
+    }
+}
+
+/// See [`Perceptron::weigh`]; `out` holds what the perceptron makes of the features.
+struct Weights<'a> {
+    least: f32,
+    gate: Option<&'a [f32]>,
+    columns: &'a [f32],
+    out: &'a mut [f32],
+}
+
+impl Vectorised for Weights<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { least, gate, columns, out } = self;
+        out.iter_mut().for_each(|v| *v = v.clamp(least, 0.0));
+        if let Some(gate) = gate {
+            out.iter_mut().zip(gate).for_each(|(v, gate)| *v += gate);
+        }
+        out.iter_mut().zip(columns).for_each(|(v, column)| {
+            let weight = exp(*v);
+            *v = if column.is_nan() { 0.0 } else { weight };
+        });
     }
 }
 
@@ -95,7 +133,7 @@ impl Vectorised for Row<'_> {
 
 /// A layer of the perceptron for a block of places.
 #[inline(always)]
-fn layer(Weights(weights, biases): &Weights, input: &[Line], output: &mut [Line]) {
+fn layer(Layer(weights, biases): &Layer, input: &[Line], output: &mut [Line]) {
     for ((output, weights), bias) in output.iter_mut().zip(weights.chunks_exact(input.len())).zip(biases) {
         let mut sums = [*bias; BLOCK];
         for (line, weight) in input.iter().zip(weights) {

@@ -9,7 +9,10 @@ use half::{f16, slice::HalfFloatSliceExt};
 use rayon::prelude::*;
 
 use super::{Frame, StoredChunk, bounds, chroma};
-use crate::{Error, Result};
+use crate::{
+    Error, Result,
+    kernels::memory::{self, PlaneBuffer},
+};
 
 /// Blocks that each thread decompresses before they are copied out: bounds the memory that decoding adds.
 const BLOCKS_PER_THREAD: usize = 8;
@@ -21,7 +24,7 @@ impl Frame {
     ///
     /// # Errors
     /// A block cannot be decompressed (see [`super::Part::undecodable`]), or a channel does not exist.
-    pub fn decode(&self, part: usize, images: &[&[usize]]) -> Result<Vec<Vec<f32>>> {
+    pub fn decode(&self, part: usize, images: &[&[usize]]) -> Result<Vec<PlaneBuffer>> {
         let header = self.layout(part)?;
         self.refuse_undecodable(part)?;
         let channels = images.concat();
@@ -29,7 +32,7 @@ impl Frame {
             return Err(Error::invalid(&self.path, format!("part {part} has no channel {bad}")));
         }
         let area = header.layer_size.area();
-        let mut decoded: Vec<Vec<f32>> = Vec::new();
+        let mut decoded: Vec<PlaneBuffer> = Vec::new();
         let of_part: Vec<&StoredChunk> = self.chunks.iter().filter(|c| c.part == part).collect();
         for batch in of_part.chunks(BLOCKS_PER_THREAD * rayon::current_num_threads()) {
             let blocks: Vec<UncompressedBlock> =
@@ -57,15 +60,12 @@ impl Frame {
     }
 
     /// Zeros; where there is no room for them, an error and not the end of the program.
-    fn zeros(&self, len: usize) -> Result<Vec<f32>> {
-        let mut values = Vec::new();
-        if values.try_reserve_exact(len).is_err() {
+    fn zeros(&self, len: usize) -> Result<PlaneBuffer> {
+        memory::try_zeros(len).ok_or_else(|| {
             let gib = (len * size_of::<f32>()) as f64 / f64::from(1 << 30);
             let why = format!("needs {gib:.1} GiB more memory than there is; render it in regions");
-            return Err(Error::invalid(&self.path, why));
-        }
-        values.resize(len, 0.0);
-        Ok(values)
+            Error::invalid(&self.path, why)
+        })
     }
 
     /// The uncompressed bytes of one stored chunk.

@@ -19,21 +19,40 @@ impl<T: Clone> Pool<T> {
         Self(Mutex::new(Vec::new()))
     }
 
-    /// The smallest free memory that holds `len` values, unless more than half of it would lie idle. Else it
-    /// is new memory, filled with `value`, and free memory that is too small goes back to the system, so that
-    /// frames that grow leave nothing behind.
+    /// Memory for `len` values: the smallest that is free and holds them, unless more than half of it would
+    /// lie idle, else new memory, filled with `value`.
     pub fn take(&'static self, len: usize, value: T) -> Pooled<T> {
+        let data = self.take_free(len).unwrap_or_else(|| vec![value; len]);
+        Pooled { len, data, pool: Some(self) }
+    }
+
+    /// As [`Pool::take`]; none where the system has no room for new memory.
+    pub fn try_take(&'static self, len: usize, value: T) -> Option<Pooled<T>> {
+        let data = self.take_free(len).or_else(|| {
+            let mut data = Vec::new();
+            data.try_reserve_exact(len).ok()?;
+            data.resize(len, value);
+            Some(data)
+        });
+        Some(Pooled { len, data: data?, pool: Some(self) })
+    }
+
+    /// Free memory that fits. Where there is none, as much that is free and too small goes back to the system
+    /// as new memory will take, what was not used for the longest time first: frames that grow leave nothing
+    /// behind.
+    fn take_free(&self, len: usize) -> Option<Vec<T>> {
         let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |(_, data): &(usize, &Vec<T>)| (len..=2 * len).contains(&data.len());
-        let data = match free.iter().enumerate().filter(fits).min_by_key(|(_, d)| d.len()).map(|(i, _)| i) {
-            Some(i) => free.swap_remove(i),
-            None => {
-                free.retain(|data| data.len() >= len);
-                drop(free);
-                vec![value; len]
-            }
-        };
-        Pooled { len, data, pool: Some(self) }
+        if let Some((at, _)) = free.iter().enumerate().filter(fits).min_by_key(|(_, data)| data.len()) {
+            return Some(free.remove(at));
+        }
+        let mut given_back = 0;
+        free.retain(|data| {
+            let stays = given_back >= len || data.len() >= len;
+            given_back += if stays { 0 } else { data.len() };
+            stays
+        });
+        None
     }
 }
 
@@ -147,6 +166,13 @@ static PLANES: Pool<f32> = Pool::new();
 /// Memory for `len` values of planar images, which are whatever the last user left.
 pub fn plane_buffer(len: usize) -> PlaneBuffer {
     PLANES.take(len, 0.0)
+}
+
+/// Zeros, as values of planar images; none where the system has no room for them.
+pub fn try_zeros(len: usize) -> Option<PlaneBuffer> {
+    let mut buffer = PLANES.try_take(len, 0.0)?;
+    buffer.fill(0.0);
+    Some(buffer)
 }
 
 /// Gives all free memory of planar images back to the system.

@@ -14,6 +14,7 @@ use crate::{
     Error, Result,
     frame::{Frame, Part, Window, to_rgb},
     frame_number::samples,
+    kernels::memory::PlaneBuffer,
     planes::Planes,
 };
 
@@ -358,20 +359,21 @@ fn decode<'a, K>(
             {
                 to_rgb(&mut image, frame.luminance_weights(part));
             }
-            let image = crop(image, stored, window);
-            put(key, Planes::from_vec(channels.len(), window.width, window.height, image));
+            let Window { width, height, .. } = window;
+            let data = crop(image, stored, window);
+            put(key, Planes { channels: channels.len(), width, height, data });
         }
     }
     Ok(())
 }
 
 /// The values of `image`, (C, H, W) and stored in `from`, at the pixels of `to`.
-fn crop(image: Vec<f32>, from: Window, to: Window) -> Vec<f32> {
+fn crop(image: PlaneBuffer, from: Window, to: Window) -> PlaneBuffer {
     if from == to {
         return image;
     }
     let (stored, wanted) = (from.width * from.height, to.width * to.height);
-    let mut out = vec![0.0; image.len() / stored * wanted];
+    let mut out = PlaneBuffer::from(vec![0.0; image.len() / stored * wanted]);
     // Overlap in absolute coordinates, as i64: windows may lie anywhere in i32.
     let span = |a: i32, n: usize, b: i32, m: usize| {
         let start = i64::from(a).max(i64::from(b));
@@ -404,11 +406,11 @@ mod tests {
         let to = Window { x: 0, y: -1, width: 3, height: 2 };
         // Stored: y 0: [10 11 12] at x -1..2; wanted: y -1..1, x 0..3.
         let plane = vec![10.0, 11.0, 12.0, 20.0, 21.0, 22.0];
-        assert_eq!(crop(plane.clone(), from, to), [0.0, 0.0, 0.0, 11.0, 12.0, 0.0]);
+        assert_eq!(crop(plane.clone().into(), from, to), [0.0, 0.0, 0.0, 11.0, 12.0, 0.0]);
         let two = [plane.clone(), plane.iter().map(|v| v + 0.5).collect()].concat();
         let moved = [0.0, 0.0, 0.0, 11.0, 12.0, 0.0, 0.0, 0.0, 0.0, 11.5, 12.5, 0.0];
-        assert_eq!(crop(two, from, to), moved);
+        assert_eq!(crop(two.into(), from, to), moved);
         let away = Window { x: 100, y: 100, ..to };
-        assert_eq!(crop(plane, from, away), [0.0; 6]);
+        assert_eq!(crop(plane.into(), from, away), [0.0; 6]);
     }
 }

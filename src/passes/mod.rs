@@ -207,7 +207,7 @@ impl PassSet {
     }
 
     /// A set without passes, of another size, that tells the same facts of the render.
-    fn empty(&self, width: usize, height: usize) -> Self {
+    pub fn empty(&self, (width, height): (usize, usize)) -> Self {
         Self {
             samples: self.samples,
             renderer: self.renderer,
@@ -249,7 +249,7 @@ impl PassSet {
     /// # Panics
     /// As [`Planes::padded_rows`].
     pub fn padded_rows(&self, passes: &[Pass], rows: Range<usize>, (width, height): (usize, usize)) -> Self {
-        let mut part = self.empty(width, height);
+        let mut part = self.empty((width, height));
         for (&pass, planes) in self.planes.iter().filter(|(pass, _)| passes.contains(pass)) {
             part.insert(pass, planes.padded_rows(rows.clone(), (width, height)));
         }
@@ -261,7 +261,7 @@ impl PassSet {
     /// # Panics
     /// If a result has another size or channel count.
     pub fn map(&self, (width, height): (usize, usize), change: impl Fn(Pass, &Planes) -> Planes) -> Self {
-        let mut changed = self.empty(width, height);
+        let mut changed = self.empty((width, height));
         self.iter().for_each(|(pass, planes)| changed.insert(pass, change(pass, planes)));
         changed
     }

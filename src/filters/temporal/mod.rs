@@ -7,7 +7,7 @@
 pub mod likeness;
 
 use self::likeness::Own;
-use super::motion::{Flow, nearest};
+use super::motion::Flow;
 use crate::planes::Planes;
 
 /// What is known of a neighbour of a frame: where its content lies there, and how far to believe it.
@@ -31,18 +31,21 @@ impl Link {
     /// Planes of the neighbour at the pixel that is nearest to where the frame's content lies; 0 where that is
     /// outside.
     pub fn nearest(&self, planes: &Planes) -> Planes {
-        let size = self.flow.size();
-        Planes::from_rows(planes.channels, size, |c, y, out| {
-            let (columns, rows) = self.flow.row(y);
-            for (out, place) in out.iter_mut().zip(columns.iter().zip(rows)) {
-                *out = nearest((*place.0, *place.1), size).map_or(0.0, |at| planes.channel(c)[at]);
+        Planes::from_rows_of_all(planes.channels, self.flow.size(), |y, rows| {
+            let stretches = self.flow.nearest_of_row(y);
+            for (c, out) in rows.iter_mut().enumerate() {
+                out.fill(0.0);
+                for stretch in &stretches {
+                    stretch.of_mut(out).copy_from_slice(stretch.of_other(planes.channel(c)));
+                }
             }
         })
     }
 }
 
 /// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the
-/// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
+/// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared. Where that
+/// is outside of the neighbour, its weight is 0.
 ///
 /// # Panics
 /// If sizes differ.
@@ -52,26 +55,24 @@ pub fn merge(own: &Planes, neighbours: &[(&Planes, &Link)]) -> Planes {
         assert!((planes.width, planes.height) == size && link.flow.size() == size, "frames of one size");
         assert_eq!(planes.channels, own.channels, "planes of one pass");
     }
-    Planes::from_rows(own.channels, size, |c, y, out| {
-        out.copy_from_slice(&own.channel(c)[y * size.0..][..size.0]);
-        let of_neighbours: Vec<_> = neighbours
-            .iter()
-            .map(|(planes, link)| {
-                (planes.channel(c), link.flow.row(y), &link.weights.data[y * size.0..][..size.0])
-            })
-            .collect();
-        for (x, out) in out.iter_mut().enumerate() {
-            let mut sum = 1.0;
-            for (plane, (columns, rows), weights) in &of_neighbours {
-                let weight = weights[x];
-                if weight > 0.0
-                    && let Some(there) = nearest((columns[x], rows[x]), size)
-                {
-                    *out += weight * plane[there];
-                    sum += weight;
+    let of_row = |y: usize| y * size.0..(y + 1) * size.0;
+    Planes::from_rows_of_all(own.channels, size, |y, rows| {
+        let stretches: Vec<_> = neighbours.iter().map(|(_, link)| link.flow.nearest_of_row(y)).collect();
+        let weights: Vec<_> = neighbours.iter().map(|(_, link)| &link.weights.data[of_row(y)]).collect();
+        let mut sums = vec![1.0; size.0];
+        for weights in &weights {
+            sums.iter_mut().zip(*weights).for_each(|(sum, weight)| *sum += weight);
+        }
+        for (c, out) in rows.iter_mut().enumerate() {
+            out.copy_from_slice(&own.channel(c)[of_row(y)]);
+            for (((planes, _), stretches), weights) in neighbours.iter().zip(&stretches).zip(&weights) {
+                for stretch in stretches {
+                    let both = stretch.of_other(planes.channel(c)).iter().zip(stretch.of(weights));
+                    let out = stretch.of_mut(out).iter_mut();
+                    out.zip(both).for_each(|(out, (value, weight))| *out += weight * value);
                 }
             }
-            *out /= sum;
+            out.iter_mut().zip(&sums).for_each(|(out, sum)| *out /= sum);
         }
     })
 }
@@ -88,22 +89,27 @@ pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&P
         return image.clone();
     }
     let own = Own::of(image, radiance, exposure);
-    let mut mean = image.clone();
-    let mut sums = Planes::from_rows(1, size, |_, _, out| out.fill(1.0));
-    let at = |c: usize, y: usize| (c * size.1 + y) * size.0;
-    for (other, link) in neighbours {
-        assert!((other.width, other.height) == size && link.flow.size() == size, "frames of one size");
-        let (there, weights) = own.weigh(other, link);
-        mean = Planes::from_rows(3, size, |c, y, out| {
-            let both =
-                mean.data[at(c, y)..].iter().zip(&there.data[at(c, y)..]).zip(&weights.data[at(0, y)..]);
-            out.iter_mut().zip(both).for_each(|(out, ((sum, there), weight))| *out = sum + weight * there);
-        });
-        sums.data.iter_mut().zip(&weights.data).for_each(|(sum, weight)| *sum += weight);
-    }
-    Planes::from_rows(3, size, |c, y, out| {
-        let both = mean.data[at(c, y)..].iter().zip(&sums.data[at(0, y)..]);
-        out.iter_mut().zip(both).for_each(|(out, (mean, sum))| *out = mean / sum);
+    let others: Vec<(Planes, Planes)> = neighbours
+        .iter()
+        .map(|(other, link)| {
+            assert!((other.width, other.height) == size && link.flow.size() == size, "frames of one size");
+            own.weigh(other, link)
+        })
+        .collect();
+    let of_row = |y: usize| y * size.0..(y + 1) * size.0;
+    Planes::from_rows_of_all(3, size, |y, rows| {
+        let mut sums = vec![1.0; size.0];
+        for (_, weights) in &others {
+            sums.iter_mut().zip(&weights.data[of_row(y)]).for_each(|(sum, weight)| *sum += weight);
+        }
+        for (c, out) in rows.iter_mut().enumerate() {
+            out.copy_from_slice(&image.channel(c)[of_row(y)]);
+            for (there, weights) in &others {
+                let both = there.channel(c)[of_row(y)].iter().zip(&weights.data[of_row(y)]);
+                out.iter_mut().zip(both).for_each(|(out, (there, weight))| *out += weight * there);
+            }
+            out.iter_mut().zip(&sums).for_each(|(out, sum)| *out /= sum);
+        }
     })
 }
 
