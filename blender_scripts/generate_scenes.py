@@ -12,7 +12,7 @@ a real frame. The same seed and options give the same scene and the same pixels.
 Writes s<seed>_<kind>_<spp>spp.exr with s<seed>_<kind>_ref.exr (all half float, one part; references
 keep their guides, which are what a prefilter aims at), where several crops of a scene add _c0, _c1 ... to
 the name. With --sequence N it writes N frames, s<seed>_<kind>_<spp>spp.0001.exr and on, in which camera and
-things move, with vectors, and the reference of the middle one alone. manifest.csv (scene,noisy,reference,spp)
+things move, with vectors, and the reference of the middle one alone, or with --all-references of each. manifest.csv (scene,noisy,reference,spp)
 lists the further noisy seeds (..._n1.exr, as scene ..._n1) and their means (..._mean.exr) too; views.csv lists
 every file with its seeds, processor seconds and SHA-256.
 Finished scenes are skipped; scenes with nothing to see go to rejected.csv and are not tried again.
@@ -114,6 +114,11 @@ def parse(arguments):
         help="N frames of each crop, an odd number, in which camera and things move, with motion vectors; the "
         "middle one has a reference and stands in the manifest",
     )
+    parser.add_argument(
+        "--all-references",
+        action="store_true",
+        help="every frame of a sequence has a reference and stands in the manifest, so that flicker can be measured",
+    )
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
     parser.add_argument("--ref-noise", type=float, default=0.01, metavar="T",
                         help="references stop early below this noise threshold, 0 for never (default 0.01)")
@@ -161,6 +166,8 @@ def parse(arguments):
         parser.error(f"--clean-spp must be above {_LEAST_CLEAN}, which every pixel gets")
     if options.sequence % 2 == 0:
         parser.error("--sequence must be odd: the middle frame is the one with a reference")
+    if options.all_references and options.sequence == 1:
+        parser.error("--all-references goes with --sequence")
     if options.sequence > 1 and (options.noisy_seeds > 1 or options.also_spp or options.guides_only):
         parser.error("--sequence does not go with --noisy-seeds, --also-spp and --guides-only")
     for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
@@ -212,7 +219,7 @@ class Crop:
         is_still = options.sequence == 1
         self.frames = [None] if is_still else list(range(1, options.sequence + 1))
         self.middle = None if is_still else moving.middle(options.sequence)
-        self.reference = names.reference_name(name, self.middle)
+        self.aimed_at = self.frames if options.all_references else [self.middle]
         self.clean = random.Random(f"clean {scene_name}").random() < options.clean_share
         self.counts = self._counts(options)
         rng = random.Random(f"adaptive {name}")
@@ -263,12 +270,17 @@ class Crop:
         """The name of the mean of the noisy renders of one sample count."""
         return names.noisy_name(self.name, spp * self.seeds).replace(".exr", "_mean.exr")
 
+    def reference(self, frame):
+        """The name of a frame's reference."""
+        return names.reference_name(self.name, frame)
+
     def pairs(self):
-        """(scene, file, samples) for the manifest."""
-        for file, spp, n in (row[:3] for row in self.noisy() if row[3] == self.middle):
-            yield self.name if n == 0 else f"{self.name}_n{n}", file, spp
+        """(scene, file, reference, samples) for the manifest."""
+        for file, spp, n, frame in self.noisy():
+            if frame in self.aimed_at:
+                yield self.name if n == 0 else f"{self.name}_n{n}", file, self.reference(frame), spp
         for spp in self.counts[0] if self.means else []:
-            yield f"{self.name}_mean", self.mean_of(spp), spp * self.seeds
+            yield f"{self.name}_mean", self.mean_of(spp), self.reference(None), spp * self.seeds
 
 
 class Records:
@@ -294,8 +306,7 @@ class Records:
             csv.writer(file, lineterminator="\n").writerows(([header] if fresh else []) + rows)
 
     def add_crop(self, crop):
-        rows = [[scene, file, crop.reference, spp] for scene, file, spp in crop.pairs()]
-        self._append("manifest.csv", ["scene", "noisy", "reference", "spp"], rows)
+        self._append("manifest.csv", ["scene", "noisy", "reference", "spp"], [list(pair) for pair in crop.pairs()])
         self.done.add(crop.name)
 
     def reject(self, scene_name, reason):
@@ -361,34 +372,34 @@ def render_crop(options, ledger, scene, region, crop, facts):
             ledger.add(
                 file=crop.mean_of(spp), spp=spp * crop.seeds, noise_seed="mean", seconds="0.0", **facts
             )
+        for frame in crop.aimed_at:
+            if frame is not None:
+                scene.frame_set(frame)
+            render_reference(options, ledger, scene, layers, crop, frame, facts)
         if crop.middle is not None:
             scene.frame_set(crop.middle)
-        with Edits() as passes:
-            rendering.combined_only(passes, layers)
-            rendering.store_guides(passes, layers)
-            seed = rendering.mixed_seed(crop.seed, crop.name, "reference")
-            spp = options.clean_spp if crop.clean else options.ref_spp
-            if crop.clean:
-                rendering.set_sampling(passes, scene, spp, seed, options.clean_noise, _LEAST_CLEAN)
-            else:
-                rendering.set_sampling(
-                    passes,
-                    scene,
-                    spp,
-                    seed,
-                    options.ref_noise,
-                    _LEAST_SAMPLES if options.denoise_references else 0,
-                )
-                if options.denoise_references:
-                    rendering.denoise(passes, scene, layers)
-            seconds = render_compact(scene, os.path.join(options.out, crop.reference))
-            ledger.add(
-                file=crop.reference,
-                spp=spp,
-                noise_seed="clean" if crop.clean else "reference",
-                seconds=f"{seconds:.1f}",
-                **facts,
-            )
+
+
+def render_reference(options, ledger, scene, layers, crop, frame, facts):
+    """Renders the reference of a frame of a crop, the scene's current one."""
+    with Edits() as passes:
+        rendering.combined_only(passes, layers)
+        rendering.store_guides(passes, layers)
+        words = (crop.seed, crop.name, "reference") + ((frame,) if options.all_references else ())
+        seed = rendering.mixed_seed(*words)
+        spp = options.clean_spp if crop.clean else options.ref_spp
+        if crop.clean:
+            rendering.set_sampling(passes, scene, spp, seed, options.clean_noise, _LEAST_CLEAN)
+        else:
+            least = _LEAST_SAMPLES if options.denoise_references else 0
+            rendering.set_sampling(passes, scene, spp, seed, options.ref_noise, least)
+            if options.denoise_references:
+                rendering.denoise(passes, scene, layers)
+        seconds = render_compact(scene, os.path.join(options.out, crop.reference(frame)))
+        kind = "clean" if crop.clean else "reference"
+        ledger.add(
+            file=crop.reference(frame), spp=spp, noise_seed=kind, seconds=f"{seconds:.1f}", **facts
+        )
 
 
 def render_compact(scene, path):

@@ -294,6 +294,21 @@ fn renders_sequences_whose_vectors_lead_to_the_frames_around() {
         }
     }
     assert!(along < 0.7 * in_place, "albedos differ by {along} along vectors, {in_place} in place");
+    let all = folder.path().join("all");
+    generate(
+        &all,
+        "--seeds 30 --kinds materials --sequence 3 --all-references --size 32 --spp 16 --ref-spp 16",
+    );
+    let pairs = testset::read(all.join("manifest.csv").to_str().unwrap()).unwrap().pairs;
+    let frames: Vec<_> = pairs.iter().filter_map(|pair| pair.frame.as_deref()).collect();
+    assert_eq!(frames, ["0001", "0002", "0003"]);
+    for pair in &pairs {
+        let reference = pair.reference.to_str().unwrap();
+        assert!(
+            reference.ends_with(&format!("{}.exr", pair.frame.as_deref().unwrap()))
+                && pair.reference.exists()
+        );
+    }
     // Two frames have no middle one.
     let mut command = blender();
     let arguments = ["--out", "x", "--seeds", "1", "--sequence", "2"];

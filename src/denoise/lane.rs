@@ -177,14 +177,17 @@ impl Lane {
                     continue;
                 }
                 Loaded::Neighbour { number, loaded, is_written } => {
-                    window.leave(number.saturating_sub(2 * reach as i64));
                     self.on_own_threads(|| window.enter(number, loaded, is_written, model));
                     continue;
                 }
                 Loaded::Complete { job, number } => {
                     let window = &mut window;
                     let denoised = attempt(&job.input, || {
-                        self.on_own_threads(|| window.denoise(number, model, options))
+                        self.on_own_threads(|| {
+                            let denoised = window.denoise(number, model, options);
+                            window.leave(number);
+                            denoised
+                        })
                     });
                     (job, denoised)
                 }

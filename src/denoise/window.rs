@@ -117,13 +117,19 @@ pub struct Window {
     /// How many frames away the renders are that are averaged, and the results.
     reaches: [i32; 2],
     held: BTreeMap<i64, Held>,
+    /// Whether its frames are those of a stream, which are let go of in their order.
+    is_stream: bool,
 }
 
 impl Window {
     /// An empty window of so many frames before and after one.
     pub fn new(reach: usize) -> Self {
         let renders = reach.min(RENDERS);
-        Self { reaches: [renders, reach - renders].map(|n| n as i32), held: BTreeMap::new() }
+        Self {
+            reaches: [renders, reach - renders].map(|n| n as i32),
+            held: BTreeMap::new(),
+            is_stream: false,
+        }
     }
 
     /// Takes in what was read of a frame, or why it cannot be; `is_written` if it is to be denoised too.
@@ -134,6 +140,7 @@ impl Window {
         is_written: bool,
         model: &dyn Denoiser,
     ) {
+        self.is_stream = true;
         let mut moments = BTreeMap::new();
         let rest = loaded.and_then(|loaded| {
             loaded.each(|_, layer, shot, _| {
@@ -168,9 +175,50 @@ impl Window {
         self.view(number, &ViewKey::default(), model, options, report)
     }
 
-    /// Lets go of frames before one.
-    pub fn leave(&mut self, before: i64) {
-        self.held = self.held.split_off(&before);
+    /// Lets go of what no frame after one needs that has been denoised, if frames come in order.
+    pub fn leave(&mut self, number: i64) {
+        let [renders, results] = self.reaches.map(i64::from);
+        // Results that later frames may average; one that is not there yet needs the renders before it.
+        let is_done = |held: &Held| held.moments.values().all(|moment| moment.result.is_some());
+        let needed = (number.saturating_sub(results - 1)..=number)
+            .map(|n| if self.held.get(&n).is_none_or(is_done) { n } else { n - renders })
+            .chain([number.saturating_sub(renders - 1)])
+            .min();
+        self.held = self.held.split_off(&needed.expect("there is at least one"));
+        // Of this frame the result is enough where the next one has its own already.
+        if results == 1 && self.held.get(&number.saturating_add(1)).is_some_and(is_done) {
+            let moments = self.held.get_mut(&number).into_iter().flat_map(|held| held.moments.values_mut());
+            moments.for_each(|moment| {
+                moment.keep(&[]);
+                moment.links.clear();
+            });
+        }
+    }
+
+    /// Lets go of what a frame of a stream no longer needs, when the render of frame `averaged` has just been
+    /// averaged with its neighbours': of what tells frames apart where it is known how they belong together,
+    /// and of all passes but those of the result where its neighbours' renders have been averaged too.
+    fn trim(&mut self, number: i64, view: &ViewKey, averaged: i64, model: &dyn Denoiser) {
+        let next = |offset: i32| number + i64::from(offset);
+        let is_known = |number: i64, offset: i32| {
+            let knows = |moment: &Moment| moment.links.contains_key(&offset) || moment.is_result_alone();
+            self.moment(number, view).is_none_or(knows)
+        };
+        let is_linked = offsets(1).all(|n| is_known(number, n) && is_known(next(n), -n));
+        // Results of frames further away are linked later.
+        if !self.is_stream || self.reaches[1] > 1 || !is_linked {
+            return;
+        }
+        let is_averaged = (-1..=1).map(next).all(|number| {
+            number == averaged || self.moment(number, view).is_none_or(|moment| moment.result.is_some())
+        });
+        let mut kept = vec![Pass::Combined, Pass::Alpha];
+        if !is_averaged {
+            kept.extend(model.passes().iter().chain(model.optional_passes()));
+        }
+        if let Some(moment) = self.moment_mut(number, view) {
+            moment.keep(&kept);
+        }
     }
 
     /// Denoises a frame that has entered to be written, as all that lies around it has.
@@ -292,11 +340,17 @@ impl Window {
         report: &mut Report,
     ) -> Result<()> {
         let [renders, _] = self.reaches;
-        offsets(renders).for_each(|offset| self.connect(number, view, offset));
-        let own = self.moment(number, view).expect("only frames that are there are inferred");
-        if own.result.is_some() {
+        if self.moment(number, view).is_some_and(|own| own.result.is_some()) {
             return Ok(());
         }
+        for offset in offsets(renders) {
+            self.connect(number, view, offset);
+            // What will be asked of a frame of a stream is found out now, so that less of it is held.
+            if self.is_stream {
+                self.connect(number + i64::from(offset), view, -offset);
+            }
+        }
+        let own = self.moment(number, view).expect("only frames that are there are inferred");
         let others: Vec<(&PassSet, &Link)> = offsets(renders)
             .filter_map(|offset| {
                 let other = self.moment(number + i64::from(offset), view)?;
@@ -310,6 +364,7 @@ impl Window {
         } else {
             let mut average = Shot::new(average(&own.shot.passes, &others, model));
             average.wraps = own.shot.wraps;
+            offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
             run(&average, model, options, report)?
         };
         self.moment_mut(number, view).expect("it is there").result = Some(image);
@@ -445,6 +500,19 @@ impl Moment {
             }
         }
         Self { shot, look, links: BTreeMap::new(), result: None }
+    }
+
+    /// Whether all else was let go of.
+    fn is_result_alone(&self) -> bool {
+        self.shot.passes.get(Pass::Combined).is_none()
+    }
+
+    /// Lets go of what tells frames apart, and of all passes but some.
+    fn keep(&mut self, passes: &[Pass]) {
+        self.look = Look::default();
+        for pass in Pass::ALL.into_iter().filter(|pass| !passes.contains(pass)) {
+            drop(self.shot.passes.remove(pass));
+        }
     }
 }
 

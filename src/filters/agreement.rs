@@ -109,7 +109,7 @@ pub struct Evidence<'a> {
 
 /// What a frame looks like from a little way off: means over squares of light (its fourth root, over the
 /// albedo), the variance of that, albedo, normal and depth.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Look {
     size: (usize, usize),
     squares: Planes,

@@ -36,6 +36,8 @@ pub struct Learned {
     network: Box<dyn Network>,
     /// Whether it looks twice, see [`TURNED`].
     turned: bool,
+    /// Whether what it changes beyond the noise is taken back.
+    pub(super) is_restrained: bool,
     /// The network's configuration and how it was trained.
     pub metadata: Metadata,
 }
@@ -44,7 +46,7 @@ impl Learned {
     /// The model of the catalogue whose weights file is given, built in or read from `path`.
     pub(super) fn parse(name: &str, bytes: &[u8], path: &Path) -> Result<Self> {
         let (network, metadata) = weights_file::parse(bytes, path)?;
-        Ok(Self { name: name.to_string(), network, turned: name == TURNED, metadata })
+        Ok(Self { name: name.to_string(), network, turned: name == TURNED, is_restrained: true, metadata })
     }
 
     /// The model in a weights file, named like the file.
@@ -59,7 +61,7 @@ impl Learned {
                 "denoises albedo and normal for other networks, not radiance; give it to `demc train --prefilter`",
             ));
         }
-        Ok(Self { name: path.display().to_string(), network, turned: false, metadata })
+        Ok(Self { name: path.display().to_string(), network, turned: false, is_restrained: true, metadata })
     }
 
     /// The model under another name, with its weights packed for an arithmetic: that asked for, or the
@@ -189,7 +191,7 @@ impl Denoiser for Learned {
     }
 
     fn expects_errors(&self) -> bool {
-        self.metadata.network.architecture == Architecture::Pyramid
+        self.metadata.network.architecture == Architecture::Pyramid && self.is_restrained
     }
 
     fn denoise_expecting(
@@ -213,6 +215,9 @@ impl Learned {
         expects: bool,
     ) -> Result<(Planes, Option<ExpectedError>)> {
         let passes = &shot.passes;
+        if self.metadata.network.architecture == Architecture::Pyramid && !self.is_restrained {
+            return Ok((self.looks(&with_stand_ins(passes), companions, tile)?, None));
+        }
         if self.metadata.network.architecture != Architecture::Pyramid {
             refuse_companions(&self.name, companions)?;
             return Ok((self.network.infer(passes, tile)?, None));

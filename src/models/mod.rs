@@ -41,13 +41,14 @@ impl Denoiser for Noisy {
 
 /// A method by its built-in name, or from a weights file. A trained network's name may end in `:f32`, `:bf16`
 /// or `:int8`, which chooses its arithmetic; without that, it is the fastest that both the network and the
-/// processor have.
+/// processor have. After that it may end in [`UNRESTRAINED`].
 ///
 /// # Errors
 /// No built-in method or readable weights file goes by that name, or it has no such arithmetic.
 pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
-    let (plain, precision) = split_precision(name_or_file);
-    let model = match catalogue::find(plain) {
+    let restrained = name_or_file.strip_suffix(UNRESTRAINED);
+    let (plain, precision) = split_precision(restrained.unwrap_or(name_or_file));
+    let mut model = match catalogue::find(plain) {
         Some(catalogue::Method { kind: catalogue::Kind::Fixed(make), .. }) => return Ok(make()),
         Some(method) => method.learned()?,
         None if Path::new(plain).extension().is_some_and(|e| e == "safetensors") => {
@@ -59,8 +60,13 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
             )));
         }
     };
+    model.is_restrained = restrained.is_none();
     Ok(Box::new(model.with_precision(name_or_file, precision)?))
 }
+
+/// What a trained network's name ends in where nothing of what it changed beyond the noise is taken back: to
+/// see what [shrinkage](crate::filters::shrinkage) does.
+pub const UNRESTRAINED: &str = ":unrestrained";
 
 /// A method's name or weights file, and the arithmetic asked for: `demc-m:f32`.
 pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
