@@ -50,11 +50,11 @@ SQUARE = 16
 class Sequence:
     """A frame, its neighbours and the reference."""
 
-    def __init__(self, tensors, stage):
+    def __init__(self, tensors, stage, kernel=1):
         count = sum(name.startswith("inside_") for name in tensors)
         stack = lambda name: torch.stack([tensors[f"{name}_{n}"] for n in range(count)])
         self.stage, self.own, self.truth = stage, tensors[stage], tensors["truth"]
-        self.there, self.inside = stack(f"{stage}_there"), stack("inside")
+        self.there, self.inside = shifted(stack(f"{stage}_there"), kernel), stack("inside")
         self.features = stack(f"{stage}_features").transpose(1, 2)
         self.gate = self.features[:, GATE:GATE + 1] if stage == "render" else torch.zeros_like(self.inside)
         self.floor = 0.25 * ((tensors["result"] - self.truth) ** 2 / (self.truth**2 + 0.001)).mean()
@@ -88,16 +88,27 @@ class Sequence:
         outputs = model.outputs(standard(self.features[:, :, rows]))
         weights = (outputs.clamp(LEAST[self.stage], MOST) + self.gate[:, :, rows]).exp() * self.inside[:, :, rows]
         own = self.own[:, rows]
-        average = (own + (weights * self.there[:, :, rows]).sum(0)) / (1 + weights.sum(0))
+        of_colours = (weights.unsqueeze(2) * self.there[:, :, :, rows]).sum((0, 1))
+        average = (own + of_colours) / (1 + weights.sum((0, 1)))
         return self.error(average, rows), self.error(own, rows)
 
 
-def train(sequences, steps, seed):
+def shifted(images, kernel):
+    """For each image, the images whose pixels are those of the kernel around each pixel, row by row."""
+    height, width = images.shape[-2:]
+    padded = F.pad(images, (kernel // 2,) * 4, mode="replicate")
+    corners = [(y, x) for y in range(kernel) for x in range(kernel)]
+    return torch.stack([padded[..., y:y + height, x:x + width] for y, x in corners], 1)
+
+
+def train(sequences, steps, seed, kernel=1):
     """The perceptron, and what standardises its features."""
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     standard = Standard(torch.cat([sequence.features for sequence in sequences]))
-    model = Perceptron(sequences[0].features.shape[1], [-0.5])
+    biases = [-4.0] * kernel**2
+    biases[kernel**2 // 2] = -0.5
+    model = Perceptron(sequences[0].features.shape[1], biases)
     optimizer = torch.optim.AdamW(model.parameters(), 3e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, steps)
     for step in range(steps):
@@ -126,14 +137,18 @@ def main():
     parser.add_argument("folder", help="what neighbour_features.rs wrote")
     parser.add_argument("--out", help="safetensors file to write")
     parser.add_argument("--hold-out", action="store_true", help=f"leave one sequence in {HELD_OUT} out, and report on those")
+    parser.add_argument("--kernel", type=int, default=1, help="weights of so many rows and columns around a neighbour's pixel; "
+                        "the program knows 1")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    if options.out and options.kernel != 1:
+        parser.error("the program knows no weights of several pixels")
     paths = sorted(glob.glob(os.path.join(options.folder, "*.safetensors")))
     held_out = lambda path: zlib.crc32(os.path.basename(path).split(".")[0].encode()) % HELD_OUT == 0
-    load = lambda paths: [Sequence(file, options.stage) for file in map(load_file, paths) if "inside_0" in file]
+    load = lambda paths: [Sequence(file, options.stage, options.kernel) for file in map(load_file, paths) if "inside_0" in file]
     seen = load([path for path in paths if not (options.hold_out and held_out(path))])
-    model, standard = train(seen, options.steps, options.seed)
+    model, standard = train(seen, options.steps, options.seed, options.kernel)
     report(seen, model, standard)
     if options.hold_out:
         report(load([path for path in paths if held_out(path)]), model, standard)

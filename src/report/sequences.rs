@@ -24,6 +24,8 @@ const REFERENCE: &str = "reference";
 const ROW: u32 = 10;
 /// Height in pixels of a method's name in a slice.
 const NAME: u32 = 22;
+/// Width in pixels that slices side by side fill at most.
+const WIDEST: u32 = 960;
 /// Bytes that all frames to step through may take in a page.
 const MOST_BYTES: usize = 6_000_000;
 
@@ -104,22 +106,26 @@ impl Sequence<'_> {
     }
 }
 
-/// The middle rows of the frames of each method, method below method.
+/// The middle rows of the frames of each method, methods side by side as far as there is room.
 fn stack(strips: &[(&str, Vec<RgbImage>)], (width, height): (u32, u32)) -> Result<RgbImage> {
     let frames = strips.iter().map(|(_, frames)| frames.len()).max().unwrap_or(0) as u32;
+    let count = strips.len() as u32;
+    let columns = (WIDEST / width).clamp(1, count.max(1));
     let strip = NAME + frames * ROW;
-    let mut image = RgbImage::from_pixel(width, strip * strips.len() as u32, BACKGROUND);
+    let corner = |s: usize| (s as u32 % columns * width, s as u32 / columns * strip);
+    let mut image = RgbImage::from_pixel(columns * width, strip * count.div_ceil(columns), BACKGROUND);
     for (s, (_, frames)) in strips.iter().enumerate() {
-        for (f, frame) in frames.iter().enumerate() {
+        let (left, top) = corner(s);
+        for (f, frame) in (0..).zip(frames) {
             let row = imageops::crop_imm(frame, 0, height / 2, width, 1).to_image();
             let tall = imageops::resize(&row, width, ROW, imageops::FilterType::Nearest);
-            let top = s as u32 * strip + NAME + f as u32 * ROW;
-            imageops::replace(&mut image, &tall, 0, top.into());
+            imageops::replace(&mut image, &tall, left.into(), (top + NAME + f * ROW).into());
         }
     }
     draw_on(&mut image, |canvas| {
         strips.iter().enumerate().try_for_each(|(s, (name, _))| {
-            let at = (6, (s as u32 * strip + NAME / 2) as i32);
+            let (left, top) = corner(s);
+            let at = (left as i32 + 6, (top + NAME / 2) as i32);
             canvas.text(name, at, Anchor::Left, Style { colour: TEXT, ..Style::new(14) })
         })
     })?;
@@ -241,7 +247,7 @@ mod tests {
         assert!(!page.contains("absent"), "a method without frames is left out");
         assert_eq!(page.matches("data-frame=").count(), 4, "two frames, by the method and by the reference");
         let slice = read(&out.path().join("slices/pan_0004spp.png")).unwrap();
-        assert_eq!(slice.dimensions(), (40, 2 * (NAME + 2 * ROW)));
+        assert_eq!(slice.dimensions(), (80, NAME + 2 * ROW), "the method beside the reference");
         let of = |frame: u32| slice.get_pixel(20, NAME + frame * ROW + ROW / 2)[0];
         assert!(of(0) < 5 && of(1) > 100, "{} {}", of(0), of(1));
         assert!(section(out.path(), &pairs[..1], &methods).unwrap().is_none());
