@@ -70,6 +70,17 @@ fn light_without_noise_comes_back_as_it_was() {
 }
 
 #[test]
+fn a_model_by_itself_changes_a_nearly_clean_frame_more() {
+    let frame = Shot::new(nearly_clean());
+    for name in MODELS {
+        let [restrained, by_itself] = ["", models::UNRESTRAINED].map(|suffix| {
+            relmse(&model(&format!("{name}{suffix}")).denoise(&frame).unwrap(), combined(&frame.passes))
+        });
+        assert!(restrained < by_itself, "{name}: {restrained} and {by_itself}");
+    }
+}
+
+#[test]
 fn a_result_denoised_again_stays() {
     let first = part(160, 90);
     for name in MODELS {
