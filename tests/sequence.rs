@@ -297,6 +297,9 @@ fn a_shadow_that_vectors_do_not_know_is_not_dragged() {
     let dir = sequence(shot, 1..=5);
     let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
     demc(&alone).arg(dir.path()).assert().success();
+    // An input after it would be its number.
+    let said = demc(&out).arg("--temporal").arg(dir.path()).assert().code(2).get_output().stderr.clone();
+    assert!(String::from_utf8(said).unwrap().contains("name inputs before it"));
     demc(&out).arg(dir.path()).arg("--temporal").assert().success();
     for n in 1..=5 {
         let [with, without] = [&out, &alone].map(|dir| shot.error(&result(dir, n), "ViewLayer.Denoised", n));

@@ -29,7 +29,7 @@ pub struct Args {
     /// N before and N after: as methods of their own, such as demc-m:temporal. Their time is that of a frame
     /// whose neighbours are all denoised for it alone [default: frame by frame; 2 without a number]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
-          value_parser = clap::value_parser!(u8).range(1..=8))]
+          value_parser = methods::parse_reach)]
     temporal: Option<u8>,
     /// Method that the summary's ratios refer to [default: the first of --models]
     #[arg(long, value_name = "NAME")]

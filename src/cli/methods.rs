@@ -110,6 +110,17 @@ impl Args {
     }
 }
 
+/// How many frames before and after one `--temporal` takes.
+///
+/// # Errors
+/// It is none that it takes.
+pub fn parse_reach(text: &str) -> Result<u8> {
+    let reach = text.parse().ok().filter(|reach| (1..=8).contains(reach));
+    reach.ok_or_else(|| {
+        Error::Usage("wants 1 to 8 frames; name inputs before it, or after that number".into())
+    })
+}
+
 /// The name of a method in tables. A weights file has its stem and the arithmetic asked for as its name.
 /// Where another file has the same name its folder is added, and where that does not help either the name is
 /// all that was asked for.

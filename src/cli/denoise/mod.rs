@@ -102,7 +102,7 @@ pub struct Args {
     /// beside them and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without
     /// a number]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
-          value_parser = clap::value_parser!(u8).range(1..=8))]
+          value_parser = super::methods::parse_reach)]
     temporal: Option<u8>,
 
     /// Write a PNG beside each result, exposed for display
