@@ -31,8 +31,9 @@ from perceptron import Perceptron, Standard
 LEAST = {"render": -8.0, "result": -10.0}
 MOST = 0.0
 
-# The feature of renders that tells the logarithm of the largest weight.
-GATE = 8
+# Features of renders: the relative variance of light, the logarithm of the largest weight by squares of pixels,
+# and how far normals of single pixels differ, followed by albedos; and what is added to these two.
+VARIANCE, GATE, NORMAL, TINY = 2, 8, 9, 1e-4
 
 # Rows of a frame that are drawn at a time, frames of a step, and that one sequence in so many is held out.
 BAND, BATCH, HELD_OUT = 80, 5, 4
@@ -56,7 +57,7 @@ class Sequence:
         self.stage, self.own, self.truth = stage, tensors[stage], tensors["truth"]
         self.there, self.inside = shifted(stack(f"{stage}_there"), kernel), stack("inside")
         self.features = stack(f"{stage}_features").transpose(1, 2)
-        self.gate = self.features[:, GATE:GATE + 1] if stage == "render" else torch.zeros_like(self.inside)
+        self.gate = bound(self.features) if stage == "render" else torch.zeros_like(self.inside)
         self.floor = 0.25 * ((tensors["result"] - self.truth) ** 2 / (self.truth**2 + 0.001)).mean()
 
     def error(self, image, rows=slice(None)):
@@ -91,6 +92,14 @@ class Sequence:
         of_colours = (weights.unsqueeze(2) * self.there[:, :, :, rows]).sum((0, 1))
         average = (own + of_colours) / (1 + weights.sum((0, 1)))
         return self.error(average, rows), self.error(own, rows)
+
+
+def bound(features):
+    """Logarithms of the largest weights of renders, as in agreement.rs."""
+    variance, normal, albedo = features[:, [VARIANCE, NORMAL, NORMAL + 1]].exp().unbind(1)
+    bias = 2 * ((albedo - TINY).clamp_min(0) + 0.3 * (normal - TINY).clamp_min(0))
+    of_pixels = (16 * variance / (16 * variance + bias)).log().clamp_min(-16)
+    return features[:, GATE:GATE + 1] + of_pixels.unsqueeze(1)
 
 
 def shifted(images, kernel):

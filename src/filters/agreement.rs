@@ -6,8 +6,9 @@
 //! itself, whose means around a place may differ by what its noise explains. Means are of 2x2 squares of
 //! pixels, and of the 3x3 squares around one, because single pixels of few samples say little. But albedo,
 //! normal and depth are compared pixel by pixel as well: at an edge that has moved by one pixel, means over
-//! squares see no difference. From all that a perceptron finds the weight, and the differences of squares
-//! alone bound it. It was trained by `eval/training/neighbours.py` to make the error of the averaged render
+//! squares see no difference. From all that a perceptron finds the weight. It is bounded by the differences
+//! of squares, and by how far light would be off that differs as the guides of single pixels do, beside how
+//! noisy it is. It was trained by `eval/training/neighbours.py` to make the error of the averaged render
 //! least. That error is of means over 3x3 to 13x13 pixels, since single pixels are what a denoiser averages.
 //!
 //! In: passes of two frames and the [`Flow`] between them. Out: a weight for every pixel, 0 where there is
@@ -22,6 +23,7 @@ use super::{
 };
 use crate::{
     kernels::{
+        exponential::exp,
         logarithm::ln,
         vectorised::{self, Vectorised},
     },
@@ -36,6 +38,7 @@ const OF_SQUARES: usize = LOGARITHMS + 1;
 const LOGARITHMS: usize = 8;
 const OF_GUIDES: usize = 3;
 const NOISE: usize = 0;
+const VARIANCES: usize = 2;
 const NORMALS: usize = 3;
 const ALBEDOS: usize = 4;
 const DEPTHS: usize = 5;
@@ -58,6 +61,16 @@ const LIGHT_DIFFERS: f32 = 3.0;
 const NORMAL_DIFFERS: f32 = 0.015;
 const ALBEDO_DIFFERS: f32 = 0.009;
 const DEPTH_DIFFERS: f32 = 0.009;
+
+/// How much of the squared difference of two pixels' normals counts as one of their light, relative to it.
+const NORMAL_AS_LIGHT: f32 = 0.3;
+
+/// How much the squared bias of an average counts beside its variance: of values from 0 to 2, the one at which
+/// rendered sequences at 16 samples came out best (docs/decisions.md).
+const BIAS: f32 = 2.0;
+
+/// A small relative variance of light is so many times that of its fourth root.
+const OF_ROOT: f32 = 16.0;
 
 /// How far the variance of a mean of the light falls below that of one pixel.
 const PIXELS: f32 = 20.0;
@@ -196,8 +209,11 @@ impl Look {
         Planes::from_rows(1, self.size, |_, y, out| {
             let mut features = vec![0.0; FEATURES * width];
             self.features_of_row(y, &of_squares, flow, [own, there], &mut features);
-            let gate = &features[GATE * width..][..width];
-            PERCEPTRON.weigh(&features, LEAST, Some(gate), flow.row(y).0, out);
+            let line = |line: usize| &features[line * width..][..width];
+            let mut gate = line(GATE).to_vec();
+            let [variance, normal, albedo] = [VARIANCES, OF_SQUARES, OF_SQUARES + 1].map(line);
+            vectorised::run(Bound { variance, normal, albedo, gate: &mut gate });
+            PERCEPTRON.weigh(&features, LEAST, Some(&gate), flow.row(y).0, out);
         })
     }
 
@@ -412,6 +428,32 @@ impl Vectorised for ComparePixels<'_> {
         for values in out.chunks_exact_mut(width) {
             replace_outside(values, columns);
             values.iter_mut().for_each(|v| *v = ln(*v + TINY_OF_PIXELS));
+        }
+    }
+}
+
+/// Bounds the weights of a row of pixels, as logarithms, by what single pixels' guides tell: light differs
+/// like the albedo does, and of two values of which the second is biased, the mean errs least if the second
+/// counts `s / (s + b)` beside 1 for the first, `s` the variance of each and `b` the squared bias.
+struct Bound<'a> {
+    /// Logarithms, which are features: the variance of a mean of the light's fourth root, relative to the
+    /// light, and the squared differences of normals and albedos.
+    variance: &'a [f32],
+    normal: &'a [f32],
+    albedo: &'a [f32],
+    gate: &'a mut [f32],
+}
+
+impl Vectorised for Bound<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { variance, normal, albedo, gate } = self;
+        for ((gate, variance), (normal, albedo)) in
+            gate.iter_mut().zip(variance).zip(normal.iter().zip(albedo))
+        {
+            let [normal, albedo] = [normal, albedo].map(|v| (exp(*v) - TINY_OF_PIXELS).max(0.0));
+            let (variance, bias) = (OF_ROOT * exp(*variance), BIAS * (albedo + NORMAL_AS_LIGHT * normal));
+            *gate += ln(variance / (variance + bias)).max(-FARTHEST);
         }
     }
 }
