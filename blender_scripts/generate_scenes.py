@@ -12,7 +12,8 @@ a real frame. The same seed and options give the same scene and the same pixels.
 Writes s<seed>_<kind>_<spp>spp.exr with s<seed>_<kind>_ref.exr (all half float, one part; references
 keep their guides, which are what a prefilter aims at), where several crops of a scene add _c0, _c1 ... to
 the name. With --sequence N it writes N frames, s<seed>_<kind>_<spp>spp.0001.exr and on, in which camera and
-things move, with vectors, and the reference of the middle one alone, or with --all-references of each. manifest.csv (scene,noisy,reference,spp)
+things move, with vectors, and the reference of the middle one alone, or with --all-references of each.
+manifest.csv (scene,noisy,reference,spp)
 lists the further noisy seeds (..._n1.exr, as scene ..._n1) and their means (..._mean.exr) too; views.csv lists
 every file with its seeds, processor seconds and SHA-256.
 Finished scenes are skipped; scenes with nothing to see go to rejected.csv and are not tried again.

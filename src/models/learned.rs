@@ -215,9 +215,6 @@ impl Learned {
         expects: bool,
     ) -> Result<(Planes, Option<ExpectedError>)> {
         let passes = &shot.passes;
-        if self.metadata.network.architecture == Architecture::Pyramid && !self.is_restrained {
-            return Ok((self.looks(&with_stand_ins(passes), companions, tile)?, None));
-        }
         if self.metadata.network.architecture != Architecture::Pyramid {
             refuse_companions(&self.name, companions)?;
             return Ok((self.network.infer(passes, tile)?, None));
@@ -235,7 +232,8 @@ impl Learned {
         Ok((part.placed_in(whole, place), error.map(|error| error.placed_in(whole, place))))
     }
 
-    /// What the network makes of a frame, after [`Shrinkage`] took back what it changed beyond the noise.
+    /// What the network makes of a frame, after [`Shrinkage`] took back what it changed beyond the noise, unless
+    /// nothing is to be taken back.
     fn restrained(
         &self,
         passes: &PassSet,
@@ -244,6 +242,9 @@ impl Learned {
         expects: bool,
     ) -> Result<(Planes, Option<ExpectedError>)> {
         let passes = &*with_stand_ins(passes);
+        if !self.is_restrained {
+            return Ok((self.looks(passes, companions, tile)?, None));
+        }
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
