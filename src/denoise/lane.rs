@@ -2,7 +2,7 @@
 //! as many lanes as frames that it denoises at once, each with threads of its own to compute with.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     sync::{
         Arc, PoisonError,
         mpsc::{Receiver, Sender, SyncSender, sync_channel},
@@ -38,8 +38,9 @@ enum Loaded {
     Frame(Job, Result<Views<Shot>>),
     /// A stretch of a sequence begins, so the one before is forgotten.
     Begin,
-    /// What was read of a frame of the sequence, by its number, and whether it is to be denoised.
-    Neighbour { number: i64, loaded: Result<Views<Shot>>, is_written: bool },
+    /// A frame of the sequence, by its number, and whether it is to be denoised. Its passes are decoded when
+    /// the window takes it in, since they are large.
+    Neighbour { number: i64, file: PathBuf, read: Result<Frame>, is_written: bool },
     /// All frames around this one have been read.
     Complete { job: Job, number: i64 },
 }
@@ -126,11 +127,11 @@ impl Lane {
     /// Reads the frames of a stretch that are to be denoised, and those around them, each once; none when the
     /// next stage has ended.
     fn load_stretch(&self, stretch: Stretch, next: &SyncSender<Loaded>) -> Option<()> {
-        let load = |file: &Path| self.take_apart(file, attempt(file, || Frame::read(file)));
+        let read = |file: &Path| attempt(file, || Frame::read(file));
         let Stretch { files, jobs, is_numbered } = stretch;
         if !is_numbered {
             for (job, _) in jobs {
-                let mut frame = load(&job.input);
+                let mut frame = self.take_apart(&job.input, read(&job.input));
                 if let Ok(frame) = &mut frame {
                     frame.say("its name ends in no frame number; denoised alone");
                 }
@@ -146,7 +147,8 @@ impl Lane {
             let (first, last) = (number.saturating_sub(reach), number.saturating_add(reach));
             for (&number, file) in files.range(first.max(unread)..=last) {
                 let is_written = written.contains(&number);
-                next.send(Loaded::Neighbour { number, loaded: load(file), is_written }).ok()?;
+                let (file, read) = (file.clone(), read(file));
+                next.send(Loaded::Neighbour { number, file, read, is_written }).ok()?;
             }
             unread = last.saturating_add(1);
             next.send(Loaded::Complete { job, number }).ok()?;
@@ -176,7 +178,8 @@ impl Lane {
                     window = Window::new(reach);
                     continue;
                 }
-                Loaded::Neighbour { number, loaded, is_written } => {
+                Loaded::Neighbour { number, file, read, is_written } => {
+                    let loaded = self.take_apart(&file, read);
                     self.on_own_threads(|| window.enter(number, loaded, is_written, model));
                     continue;
                 }

@@ -6,6 +6,7 @@
 //! in each frame's [`Report`].
 
 mod batch;
+mod half_floats;
 mod job;
 mod lane;
 mod lights;

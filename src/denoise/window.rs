@@ -8,22 +8,23 @@
 //! a stream, each is read and denoised once. Both averages follow the Vector pass, and leave out what does
 //! not agree: see [`agreement`](crate::filters::agreement).
 
-use std::{collections::BTreeMap, time::Instant};
+use std::{borrow::Cow, collections::BTreeMap, time::Instant};
 
 use super::{
     Denoised, Options, Report, Views,
+    half_floats::HalfFloats,
     job::{finish, run},
 };
 use crate::{
     Error, Result,
     features::exposure,
     filters::{
-        agreement::{Evidence, Look},
+        agreement::{Guides, Look},
         motion::{Direction, Flow},
         temporal::{self, Link, likeness},
     },
     models::Denoiser,
-    passes::{Layer, Pass, PassSet},
+    passes::{Layer, Pass, PassSet, Quantity},
     planes::Planes,
     shot::Shot,
 };
@@ -68,19 +69,21 @@ enum Gap {
 
 /// One view of a frame.
 struct Moment {
+    /// All that is known of it but most passes.
     shot: Shot,
+    /// These passes.
+    waiting: BTreeMap<Pass, HalfFloats>,
     look: Look,
-    /// By how many frames later the neighbour is.
-    links: BTreeMap<i32, Result<Link, Gap>>,
+    /// Weights of neighbours, (1, H, W), by how many frames later these are.
+    links: BTreeMap<i32, Result<HalfFloats, Gap>>,
     /// What the model makes of it and its neighbours' renders.
     result: Option<Planes>,
 }
 
-/// A frame whose result is averaged with another's.
+/// A frame that is averaged with another.
 struct Neighbour<'a> {
     moment: &'a Moment,
-    result: &'a Planes,
-    link: &'a Link,
+    link: Link,
 }
 
 /// What training of the weights of neighbours learns from.
@@ -212,7 +215,7 @@ impl Window {
         let is_averaged = (-1..=1).map(next).all(|number| {
             number == averaged || self.moment(number, view).is_none_or(|moment| moment.result.is_some())
         });
-        let mut kept = vec![Pass::Combined, Pass::Alpha];
+        let mut kept = vec![Pass::Combined, Pass::Alpha, Pass::Vector];
         if !is_averaged {
             kept.extend(model.passes().iter().chain(model.optional_passes()));
         }
@@ -253,22 +256,21 @@ impl Window {
     pub fn candidates(&mut self, number: i64, model: &dyn Denoiser) -> Result<Candidates> {
         let view = ViewKey::default();
         self.gather(number, &view, model, &Options::default(), &mut Report::default())?;
-        let (result, render, others) = self.gathered(number, &view, model)?;
         let own = self.moment(number, &view).expect("it has entered");
-        let likeness = likeness::Own::of(result, render, exposure(render));
-        let neighbours = others.iter().map(|Neighbour { moment, result, link }| {
-            let radiance = moment.shot.passes.require(Pass::Combined, model.name())?;
-            let passes = [own, moment].map(|moment| evidence(&moment.shot.passes));
-            let features = own.look.features(&moment.look, &link.flow, &passes[0], &passes[1]);
-            Ok(Candidate {
+        let (result, render) = (own.result(), own.render());
+        let likeness = likeness::Own::of(result, &render, exposure(&render));
+        let neighbours = self.neighbours(number, &view, self.reaches[1]).map(|Neighbour { moment, link }| {
+            let (guides, there) = (own.guides(), moment.guides());
+            let features = own.look.features(&moment.look, &link.flow, &guides, &there);
+            Candidate {
                 inside: link.inside(),
-                render: [link.nearest(radiance), features],
-                result: likeness.features(result, link).into(),
-            })
+                render: [link.nearest(&moment.render()), features],
+                result: likeness.features(moment.result(), &link).into(),
+            }
         });
         Ok(Candidates {
-            neighbours: neighbours.collect::<Result<_>>()?,
-            render: render.clone(),
+            neighbours: neighbours.collect(),
+            render: render.clone().into_owned(),
             result: result.clone(),
         })
     }
@@ -282,9 +284,12 @@ impl Window {
         report: &mut Report,
     ) -> Result<Planes> {
         self.gather(number, view, model, options, report)?;
-        let (image, radiance, others) = self.gathered(number, view, model)?;
-        let others: Vec<(&Planes, &Link)> = others.iter().map(|of| (of.result, of.link)).collect();
-        Ok(temporal::blend(image, radiance, exposure(radiance), &others))
+        let own = self.moment(number, view).expect("its views have entered");
+        let radiance = own.render();
+        let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
+        let results: Vec<(&Planes, &Link)> =
+            others.iter().map(|other| (other.moment.result(), &other.link)).collect();
+        Ok(temporal::blend(own.result(), &radiance, exposure(&radiance), &results))
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
@@ -303,31 +308,36 @@ impl Window {
         self.explain(number, view, report);
         self.infer(number, view, model, options, report)?;
         for offset in offsets(results) {
-            if self.link(number, view, offset).is_some() {
+            if self.is_linked(number, view, offset) {
                 self.infer(number + i64::from(offset), view, model, options, report)?;
             }
         }
         Ok(())
     }
 
-    /// What the model made of a frame, the frame as rendered, and what it made of neighbours in reach.
-    fn gathered(
-        &self,
-        number: i64,
-        view: &ViewKey,
-        model: &dyn Denoiser,
-    ) -> Result<(&Planes, &Planes, Vec<Neighbour<'_>>)> {
-        let own = self.moment(number, view).expect("its views have entered");
-        let image = own.result.as_ref().expect("the model ran over it");
-        let others = offsets(self.reaches[1]).filter_map(|offset| {
+    /// The frames up to so many away that a frame is averaged with.
+    fn neighbours(&self, number: i64, view: &ViewKey, reach: i32) -> impl Iterator<Item = Neighbour<'_>> {
+        offsets(reach).filter_map(move |offset| {
+            let own = self.moment(number, view)?;
+            let weights = own.links.get(&offset)?.as_ref().ok()?.planes();
+            let flow = self.flow(number, view, offset).ok()?;
             let moment = self.moment(number + i64::from(offset), view)?;
-            Some(Neighbour {
-                moment,
-                result: moment.result.as_ref()?,
-                link: self.link(number, view, offset)?,
-            })
-        });
-        Ok((image, own.shot.passes.require(Pass::Combined, model.name())?, others.collect()))
+            Some(Neighbour { moment, link: Link { flow, weights } })
+        })
+    }
+
+    /// Where the content of a frame lies in one so many frames later; the number of the frame whose vectors
+    /// are missing, if some are.
+    fn flow(&self, number: i64, view: &ViewKey, offset: i32) -> Result<Flow, i64> {
+        let (step, direction) = step(offset);
+        let own = &self.moment(number, view).ok_or(number)?.shot.passes;
+        let mut flow = Flow::still(own.width, own.height);
+        for nearer in 0..offset.abs() {
+            let at = number + i64::from(step * nearer);
+            let vectors = self.moment(at, view).and_then(|moment| moment.pass(Pass::Vector)).ok_or(at)?;
+            flow.step(&vectors, direction);
+        }
+        Ok(flow)
     }
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
@@ -351,22 +361,19 @@ impl Window {
             }
         }
         let own = self.moment(number, view).expect("only frames that are there are inferred");
-        let others: Vec<(&PassSet, &Link)> = offsets(renders)
-            .filter_map(|offset| {
-                let other = self.moment(number + i64::from(offset), view)?;
-                Some((&other.shot.passes, self.link(number, view, offset)?))
-            })
-            .collect();
         // Half buffers are the frame's own: a model that holds them against each other reads no average
         // beside them.
-        let image = if others.is_empty() || model.reads_halves() {
-            run(&own.shot, model, options, report)?
-        } else {
-            let mut average = Shot::new(average(&own.shot.passes, &others, model));
+        let is_linked = offsets(renders).any(|offset| self.is_linked(number, view, offset));
+        let shot = if is_linked && !model.reads_halves() {
+            let others: Vec<Neighbour> = self.neighbours(number, view, renders).collect();
+            let mut average = Shot::new(average(own, &others, model));
             average.wraps = own.shot.wraps;
-            offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
-            run(&average, model, options, report)?
+            average
+        } else {
+            own.shot()
         };
+        offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
+        let image = run(&shot, model, options, report)?;
         self.moment_mut(number, view).expect("it is there").result = Some(image);
         Ok(())
     }
@@ -383,13 +390,14 @@ impl Window {
         }
     }
 
-    fn find_link(&mut self, number: i64, view: &ViewKey, offset: i32) -> Result<Link, Gap> {
-        let (step, direction) = if offset < 0 { (-1, Direction::Back) } else { (1, Direction::Forth) };
+    /// The weights of a neighbour.
+    fn find_link(&mut self, number: i64, view: &ViewKey, offset: i32) -> Result<HalfFloats, Gap> {
+        let (step, _) = step(offset);
         // What lies further away is reached through what lies nearer.
         for nearer in 0..offset.abs() - 1 {
             let from = number + i64::from(step * nearer);
             self.connect(from, view, step);
-            if self.link(from, view, step).is_none() {
+            if !self.is_linked(from, view, step) {
                 return Err(Gap::Beyond);
             }
         }
@@ -409,12 +417,9 @@ impl Window {
         if place(&own.shot.passes) != place(&other.shot.passes) {
             return said(format!("frame {there} is of another size or region"));
         }
-        let mut flow = Flow::still(own.shot.passes.width, own.shot.passes.height);
-        let mut moves = false;
-        for nearer in 0..offset.abs() {
-            let at = number + i64::from(step * nearer);
-            let vectors = self.moment(at, view).and_then(|moment| moment.shot.passes.get(Pass::Vector));
-            let Some(vectors) = vectors else {
+        let flow = match self.flow(number, view, offset) {
+            Ok(flow) => flow,
+            Err(at) => {
                 let renderer = own.shot.passes.renderer;
                 return said(match renderer.is_blender() {
                     true => format!(
@@ -426,16 +431,9 @@ impl Window {
                         renderer.name
                     ),
                 });
-            };
-            moves |= vectors.data.iter().any(|v| *v != 0.0);
-            flow.step(vectors, direction);
-        }
-        let weights = own.look.agreement(
-            &other.look,
-            &flow,
-            &evidence(&own.shot.passes),
-            &evidence(&other.shot.passes),
-        );
+            }
+        };
+        let weights = own.look.agreement(&other.look, &flow, &own.guides(), &other.guides());
         let (mut sum, mut inside) = (0.0, 0usize);
         for y in 0..weights.height {
             let row = &weights.data[y * weights.width..][..weights.width];
@@ -443,7 +441,11 @@ impl Window {
             inside += flow.row(y).0.iter().filter(|x| !x.is_nan()).count();
         }
         let share = (sum / inside.max(1) as f64) as f32;
-        if !moves && share < STILL {
+        let are_zero = |nearer: i32| {
+            let moment = self.moment(number + i64::from(step * nearer), view);
+            moment.and_then(|moment| moment.waiting.get(&Pass::Vector)).is_none_or(HalfFloats::are_zero)
+        };
+        if share < STILL && (0..offset.abs()).all(are_zero) {
             return said(format!(
                 "frame {there} shows another picture, and Vector is zero everywhere: a cut, or motion blur was on, with \
                  which Blender writes no vectors (turn off Render Properties > Motion Blur and blur in the compositor, \
@@ -453,7 +455,7 @@ impl Window {
         if share < CUT {
             return said(format!("frame {there} shows another picture: a cut"));
         }
-        Ok(Link { flow, weights })
+        Ok(HalfFloats::of(&weights))
     }
 
     /// Says what a frame stays without, where its window is not full.
@@ -476,8 +478,9 @@ impl Window {
         }
     }
 
-    fn link(&self, number: i64, view: &ViewKey, offset: i32) -> Option<&Link> {
-        self.moment(number, view)?.links.get(&offset)?.as_ref().ok()
+    fn is_linked(&self, number: i64, view: &ViewKey, offset: i32) -> bool {
+        let link = self.moment(number, view).and_then(|moment| moment.links.get(&offset));
+        link.is_some_and(Result::is_ok)
     }
 
     fn moment(&self, number: i64, view: &ViewKey) -> Option<&Moment> {
@@ -491,40 +494,78 @@ impl Window {
 
 impl Moment {
     fn new(mut shot: Shot, model: &dyn Denoiser) -> Self {
-        let look = Look::of(&evidence(&shot.passes));
+        let passes = &mut shot.passes;
         // Of two passes that tell the same, the first is enough.
         for [first, second] in [NORMALS, DEPTHS] {
             let is_read = [model.passes(), model.optional_passes()].concat().contains(&second);
-            if shot.passes.get(first).is_some() && !is_read {
-                drop(shot.passes.remove(second));
+            if passes.get(first).is_some() && !is_read {
+                drop(passes.remove(second));
             }
         }
-        Self { shot, look, links: BTreeMap::new(), result: None }
+        let radiance = passes.get(Pass::Combined).expect("a frame is not loaded without it");
+        let look = Look::of(radiance, &guides(|pass| passes.get(pass).map(Cow::Borrowed)));
+        let waiting = Pass::ALL.into_iter().filter(|pass| !is_place(*pass));
+        let waiting =
+            waiting.filter_map(|pass| Some((pass, HalfFloats::of(&passes.remove(pass)?)))).collect();
+        Self { shot, waiting, look, links: BTreeMap::new(), result: None }
+    }
+
+    fn pass(&self, pass: Pass) -> Option<Cow<'_, Planes>> {
+        let waiting = || Some(Cow::Owned(self.waiting.get(&pass)?.planes()));
+        self.shot.passes.get(pass).map(Cow::Borrowed).or_else(waiting)
+    }
+
+    /// The frame as rendered.
+    fn render(&self) -> Cow<'_, Planes> {
+        self.pass(Pass::Combined).expect("it is kept for as long as it is needed")
+    }
+
+    fn guides(&self) -> Guides<'_> {
+        guides(|pass| self.pass(pass))
+    }
+
+    /// What the model made of it.
+    fn result(&self) -> &Planes {
+        self.result.as_ref().expect("the model ran over it")
+    }
+
+    /// With all its passes.
+    fn shot(&self) -> Shot {
+        let mut shot = self.shot.clone();
+        self.waiting.iter().for_each(|(pass, planes)| shot.passes.insert(*pass, planes.planes()));
+        shot
     }
 
     /// Whether all else was let go of.
     fn is_result_alone(&self) -> bool {
-        self.shot.passes.get(Pass::Combined).is_none()
+        !self.waiting.contains_key(&Pass::Combined)
     }
 
     /// Lets go of what tells frames apart, and of all passes but some.
     fn keep(&mut self, passes: &[Pass]) {
         self.look = Look::default();
+        self.waiting.retain(|pass, _| passes.contains(pass));
         for pass in Pass::ALL.into_iter().filter(|pass| !passes.contains(pass)) {
             drop(self.shot.passes.remove(pass));
         }
     }
 }
 
-/// What tells whether two frames show the same.
-fn evidence(set: &PassSet) -> Evidence<'_> {
-    let either = |[first, second]: [Pass; 2]| set.get(first).or_else(|| set.get(second));
-    Evidence {
-        radiance: set.get(Pass::Combined).expect("a frame is not loaded without it"),
-        albedo: set.get(Pass::DenoisingAlbedo),
-        normal: either(NORMALS),
-        depth: either(DEPTHS),
-    }
+/// Whether a pass tells where a pixel's content lies and how far it covers it: it is never averaged, and half
+/// floats would not hold it.
+fn is_place(pass: Pass) -> bool {
+    matches!(pass.quantity(), Quantity::Place | Quantity::Distance | Quantity::Share)
+}
+
+/// What tells, besides light, whether two frames show the same.
+fn guides<'a>(pass: impl Fn(Pass) -> Option<Cow<'a, Planes>>) -> Guides<'a> {
+    let either = |[first, second]: [Pass; 2]| pass(first).or_else(|| pass(second));
+    Guides { albedo: pass(Pass::DenoisingAlbedo), normal: either(NORMALS), depth: either(DEPTHS) }
+}
+
+/// How many frames later the first step is on the way to a neighbour, and its direction.
+fn step(offset: i32) -> (i32, Direction) {
+    if offset < 0 { (-1, Direction::Back) } else { (1, Direction::Forth) }
 }
 
 fn key(layer: &Layer) -> ViewKey {
@@ -537,23 +578,25 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
 }
 
 /// The passes of a frame that the model reads, averaged with those of its neighbours. Places remain its own.
-fn average(own: &PassSet, others: &[(&PassSet, &Link)], model: &dyn Denoiser) -> PassSet {
-    let read = [model.passes(), model.optional_passes()].concat();
-    let mut set = own.empty((own.width, own.height));
-    for (pass, planes) in own.iter().filter(|(pass, _)| read.contains(pass)) {
-        let is_place = matches!(pass, Pass::Alpha | Pass::Depth | Pass::DenoisingDepth | Pass::Position);
-        let average = if is_place {
-            planes.clone()
+fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
+    let passes = &own.shot.passes;
+    let mut set = passes.empty((passes.width, passes.height));
+    for &pass in model.passes().iter().chain(model.optional_passes()) {
+        let Some(planes) = own.pass(pass) else { continue };
+        let average = if is_place(pass) {
+            planes.into_owned()
         } else {
+            let of_others: Vec<(Cow<'_, Planes>, &Link)> =
+                others.iter().filter_map(|other| Some((other.moment.pass(pass)?, &other.link))).collect();
             let of_others: Vec<(&Planes, &Link)> =
-                others.iter().filter_map(|(set, link)| Some((set.get(pass)?, *link))).collect();
-            temporal::merge(planes, &of_others)
+                of_others.iter().map(|(planes, link)| (&**planes, *link)).collect();
+            temporal::merge(&planes, &of_others)
         };
         set.insert(pass, average);
     }
-    set.origin = own.origin;
+    set.origin = passes.origin;
     // Fireflies are spread over more pixels, but not rarer than in the frame alone. Told that there are more
     // samples, the shrinkage would take them for detail.
-    set.samples = own.samples;
+    set.samples = passes.samples;
     set
 }

@@ -14,7 +14,7 @@
 //! In: passes of two frames and the [`Flow`] between them. Out: a weight for every pixel, 0 where there is
 //! nothing to compare.
 
-use std::sync::LazyLock;
+use std::{borrow::Cow, sync::LazyLock};
 
 use super::{
     box_mean,
@@ -107,17 +107,16 @@ const GUIDES: usize = SPREAD_OF_ALBEDO - ALBEDO;
 static PERCEPTRON: LazyLock<Perceptron> =
     LazyLock::new(|| Perceptron::read(include_bytes!("agreement.safetensors"), FEATURES, 1));
 
-/// The passes of a frame that tell where another agrees with it; guides that are not there agree everywhere.
-#[derive(Clone, Copy)]
-pub struct Evidence<'a> {
-    /// Noisy radiance, (3, H, W), finite.
-    pub radiance: &'a Planes,
-    /// Albedo, (3, H, W).
-    pub albedo: Option<&'a Planes>,
-    /// Normal, (3, H, W).
-    pub normal: Option<&'a Planes>,
-    /// Depth, (1, H, W).
-    pub depth: Option<&'a Planes>,
+/// The passes of a frame that tell, besides its light, where another agrees with it; those that are not there
+/// agree everywhere.
+#[derive(Clone, Debug, Default)]
+pub struct Guides<'a> {
+    /// (3, H, W).
+    pub albedo: Option<Cow<'a, Planes>>,
+    /// (3, H, W).
+    pub normal: Option<Cow<'a, Planes>>,
+    /// (1, H, W).
+    pub depth: Option<Cow<'a, Planes>>,
 }
 
 /// What a frame looks like from a little way off: means over squares of light (its fourth root, over the
@@ -129,12 +128,13 @@ pub struct Look {
 }
 
 impl Look {
-    /// Of a frame.
+    /// Of a frame's noisy radiance, (3, H, W) and finite, and its guides.
     ///
     /// # Panics
     /// If the planes are empty, or their sizes or channels differ from what is told of them.
-    pub fn of(frame: &Evidence) -> Self {
-        let (width, height) = (frame.radiance.width, frame.radiance.height);
+    pub fn of(radiance: &Planes, guides: &Guides) -> Self {
+        let (width, height) = (radiance.width, radiance.height);
+        let [of_albedo, of_normal] = [&guides.albedo, &guides.normal].map(Option::as_deref);
         let size = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
         let squares = Planes::from_rows_of_all(LINES, size, |row, lines| {
             let mut roots = vec![0.0; width];
@@ -145,9 +145,9 @@ impl Look {
             let pixels = row * SQUARE..((row + 1) * SQUARE).min(height);
             for y in pixels.clone() {
                 for c in 0..3 {
-                    let light = row_of(frame.radiance, c, y);
+                    let light = row_of(radiance, c, y);
                     let [albedo, normal] =
-                        [frame.albedo, frame.normal].map(|guide| guide.map(|planes| row_of(planes, c, y)));
+                        [of_albedo, of_normal].map(|guide| guide.map(|planes| row_of(planes, c, y)));
                     vectorised::run(Roots { light, albedo, roots: &mut roots });
                     add(LIGHT + c, &roots, false);
                     add(VARIANCE + c, &roots, true);
@@ -158,7 +158,7 @@ impl Look {
                         add(spread, values, true);
                     }
                 }
-                if let Some(depth) = frame.depth {
+                if let Some(depth) = &guides.depth {
                     add(DEPTH, row_of(depth, 0, y), false);
                 }
             }
@@ -184,11 +184,11 @@ impl Look {
     }
 
     /// What the perceptron reads of every pixel and of the one to which the flow leads: [`FEATURES`] lines for
-    /// each row, (H, FEATURES, W) as one plane. `own` and `there` are what both looks were made of.
+    /// each row, (H, FEATURES, W) as one plane. `own` and `there` are the guides that both looks were made of.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn features(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
+    pub fn features(&self, other: &Self, flow: &Flow, own: &Guides, there: &Guides) -> Planes {
         let (width, height) = self.size;
         let of_squares = self.features_of_squares(other, flow);
         Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
@@ -197,12 +197,12 @@ impl Look {
     }
 
     /// How far each pixel may be averaged with that of `other` to which the flow leads, beside 1 for its own:
-    /// from 0 to 1, (1, H, W), and 0 where the flow leads outside. `own` and `there` are what both looks were
-    /// made of.
+    /// from 0 to 1, (1, H, W), and 0 where the flow leads outside. `own` and `there` are the guides that both
+    /// looks were made of.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn agreement(&self, other: &Self, flow: &Flow, own: &Evidence, there: &Evidence) -> Planes {
+    pub fn agreement(&self, other: &Self, flow: &Flow, own: &Guides, there: &Guides) -> Planes {
         let of_squares = self.features_of_squares(other, flow);
         let width = self.size.0;
         // A row at a time: features of a whole frame would take many times its memory.
@@ -223,7 +223,7 @@ impl Look {
         y: usize,
         of_squares: &Planes,
         flow: &Flow,
-        [own, there]: [&Evidence; 2],
+        [own, there]: [&Guides; 2],
         out: &mut [f32],
     ) {
         let width = self.size.0;
@@ -276,17 +276,18 @@ fn row_of(planes: &Planes, c: usize, y: usize) -> &[f32] {
 
 /// Lines of a row of pixels: how different albedo, normal and depth of each are from those of the nearest
 /// pixel of the other frame.
-fn compare_pixels(y: usize, flow: &Flow, own: &Evidence, there: &Evidence, out: &mut [f32]) {
+fn compare_pixels(y: usize, flow: &Flow, own: &Guides, there: &Guides, out: &mut [f32]) {
     let width = flow.size().0;
     let stretches = flow.nearest_of_row(y);
     let mut lines = vec![0.0; 2 * GUIDES * width];
     let (own_lines, there_lines) = lines.split_at_mut(GUIDES * width);
     let mut both = own_lines.chunks_exact_mut(width).zip(there_lines.chunks_exact_mut(width));
-    let of_both = [(own.albedo, there.albedo, 3), (own.normal, there.normal, 3), (own.depth, there.depth, 1)];
+    let of_both =
+        [(&own.albedo, &there.albedo, 3), (&own.normal, &there.normal, 3), (&own.depth, &there.depth, 1)];
     for (own, there, channels) in of_both {
         for (c, (own_line, there_line)) in both.by_ref().take(channels).enumerate() {
             // A guide that one of them lacks agrees.
-            let Some((own, there)) = own.zip(there) else { continue };
+            let Some((own, there)) = own.as_deref().zip(there.as_deref()) else { continue };
             own_line.copy_from_slice(row_of(own, c, y));
             for stretch in &stretches {
                 stretch.of_mut(there_line).copy_from_slice(stretch.of_other(there.channel(c)));
@@ -546,13 +547,17 @@ mod tests {
         ]
     }
 
-    fn evidence([radiance, albedo, normal, depth]: &[Planes; 4]) -> Evidence<'_> {
-        Evidence { radiance, albedo: Some(albedo), normal: Some(normal), depth: Some(depth) }
+    fn guides(frame: &[Planes; 4]) -> Guides<'_> {
+        let [_, albedo, normal, depth] = frame.each_ref().map(|planes| Some(Cow::Borrowed(planes)));
+        Guides { albedo, normal, depth }
     }
 
     fn agreement(one: &[Planes; 4], other: &[Planes; 4], flow: &Flow) -> Planes {
-        let [one, other] = [one, other].map(evidence);
-        Look::of(&one).agreement(&Look::of(&other), flow, &one, &other)
+        let [(look, own), (other, there)] = [one, other].map(|frame| {
+            let guides = guides(frame);
+            (Look::of(&frame[0], &guides), guides)
+        });
+        look.agreement(&other, flow, &own, &there)
     }
 
     fn mean(weights: &Planes, columns: std::ops::Range<usize>) -> f32 {
@@ -603,10 +608,9 @@ mod tests {
     #[test]
     fn tiny_and_black_frames_have_weights() {
         for (w, h) in [(1, 1), (1, 5), (2, 2), (3, 1)] {
-            let black = Planes::new(3, w, h);
-            let evidence = Evidence { radiance: &black, albedo: None, normal: None, depth: None };
-            let look = Look::of(&evidence);
-            let weights = look.agreement(&look, &Flow::still(w, h), &evidence, &evidence);
+            let none = Guides::default();
+            let look = Look::of(&Planes::new(3, w, h), &none);
+            let weights = look.agreement(&look, &Flow::still(w, h), &none, &none);
             assert!(weights.data.iter().all(|v| *v > 0.5), "{w}x{h}: {:?}", weights.data.to_vec());
         }
     }

@@ -7,6 +7,7 @@ use std::{
     sync::{Mutex, PoisonError},
 };
 
+use half::f16;
 use rayon::prelude::*;
 
 /// Free memory for values of one type. What it holds is whatever the last user left.
@@ -168,6 +169,16 @@ pub fn plane_buffer(len: usize) -> PlaneBuffer {
     PLANES.take(len, 0.0)
 }
 
+/// The values of planar images that wait.
+pub type HalfBuffer = Pooled<f16>;
+
+static HALVES: Pool<f16> = Pool::new();
+
+/// As [`plane_buffer`], of half floats.
+pub fn half_buffer(len: usize) -> HalfBuffer {
+    HALVES.take(len, f16::ZERO)
+}
+
 /// Zeros, as values of planar images; none where the system has no room for them.
 pub fn try_zeros(len: usize) -> Option<PlaneBuffer> {
     let mut buffer = PLANES.try_take(len, 0.0)?;
@@ -178,6 +189,7 @@ pub fn try_zeros(len: usize) -> Option<PlaneBuffer> {
 /// Gives all free memory of planar images back to the system.
 pub fn clear() {
     PLANES.clear();
+    HALVES.clear();
 }
 
 #[cfg(test)]
