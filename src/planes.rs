@@ -6,6 +6,21 @@ use rayon::prelude::*;
 
 use crate::kernels::memory::{PlaneBuffer, plane_buffer};
 
+/// Planes whose values are read as f32, however they are stored.
+pub trait Values: Sync {
+    /// Reads values of a channel, from pixel number `first` on, until `out` is full.
+    ///
+    /// # Panics
+    /// If there are not so many.
+    fn read(&self, channel: usize, first: usize, out: &mut [f32]);
+}
+
+impl Values for Planes {
+    fn read(&self, channel: usize, first: usize, out: &mut [f32]) {
+        out.copy_from_slice(&self.channel(channel)[first..][..out.len()]);
+    }
+}
+
 /// `channels` planes of `height` x `width` f32, channel after channel, rows top to bottom.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planes {

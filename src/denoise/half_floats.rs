@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::{
     kernels::memory::{HalfBuffer, half_buffer},
-    planes::Planes,
+    planes::{Planes, Values},
 };
 
 /// [`Planes`] as 16-bit floats and a scale. Values from an EXR file's half floats come back as they were, and
@@ -45,9 +45,16 @@ impl HalfFloats {
     /// The planes.
     pub fn planes(&self) -> Planes {
         Planes::from_rows(self.channels, (self.width, self.height), |c, y, out| {
-            self.data[(c * self.height + y) * self.width..][..self.width].convert_to_f32_slice(out);
-            out.iter_mut().for_each(|v| *v = (*v / self.scale).clamp(f32::MIN, f32::MAX));
+            self.read(c, y * self.width, out);
         })
+    }
+}
+
+impl Values for HalfFloats {
+    fn read(&self, channel: usize, first: usize, out: &mut [f32]) {
+        let of_channel = &self.data[channel * self.width * self.height..][..self.width * self.height];
+        of_channel[first..][..out.len()].convert_to_f32_slice(out);
+        out.iter_mut().for_each(|v| *v = (*v / self.scale).clamp(f32::MIN, f32::MAX));
     }
 }
 

@@ -8,7 +8,7 @@
 //! a stream, each is read and denoised once. Both averages follow the Vector pass, and leave out what does
 //! not agree: see [`agreement`](crate::filters::agreement).
 
-use std::{borrow::Cow, collections::BTreeMap, time::Instant};
+use std::{collections::BTreeMap, time::Instant};
 
 use super::{
     Denoised, Options, Report, Views,
@@ -25,7 +25,7 @@ use crate::{
     },
     models::Denoiser,
     passes::{Layer, Pass, PassSet, Quantity},
-    planes::Planes,
+    planes::{Planes, Values},
     shot::Shot,
 };
 
@@ -270,7 +270,7 @@ impl Window {
         });
         Ok(Candidates {
             neighbours: neighbours.collect(),
-            render: render.clone().into_owned(),
+            render: render.clone(),
             result: result.clone(),
         })
     }
@@ -334,8 +334,8 @@ impl Window {
         let mut flow = Flow::still(own.width, own.height);
         for nearer in 0..offset.abs() {
             let at = number + i64::from(step * nearer);
-            let vectors = self.moment(at, view).and_then(|moment| moment.pass(Pass::Vector)).ok_or(at)?;
-            flow.step(&vectors, direction);
+            let vectors = self.moment(at, view).and_then(|moment| moment.waiting.get(&Pass::Vector)).ok_or(at)?;
+            flow.step(&vectors.planes(), direction);
         }
         Ok(flow)
     }
@@ -503,25 +503,25 @@ impl Moment {
             }
         }
         let radiance = passes.get(Pass::Combined).expect("a frame is not loaded without it");
-        let look = Look::of(radiance, &guides(|pass| passes.get(pass).map(Cow::Borrowed)));
+        let look = Look::of(radiance, &guides(|pass| Some(passes.get(pass)?)));
         let waiting = Pass::ALL.into_iter().filter(|pass| !is_place(*pass));
         let waiting =
             waiting.filter_map(|pass| Some((pass, HalfFloats::of(&passes.remove(pass)?)))).collect();
         Self { shot, waiting, look, links: BTreeMap::new(), result: None }
     }
 
-    fn pass(&self, pass: Pass) -> Option<Cow<'_, Planes>> {
-        let waiting = || Some(Cow::Owned(self.waiting.get(&pass)?.planes()));
-        self.shot.passes.get(pass).map(Cow::Borrowed).or_else(waiting)
+    fn values(&self, pass: Pass) -> Option<&dyn Values> {
+        let waiting = || Some(self.waiting.get(&pass)? as &dyn Values);
+        self.shot.passes.get(pass).map(|planes| planes as &dyn Values).or_else(waiting)
     }
 
     /// The frame as rendered.
-    fn render(&self) -> Cow<'_, Planes> {
-        self.pass(Pass::Combined).expect("it is kept for as long as it is needed")
+    fn render(&self) -> Planes {
+        self.waiting.get(&Pass::Combined).expect("it is kept for as long as it is needed").planes()
     }
 
     fn guides(&self) -> Guides<'_> {
-        guides(|pass| self.pass(pass))
+        guides(|pass| self.values(pass))
     }
 
     /// What the model made of it.
@@ -558,7 +558,7 @@ fn is_place(pass: Pass) -> bool {
 }
 
 /// What tells, besides light, whether two frames show the same.
-fn guides<'a>(pass: impl Fn(Pass) -> Option<Cow<'a, Planes>>) -> Guides<'a> {
+fn guides<'a>(pass: impl Fn(Pass) -> Option<&'a dyn Values>) -> Guides<'a> {
     let either = |[first, second]: [Pass; 2]| pass(first).or_else(|| pass(second));
     Guides { albedo: pass(Pass::DenoisingAlbedo), normal: either(NORMALS), depth: either(DEPTHS) }
 }
@@ -580,19 +580,16 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
 /// The passes of a frame that the model reads, averaged with those of its neighbours. Places remain its own.
 fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
     let passes = &own.shot.passes;
-    let mut set = passes.empty((passes.width, passes.height));
+    let size = (passes.width, passes.height);
+    let mut set = passes.empty(size);
     for &pass in model.passes().iter().chain(model.optional_passes()) {
-        let Some(planes) = own.pass(pass) else { continue };
-        let average = if is_place(pass) {
-            planes.into_owned()
-        } else {
-            let of_others: Vec<(Cow<'_, Planes>, &Link)> =
-                others.iter().filter_map(|other| Some((other.moment.pass(pass)?, &other.link))).collect();
-            let of_others: Vec<(&Planes, &Link)> =
-                of_others.iter().map(|(planes, link)| (&**planes, *link)).collect();
-            temporal::merge(&planes, &of_others)
-        };
-        set.insert(pass, average);
+        if let Some(planes) = passes.get(pass) {
+            set.insert(pass, planes.clone());
+        } else if let Some(values) = own.waiting.get(&pass) {
+            let of_others: Vec<(&dyn Values, &Link)> =
+                others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
+            set.insert(pass, temporal::merge(values, (pass.channels(), size), &of_others));
+        }
     }
     set.origin = passes.origin;
     // Fireflies are spread over more pixels, but not rarer than in the frame alone. Told that there are more

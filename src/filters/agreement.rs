@@ -14,7 +14,7 @@
 //! In: passes of two frames and the [`Flow`] between them. Out: a weight for every pixel, 0 where there is
 //! nothing to compare.
 
-use std::{borrow::Cow, sync::LazyLock};
+use std::sync::LazyLock;
 
 use super::{
     box_mean,
@@ -27,7 +27,7 @@ use crate::{
         logarithm::ln,
         vectorised::{self, Vectorised},
     },
-    planes::Planes,
+    planes::{Planes, Values},
 };
 
 /// Lines of [`Look::features`] of a row of pixels. First come those of squares: logarithms of how different
@@ -109,14 +109,14 @@ static PERCEPTRON: LazyLock<Perceptron> =
 
 /// The passes of a frame that tell, besides its light, where another agrees with it; those that are not there
 /// agree everywhere.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Copy, Default)]
 pub struct Guides<'a> {
     /// (3, H, W).
-    pub albedo: Option<Cow<'a, Planes>>,
+    pub albedo: Option<&'a dyn Values>,
     /// (3, H, W).
-    pub normal: Option<Cow<'a, Planes>>,
+    pub normal: Option<&'a dyn Values>,
     /// (1, H, W).
-    pub depth: Option<Cow<'a, Planes>>,
+    pub depth: Option<&'a dyn Values>,
 }
 
 /// What a frame looks like from a little way off: means over squares of light (its fourth root, over the
@@ -134,10 +134,9 @@ impl Look {
     /// If the planes are empty, or their sizes or channels differ from what is told of them.
     pub fn of(radiance: &Planes, guides: &Guides) -> Self {
         let (width, height) = (radiance.width, radiance.height);
-        let [of_albedo, of_normal] = [&guides.albedo, &guides.normal].map(Option::as_deref);
         let size = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
         let squares = Planes::from_rows_of_all(LINES, size, |row, lines| {
-            let mut roots = vec![0.0; width];
+            let [mut roots, mut guide, mut beside] = [(); 3].map(|()| vec![0.0; width]);
             lines.iter_mut().for_each(|line| line.fill(0.0));
             let mut add = |line: usize, values: &[f32], is_squared: bool| {
                 vectorised::run(Add { values, is_squared, sums: &mut *lines[line] });
@@ -146,20 +145,27 @@ impl Look {
             for y in pixels.clone() {
                 for c in 0..3 {
                     let light = row_of(radiance, c, y);
-                    let [albedo, normal] =
-                        [of_albedo, of_normal].map(|guide| guide.map(|planes| row_of(planes, c, y)));
+                    let albedo = guides.albedo.map(|albedo| {
+                        albedo.read(c, y * width, &mut guide);
+                        &*guide
+                    });
                     vectorised::run(Roots { light, albedo, roots: &mut roots });
                     add(LIGHT + c, &roots, false);
                     add(VARIANCE + c, &roots, true);
-                    let guides = [(albedo, ALBEDO, SPREAD_OF_ALBEDO), (normal, NORMAL, SPREAD_OF_NORMAL)];
-                    for (values, line, spread) in guides {
+                    let normal = guides.normal.map(|normal| {
+                        normal.read(c, y * width, &mut beside);
+                        &*beside
+                    });
+                    let of_guides = [(albedo, ALBEDO, SPREAD_OF_ALBEDO), (normal, NORMAL, SPREAD_OF_NORMAL)];
+                    for (values, line, spread) in of_guides {
                         let Some(values) = values else { continue };
                         add(line + c, values, false);
                         add(spread, values, true);
                     }
                 }
-                if let Some(depth) = &guides.depth {
-                    add(DEPTH, row_of(depth, 0, y), false);
+                if let Some(depth) = guides.depth {
+                    depth.read(0, y * width, &mut guide);
+                    add(DEPTH, &guide, false);
                 }
             }
             // Squares at the right and lower edge may be cut.
@@ -282,16 +288,13 @@ fn compare_pixels(y: usize, flow: &Flow, own: &Guides, there: &Guides, out: &mut
     let mut lines = vec![0.0; 2 * GUIDES * width];
     let (own_lines, there_lines) = lines.split_at_mut(GUIDES * width);
     let mut both = own_lines.chunks_exact_mut(width).zip(there_lines.chunks_exact_mut(width));
-    let of_both =
-        [(&own.albedo, &there.albedo, 3), (&own.normal, &there.normal, 3), (&own.depth, &there.depth, 1)];
+    let of_both = [(own.albedo, there.albedo, 3), (own.normal, there.normal, 3), (own.depth, there.depth, 1)];
     for (own, there, channels) in of_both {
         for (c, (own_line, there_line)) in both.by_ref().take(channels).enumerate() {
             // A guide that one of them lacks agrees.
-            let Some((own, there)) = own.as_deref().zip(there.as_deref()) else { continue };
-            own_line.copy_from_slice(row_of(own, c, y));
-            for stretch in &stretches {
-                stretch.of_mut(there_line).copy_from_slice(stretch.of_other(there.channel(c)));
-            }
+            let Some((own, there)) = own.zip(there) else { continue };
+            own.read(c, y * width, own_line);
+            stretches.iter().for_each(|stretch| there.read(c, stretch.there, stretch.of_mut(there_line)));
         }
     }
     vectorised::run(ComparePixels { here: own_lines, there: there_lines, columns: flow.row(y).0, out });
@@ -548,7 +551,7 @@ mod tests {
     }
 
     fn guides(frame: &[Planes; 4]) -> Guides<'_> {
-        let [_, albedo, normal, depth] = frame.each_ref().map(|planes| Some(Cow::Borrowed(planes)));
+        let [_, albedo, normal, depth] = frame.each_ref().map(|planes| Some(planes as &dyn Values));
         Guides { albedo, normal, depth }
     }
 

@@ -10,6 +10,10 @@ use std::{
 use half::f16;
 use rayon::prelude::*;
 
+/// Bytes from which on memory is not kept for later: the system takes as much back as a whole, and what planes of
+/// an 8K frame leave free fills the memory of a computer.
+const LARGE: usize = 64 << 20;
+
 /// Free memory for values of one type. What it holds is whatever the last user left.
 #[derive(Debug)]
 pub struct Pool<T: 'static>(Mutex<Vec<Vec<T>>>);
@@ -153,7 +157,7 @@ impl<T> DerefMut for Pooled<T> {
 impl<T> Drop for Pooled<T> {
     fn drop(&mut self) {
         let data = std::mem::take(&mut self.data);
-        if let Some(pool) = self.pool {
+        if let Some(pool) = self.pool.filter(|_| size_of_val(&data[..]) < LARGE) {
             pool.0.lock().unwrap_or_else(PoisonError::into_inner).push(data);
         }
     }

@@ -8,7 +8,7 @@ pub mod likeness;
 
 use self::likeness::Own;
 use super::motion::Flow;
-use crate::planes::Planes;
+use crate::planes::{Planes, Values};
 
 /// What is known of a neighbour of a frame: where its content lies there, and how far to believe it.
 #[derive(Clone, Debug)]
@@ -43,31 +43,34 @@ impl Link {
     }
 }
 
-/// The weighted mean of `own` and of its neighbours' planes of one pass. Of a neighbour, each pixel takes the
-/// nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared. Where that
-/// is outside of the neighbour, its weight is 0.
+/// The weighted mean of `own`, a pass of (channels, H, W), and of its neighbours'. Of a neighbour, each pixel
+/// takes the nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
+/// Where that is outside of the neighbour, its weight is 0.
 ///
 /// # Panics
 /// If sizes differ.
-pub fn merge(own: &Planes, neighbours: &[(&Planes, &Link)]) -> Planes {
-    let size = (own.width, own.height);
-    for (planes, link) in neighbours {
-        assert!((planes.width, planes.height) == size && link.flow.size() == size, "frames of one size");
-        assert_eq!(planes.channels, own.channels, "planes of one pass");
-    }
+pub fn merge(
+    own: &dyn Values,
+    (channels, size): (usize, (usize, usize)),
+    neighbours: &[(&dyn Values, &Link)],
+) -> Planes {
+    assert!(neighbours.iter().all(|(_, link)| link.flow.size() == size), "frames of one size");
     let of_row = |y: usize| y * size.0..(y + 1) * size.0;
-    Planes::from_rows_of_all(own.channels, size, |y, rows| {
+    Planes::from_rows_of_all(channels, size, |y, rows| {
         let stretches: Vec<_> = neighbours.iter().map(|(_, link)| link.flow.nearest_of_row(y)).collect();
         let weights: Vec<_> = neighbours.iter().map(|(_, link)| &link.weights.data[of_row(y)]).collect();
         let mut sums = vec![1.0; size.0];
         for weights in &weights {
             sums.iter_mut().zip(*weights).for_each(|(sum, weight)| *sum += weight);
         }
+        let mut there = vec![0.0; size.0];
         for (c, out) in rows.iter_mut().enumerate() {
-            out.copy_from_slice(&own.channel(c)[of_row(y)]);
-            for (((planes, _), stretches), weights) in neighbours.iter().zip(&stretches).zip(&weights) {
+            own.read(c, y * size.0, out);
+            for (((values, _), stretches), weights) in neighbours.iter().zip(&stretches).zip(&weights) {
                 for stretch in stretches {
-                    let both = stretch.of_other(planes.channel(c)).iter().zip(stretch.of(weights));
+                    let there = &mut there[..stretch.pixels];
+                    values.read(c, stretch.there, there);
+                    let both = there.iter().zip(stretch.of(weights));
                     let out = stretch.of_mut(out).iter_mut();
                     out.zip(both).for_each(|(out, (value, weight))| *out += weight * value);
                 }
@@ -144,14 +147,14 @@ mod tests {
     fn merging_follows_the_motion_and_the_weights() {
         let own = grey(|x, y| (x + 2 * y) as f32);
         let moved = grey(|x, y| x as f32 - 3.0 + 2.0 * y as f32 + 1.0);
-        let merged = merge(&own, &[(&moved, &link(3.0, 0.5))]);
+        let merged = merge(&own, (3, SIZE), &[(&moved, &link(3.0, 0.5))]);
         for x in 0..SIZE.0 {
             // One brighter, at half the weight; what leaves the frame is left as it was.
             let weight = if x + 3 < SIZE.0 { 0.5 } else { 0.0 };
             let more = weight / (1.0 + weight);
             assert!((merged.channel(1)[x] - x as f32 - more).abs() < 1e-4, "{x}");
         }
-        assert_eq!(merge(&own, &[]), own);
+        assert_eq!(merge(&own, (3, SIZE), &[]), own);
     }
 
     #[test]
