@@ -35,6 +35,13 @@ MOST = 0.0
 # and how far normals of single pixels differ, followed by albedos; and what is added to these two.
 VARIANCE, GATE, NORMAL, TINY = 2, 8, 9, 1e-4
 
+# The share of steps' frames that see a neighbour on one side alone, as the first and the last frame of a shot do.
+# What moves is then off to one side; between two neighbours, errors of that kind cancel.
+ONE_SIDED = 0.5
+
+# Neighbours that take part, of which there is one before and one after.
+SIDES = {"both sides": slice(None), "before": slice(0, 1), "after": slice(1, 2)}
+
 # Rows of a frame that are drawn at a time, frames of a step, and that one sequence in so many is held out.
 BAND, BATCH, HELD_OUT = 80, 5, 4
 
@@ -69,27 +76,27 @@ class Sequence:
         means = lambda image, reach: F.avg_pool2d(image, 2 * reach + 1, 1, reach, count_include_pad=False)
         return [relative(means(image, n), means(truth, n)).clamp(max=LARGEST) for n in REACHES]
 
-    def gain(self, model, standard, rows=slice(None)):
+    def gain(self, model, standard, rows=slice(None), only=slice(None)):
         """The logarithm of the error of the average beside that of the frame's own, square by square."""
         losses = []
-        for average, own in zip(*self.errors(model, standard, rows)):
+        for average, own in zip(*self.errors(model, standard, rows, only)):
             average, own = [F.avg_pool2d(error, SQUARE, ceil_mode=True) for error in (average, own)]
             floor = self.floor
             gain = torch.log((average + floor) / (own + floor))
             losses.append((gain + HARM[self.stage] * gain.clamp_min(0)).mean())
         return sum(losses) / len(losses)
 
-    def ratio(self, model, standard):
+    def ratio(self, model, standard, only=slice(None)):
         """The error of the average beside that of the frame's own."""
-        average, own = self.errors(model, standard)
+        average, own = self.errors(model, standard, only=only)
         return sum(e.mean() for e in average) / sum(e.mean() for e in own).clamp_min(1e-6)
 
-    def errors(self, model, standard, rows=slice(None)):
-        """Errors of the average and of the frame's own, in maps."""
-        outputs = model.outputs(standard(self.features[:, :, rows]))
-        weights = (outputs.clamp(LEAST[self.stage], MOST) + self.gate[:, :, rows]).exp() * self.inside[:, :, rows]
+    def errors(self, model, standard, rows=slice(None), only=slice(None)):
+        """Errors of the average with some of the neighbours and of the frame's own, in maps."""
+        outputs = model.outputs(standard(self.features[only, :, rows]))
+        weights = (outputs.clamp(LEAST[self.stage], MOST) + self.gate[only, :, rows]).exp() * self.inside[only, :, rows]
         own = self.own[:, rows]
-        of_colours = (weights.unsqueeze(2) * self.there[:, :, :, rows]).sum((0, 1))
+        of_colours = (weights.unsqueeze(2) * self.there[only, :, :, rows]).sum((0, 1))
         average = (own + of_colours) / (1 + weights.sum((0, 1)))
         return self.error(average, rows), self.error(own, rows)
 
@@ -125,7 +132,10 @@ def train(sequences, steps, seed, kernel=1):
         for at in torch.randint(0, len(sequences), (BATCH,), generator=generator).tolist():
             height = sequences[at].own.shape[1]
             first = int(torch.randint(0, max(height - BAND, 0) + 1, (), generator=generator))
-            loss = loss + sequences[at].gain(model, standard, slice(first, first + BAND)) / BATCH
+            both, *one = SIDES.values()
+            side = int(torch.rand((), generator=generator) / ONE_SIDED * len(one))
+            rows = slice(first, first + BAND)
+            loss = loss + sequences[at].gain(model, standard, rows, one[side] if side < len(one) else both) / BATCH
         perceptron.step(loss, model, optimizer, schedule)
         if (step + 1) % 250 == 0:
             print(f"step {step + 1}: {loss.item():.3f}", flush=True)
@@ -133,10 +143,12 @@ def train(sequences, steps, seed, kernel=1):
 
 
 def report(sequences, model, standard):
-    """The geometric mean of the average's error beside the frame's own, and the worst."""
-    with torch.no_grad():
-        ratios = torch.stack([sequence.ratio(model, standard) for sequence in sequences])
-    print(f"{len(ratios)} sequences: {ratios.log().mean().exp():.3f} of the frame's own error, worst {ratios.max():.3f}")
+    """The geometric mean of the average's error beside the frame's own, and the worst, by the sides of its neighbours."""
+    for name, only in SIDES.items():
+        with torch.no_grad():
+            ratios = torch.stack([sequence.ratio(model, standard, only) for sequence in sequences])
+        error, worst = ratios.log().mean().exp(), ratios.max()
+        print(f"{len(ratios)} sequences, {name}: {error:.3f} of the frame's own error, worst {worst:.3f}")
 
 
 def main():
