@@ -35,7 +35,7 @@ pub struct Lane {
 /// What the reading stage sends to the denoising stage.
 enum Loaded {
     /// What was read of a frame that is denoised by itself.
-    Frame(Job, Result<Views<Shot>>),
+    Frame(Job, Box<Result<Views<Shot>>>),
     /// A stretch of a sequence begins, so the one before is forgotten.
     Begin,
     /// A frame of the sequence, by its number, and whether it is to be denoised. Its passes are decoded when
@@ -104,7 +104,7 @@ impl Lane {
                 Work::Frame(job) => {
                     let Some(read) = self.read_new(&job) else { continue };
                     let loaded = self.take_apart(&job.input, read);
-                    next.send(Loaded::Frame(job, loaded)).ok()?;
+                    next.send(Loaded::Frame(job, Box::new(loaded))).ok()?;
                 }
                 Work::Stretch(stretch) => self.load_stretch(stretch, next)?,
             }
@@ -135,7 +135,7 @@ impl Lane {
                 if let Ok(frame) = &mut frame {
                     frame.say("its name ends in no frame number; denoised alone");
                 }
-                next.send(Loaded::Frame(job, frame)).ok()?;
+                next.send(Loaded::Frame(job, Box::new(frame))).ok()?;
             }
             return Some(());
         }

@@ -268,11 +268,7 @@ impl Window {
                 result: likeness.features(moment.result(), &link).into(),
             }
         });
-        Ok(Candidates {
-            neighbours: neighbours.collect(),
-            render: render.clone(),
-            result: result.clone(),
-        })
+        Ok(Candidates { neighbours: neighbours.collect(), render: render.clone(), result: result.clone() })
     }
 
     fn view(
@@ -334,7 +330,8 @@ impl Window {
         let mut flow = Flow::still(own.width, own.height);
         for nearer in 0..offset.abs() {
             let at = number + i64::from(step * nearer);
-            let vectors = self.moment(at, view).and_then(|moment| moment.waiting.get(&Pass::Vector)).ok_or(at)?;
+            let vectors =
+                self.moment(at, view).and_then(|moment| moment.waiting.get(&Pass::Vector)).ok_or(at)?;
             flow.step(&vectors.planes(), direction);
         }
         Ok(flow)
