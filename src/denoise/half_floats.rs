@@ -37,9 +37,16 @@ impl HalfFloats {
         Self { channels: *channels, width: *width, height: *height, scale, data: halves }
     }
 
-    /// Whether all values are zero.
-    pub fn are_zero(&self) -> bool {
-        self.data.iter().all(|v| *v == f16::ZERO)
+    /// Of planes that come back as they were; none of others.
+    pub fn exactly(planes: &Planes) -> Option<Self> {
+        let halves = Self::of(planes);
+        let row = planes.width.max(1);
+        let is_exact = planes.data.par_chunks(row).enumerate().all(|(i, values)| {
+            let mut back = vec![0.0; values.len()];
+            halves.read(i / planes.height, i % planes.height * planes.width, &mut back);
+            back == values
+        });
+        is_exact.then_some(halves)
     }
 
     /// The planes.
@@ -80,7 +87,9 @@ mod tests {
         let finite: Vec<f32> = halves.filter(|v| v.is_finite()).collect();
         assert_eq!(there_and_back(&finite), finite);
         let zeros = HalfFloats::of(&Planes::new(2, 3, 1));
-        assert!(zeros.are_zero() && zeros.planes() == Planes::new(2, 3, 1));
+        assert_eq!(zeros.planes(), Planes::new(2, 3, 1));
+        let exactly = |values: &[f32]| HalfFloats::exactly(&Planes::from_vec(1, 2, 1, values.to_vec()));
+        assert!(exactly(&[0.1, 1.0]).is_none() && exactly(&[0.125, 1.0]).is_some());
     }
 
     #[test]

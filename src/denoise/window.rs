@@ -8,7 +8,7 @@
 //! a stream, each is read and denoised once. Both averages follow the Vector pass, and leave out what does
 //! not agree: see [`agreement`](crate::filters::agreement).
 
-use std::{collections::BTreeMap, time::Instant};
+use std::{borrow::Cow, collections::BTreeMap, time::Instant};
 
 use super::{
     Denoised, Options, Report, Views,
@@ -69,9 +69,9 @@ enum Gap {
 
 /// One view of a frame.
 struct Moment {
-    /// All that is known of it but most passes.
+    /// All that is known of it but some passes.
     shot: Shot,
-    /// These passes.
+    /// These passes, which half floats hold exactly: a frame that stays alone is denoised to the same bits.
     waiting: BTreeMap<Pass, HalfFloats>,
     look: Look,
     /// Weights of neighbours, (1, H, W), by how many frames later these are.
@@ -268,7 +268,11 @@ impl Window {
                 result: likeness.features(moment.result(), &link).into(),
             }
         });
-        Ok(Candidates { neighbours: neighbours.collect(), render: render.clone(), result: result.clone() })
+        Ok(Candidates {
+            neighbours: neighbours.collect(),
+            render: render.clone().into_owned(),
+            result: result.clone(),
+        })
     }
 
     fn view(
@@ -330,9 +334,8 @@ impl Window {
         let mut flow = Flow::still(own.width, own.height);
         for nearer in 0..offset.abs() {
             let at = number + i64::from(step * nearer);
-            let vectors =
-                self.moment(at, view).and_then(|moment| moment.waiting.get(&Pass::Vector)).ok_or(at)?;
-            flow.step(&vectors.planes(), direction);
+            let vectors = self.moment(at, view).and_then(|moment| moment.pass(Pass::Vector)).ok_or(at)?;
+            flow.step(&vectors, direction);
         }
         Ok(flow)
     }
@@ -440,7 +443,8 @@ impl Window {
         let share = (sum / inside.max(1) as f64) as f32;
         let are_zero = |nearer: i32| {
             let moment = self.moment(number + i64::from(step * nearer), view);
-            moment.and_then(|moment| moment.waiting.get(&Pass::Vector)).is_none_or(HalfFloats::are_zero)
+            let vectors = moment.and_then(|moment| moment.pass(Pass::Vector));
+            vectors.is_none_or(|vectors| vectors.data.iter().all(|v| *v == 0.0))
         };
         if share < STILL && (0..offset.abs()).all(are_zero) {
             return said(format!(
@@ -501,9 +505,13 @@ impl Moment {
         }
         let radiance = passes.get(Pass::Combined).expect("a frame is not loaded without it");
         let look = Look::of(radiance, &guides(|pass| Some(passes.get(pass)?)));
-        let waiting = Pass::ALL.into_iter().filter(|pass| !is_place(*pass));
-        let waiting =
-            waiting.filter_map(|pass| Some((pass, HalfFloats::of(&passes.remove(pass)?)))).collect();
+        let averaged = Pass::ALL.into_iter().filter(|pass| !is_place(*pass));
+        let waiting = averaged.filter_map(|pass| {
+            let halves = HalfFloats::exactly(passes.get(pass)?)?;
+            drop(passes.remove(pass));
+            Some((pass, halves))
+        });
+        let waiting = waiting.collect();
         Self { shot, waiting, look, links: BTreeMap::new(), result: None }
     }
 
@@ -512,9 +520,14 @@ impl Moment {
         self.shot.passes.get(pass).map(|planes| planes as &dyn Values).or_else(waiting)
     }
 
+    fn pass(&self, pass: Pass) -> Option<Cow<'_, Planes>> {
+        let waiting = || Some(Cow::Owned(self.waiting.get(&pass)?.planes()));
+        self.shot.passes.get(pass).map(Cow::Borrowed).or_else(waiting)
+    }
+
     /// The frame as rendered.
-    fn render(&self) -> Planes {
-        self.waiting.get(&Pass::Combined).expect("it is kept for as long as it is needed").planes()
+    fn render(&self) -> Cow<'_, Planes> {
+        self.pass(Pass::Combined).expect("it is kept for as long as it is needed")
     }
 
     fn guides(&self) -> Guides<'_> {
@@ -535,7 +548,7 @@ impl Moment {
 
     /// Whether all else was let go of.
     fn is_result_alone(&self) -> bool {
-        !self.waiting.contains_key(&Pass::Combined)
+        self.values(Pass::Combined).is_none()
     }
 
     /// Lets go of what tells frames apart, and of all passes but some.
@@ -548,8 +561,7 @@ impl Moment {
     }
 }
 
-/// Whether a pass tells where a pixel's content lies and how far it covers it: it is never averaged, and half
-/// floats would not hold it.
+/// Whether a pass tells where a pixel's content lies and how far it covers it: it is never averaged.
 fn is_place(pass: Pass) -> bool {
     matches!(pass.quantity(), Quantity::Place | Quantity::Distance | Quantity::Share)
 }
@@ -580,9 +592,10 @@ fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> Pass
     let size = (passes.width, passes.height);
     let mut set = passes.empty(size);
     for &pass in model.passes().iter().chain(model.optional_passes()) {
-        if let Some(planes) = passes.get(pass) {
-            set.insert(pass, planes.clone());
-        } else if let Some(values) = own.waiting.get(&pass) {
+        let Some(values) = own.values(pass) else { continue };
+        if is_place(pass) {
+            set.insert(pass, own.pass(pass).expect("it is there").into_owned());
+        } else {
             let of_others: Vec<(&dyn Values, &Link)> =
                 others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
             set.insert(pass, temporal::merge(values, (pass.channels(), size), &of_others));
