@@ -8,6 +8,9 @@ use crate::kernels::memory::{PlaneBuffer, plane_buffer};
 
 /// Planes whose values are read as f32, however they are stored.
 pub trait Values: Sync {
+    /// Channels, pixels in a row, and rows.
+    fn extent(&self) -> (usize, usize, usize);
+
     /// Reads values of a channel, from pixel number `first` on, until `out` is full.
     ///
     /// # Panics
@@ -16,6 +19,10 @@ pub trait Values: Sync {
 }
 
 impl Values for Planes {
+    fn extent(&self) -> (usize, usize, usize) {
+        (self.channels, self.width, self.height)
+    }
+
     fn read(&self, channel: usize, first: usize, out: &mut [f32]) {
         out.copy_from_slice(&self.channel(channel)[first..][..out.len()]);
     }

@@ -58,6 +58,10 @@ impl HalfFloats {
 }
 
 impl Values for HalfFloats {
+    fn extent(&self) -> (usize, usize, usize) {
+        (self.channels, self.width, self.height)
+    }
+
     fn read(&self, channel: usize, first: usize, out: &mut [f32]) {
         let of_channel = &self.data[channel * self.width * self.height..][..self.width * self.height];
         of_channel[first..][..out.len()].convert_to_f32_slice(out);

@@ -589,16 +589,16 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
 /// The passes of a frame that the model reads, averaged with those of its neighbours. Places remain its own.
 fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
     let passes = &own.shot.passes;
-    let size = (passes.width, passes.height);
-    let mut set = passes.empty(size);
+    let mut set = passes.empty((passes.width, passes.height));
     for &pass in model.passes().iter().chain(model.optional_passes()) {
         let Some(values) = own.values(pass) else { continue };
         if is_place(pass) {
-            set.insert(pass, own.pass(pass).expect("it is there").into_owned());
+            // Places never wait.
+            passes.get(pass).into_iter().for_each(|planes| set.insert(pass, planes.clone()));
         } else {
             let of_others: Vec<(&dyn Values, &Link)> =
                 others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
-            set.insert(pass, temporal::merge(values, (pass.channels(), size), &of_others));
+            set.insert(pass, temporal::merge(values, &of_others));
         }
     }
     set.origin = passes.origin;

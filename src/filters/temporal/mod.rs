@@ -43,18 +43,19 @@ impl Link {
     }
 }
 
-/// The weighted mean of `own`, a pass of (channels, H, W), and of its neighbours'. Of a neighbour, each pixel
+/// The weighted mean of `own`, a pass of (C, H, W), and of its neighbours'. Of a neighbour, each pixel
 /// takes the nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
 /// Where that is outside of the neighbour, its weight is 0.
 ///
 /// # Panics
 /// If sizes differ.
-pub fn merge(
-    own: &dyn Values,
-    (channels, size): (usize, (usize, usize)),
-    neighbours: &[(&dyn Values, &Link)],
-) -> Planes {
-    assert!(neighbours.iter().all(|(_, link)| link.flow.size() == size), "frames of one size");
+pub fn merge(own: &dyn Values, neighbours: &[(&dyn Values, &Link)]) -> Planes {
+    let (channels, width, height) = own.extent();
+    let size = (width, height);
+    for (values, link) in neighbours {
+        assert_eq!(values.extent(), own.extent(), "planes of one pass");
+        assert!(link.flow.size() == size, "frames of one size");
+    }
     let of_row = |y: usize| y * size.0..(y + 1) * size.0;
     Planes::from_rows_of_all(channels, size, |y, rows| {
         let stretches: Vec<_> = neighbours.iter().map(|(_, link)| link.flow.nearest_of_row(y)).collect();
@@ -147,14 +148,14 @@ mod tests {
     fn merging_follows_the_motion_and_the_weights() {
         let own = grey(|x, y| (x + 2 * y) as f32);
         let moved = grey(|x, y| x as f32 - 3.0 + 2.0 * y as f32 + 1.0);
-        let merged = merge(&own, (3, SIZE), &[(&moved, &link(3.0, 0.5))]);
+        let merged = merge(&own, &[(&moved, &link(3.0, 0.5))]);
         for x in 0..SIZE.0 {
             // One brighter, at half the weight; what leaves the frame is left as it was.
             let weight = if x + 3 < SIZE.0 { 0.5 } else { 0.0 };
             let more = weight / (1.0 + weight);
             assert!((merged.channel(1)[x] - x as f32 - more).abs() < 1e-4, "{x}");
         }
-        assert_eq!(merge(&own, (3, SIZE), &[]), own);
+        assert_eq!(merge(&own, &[]), own);
     }
 
     #[test]
