@@ -108,6 +108,11 @@ def parse(arguments):
         help="share of crops with a pixel filter that is not Blender's default, half of them a box",
     )
     parser.add_argument(
+        "--light-passes",
+        action="store_true",
+        help="noisy crops hold diffuse light, emission and environment too, which kpcn reads",
+    )
+    parser.add_argument(
         "--sequence",
         type=cl.positive,
         default=1,
@@ -356,6 +361,8 @@ def render_crop(options, ledger, scene, region, crop, facts):
         with Edits() as passes:
             rendering.combined_only(passes, layers)
             rendering.enable_passes(passes, layers, vector=crop.middle is not None)
+            if options.light_passes:
+                rendering.enable_light_passes(passes, layers)
             store_position(passes, layers)
             for file, spp, n, frame in crop.noisy():
                 noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0

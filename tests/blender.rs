@@ -229,8 +229,7 @@ fn generate(out: &Path, arguments: &str) -> String {
 fn generates_the_same_pixels_for_the_same_seed() {
     let folder = tempfile::tempdir().unwrap();
     let (first, second) = (folder.path().join("first"), folder.path().join("second"));
-    let arguments =
-        "--seeds 3:5 --kinds materials,glass --size 40 --crops 2 --spp 2 --noisy-seeds 2 --ref-spp 16";
+    let arguments = "--seeds 3:5 --kinds materials,glass --size 40 --crops 2 --spp 2 --noisy-seeds 2 --ref-spp 16 --light-passes";
     let said = generate(&first, arguments);
     assert_eq!(said.lines().count(), 2, "a line a scene: {said}");
     generate(&second, arguments);
@@ -255,6 +254,20 @@ fn generates_the_same_pixels_for_the_same_seed() {
         let (a, b) = (mean_luminance(&noisy), mean_luminance(&reference));
         assert!(b > 1e-3 && (0.4..2.5).contains(&(a / b)), "{}: mean {a} and {b}", pair.id());
         assert_eq!(noisy.get(Pass::Combined).unwrap().non_finite(), 0);
+        // Diffuse light times its colour is part of the frame; half floats round each by 2^-11.
+        let [combined, direct, indirect, colour] =
+            [Pass::Combined, Pass::DiffuseDirect, Pass::DiffuseIndirect, Pass::DiffuseColor]
+                .map(|pass| &noisy.get(pass).unwrap().data);
+        let diffuse: Vec<f32> = direct
+            .iter()
+            .zip(indirect)
+            .zip(colour)
+            .map(|((direct, indirect), c)| (direct + indirect) * c)
+            .collect();
+        let is_part = |(part, whole): (&f32, &f32)| *part <= 1.01 * whole + 1e-3;
+        assert!(diffuse.iter().zip(combined).all(is_part), "{}", pair.id());
+        assert!(diffuse.iter().any(|light| *light > 0.01), "{}", pair.id());
+        assert!(noisy.get(Pass::Emission).is_some() && noisy.get(Pass::Environment).is_some());
     }
 
     let said = generate(&first, arguments);

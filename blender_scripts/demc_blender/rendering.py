@@ -18,6 +18,8 @@ DATA_PASSES = (
     "use_pass_transmission_color",
 )
 
+# The light that KPCN's two streams read, and what neither of them filters.
+LIGHT_PASSES = ("use_pass_diffuse_direct", "use_pass_diffuse_indirect", "use_pass_emit", "use_pass_environment")
 
 # What Blender renders with as it comes: adaptive, this many samples at most.
 DEFAULT_SAMPLES = 4096
@@ -54,6 +56,13 @@ def enable_passes(edits, layers, vector=False):
         for name in ("use_pass_combined",) + DATA_PASSES + (("use_pass_vector",) if vector else ()):
             edits.set(layer, name, True)
         edits.set(layer.cycles, "denoising_store_passes", True)
+
+
+def enable_light_passes(edits, layers):
+    """Turns on diffuse light, emission and environment, which `kpcn` reads."""
+    for layer in layers:
+        for name in LIGHT_PASSES:
+            edits.set(layer, name, True)
 
 
 def leave_out_vectors(edits, layers):
