@@ -245,6 +245,7 @@ fn generates_the_same_pixels_for_the_same_seed() {
     let pairs = testset::read(first.to_str().unwrap()).unwrap().pairs;
     assert_eq!(pairs.len(), 4);
     assert_eq!(testset::read(first.join("manifest.csv").to_str().unwrap()).unwrap().pairs.len(), 8);
+    let mut lit = 0;
     for pair in &pairs {
         let noisy = passes::load(&pair.noisy, None).unwrap();
         let reference = passes::load(&pair.reference, None).unwrap();
@@ -266,9 +267,10 @@ fn generates_the_same_pixels_for_the_same_seed() {
             .collect();
         let is_part = |(part, whole): (&f32, &f32)| *part <= 1.01 * whole + 1e-3;
         assert!(diffuse.iter().zip(combined).all(is_part), "{}", pair.id());
-        assert!(diffuse.iter().any(|light| *light > 0.01), "{}", pair.id());
+        lit += diffuse.iter().filter(|light| **light > 0.01).count();
         assert!(noisy.get(Pass::Emission).is_some() && noisy.get(Pass::Environment).is_some());
     }
+    assert!(lit > 1000, "{lit} values have diffuse light");
 
     let said = generate(&first, arguments);
     assert!(said.lines().all(|line| line.ends_with("is there")), "{said}");
