@@ -153,7 +153,7 @@ fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
         run(command.arg("--prefilter").arg(built_in(folder.path(), "demc-s")).arg("--out").arg(at("run")))
     };
     train("3", &[]);
-    train("6", &["--resume"]);
+    train("6", &["--resume", "--guide-dropout", "0.5"]);
     let log = std::fs::read_to_string(at("run/log.csv")).unwrap();
     let steps: Vec<&str> = log.lines().skip(1).map(|row| row.split(',').next().unwrap()).collect();
     assert_eq!(steps, ["3", "6"]);
@@ -162,6 +162,7 @@ fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
     // The crate reads the weights, says the same of their training, and scores them alike.
     let (network, metadata) = weights_file::read(&at("run/last.safetensors")).unwrap();
     assert_eq!((metadata.training.steps, metadata.training.frames), (6, 2));
+    assert_eq!(metadata.training.guide_dropout, 0.5);
     let logs = ["s0000_room", "s0010_outdoor"].map(|scene| {
         let reference = passes(&format!("{scene}_ref.exr"));
         let image = network.infer(&passes(&format!("{scene}_0004spp.exr")), None).unwrap();
@@ -169,6 +170,14 @@ fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
     });
     let score = ((logs[0] + logs[1]) / 2.0).exp();
     assert!((score - validation).abs() < 0.01 * score, "{score} here, {validation} there");
+    // Crops lack albedo, normal, or both, as the crate has them: grey albedo, and the normal of nothing.
+    let draws = "import random, sys; from data import Frames\n\
+                 frames = Frames(sys.argv[1:], 'cpu', 32, False)\n\
+                 crops = frames.draw(random.Random(1), 40, 32, 1.0)[0]\n\
+                 print(sorted({(bool((c[3:6] == 0.5).all()), bool((c[6:] == 0).all())) for c in crops}))";
+    let mut command = Command::new(&python);
+    command.current_dir(root().join("eval/twin")).args(["-c", draws]).arg(at("two.pack"));
+    assert_eq!(run(&mut command).trim(), "[(False, True), (True, False), (True, True)]");
     // A pack that was damaged on its way is refused.
     let mut bytes = std::fs::read(at("two.pack")).unwrap();
     let middle = bytes.len() / 3;

@@ -7,6 +7,10 @@ import torch
 import pack
 
 _STOPS = 2.0
+# Channels of a noisy frame, and what stands in their place where it lacks them, as in
+# src/features/stand_in.rs.
+_ALBEDO, _NORMAL = (slice(3, 6), 0.5), (slice(6, 9), 0.0)
+_DROPPED = ((_ALBEDO,), (_NORMAL,), (_ALBEDO, _NORMAL))
 _ORDERS = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
 LEAST = 16  # sides are multiples of this
 
@@ -40,9 +44,10 @@ class Frames:
         cut = {name: parts[name][None, :, :h, :w].float() for name in ("reference", "raw", "guides") if name in parts}
         return {"noisy": parts[f"noisy.{which}"][None, :, :h, :w].float(), "spp": spp, **cut}
 
-    def draw(self, rng, count, side):
+    def draw(self, rng, count, side, guide_dropout=0.0):
         """A batch of augmented crops: noisy (N, 9, S, S), reference and raw (N, 3, S, S), and the guides of
-        the reference, (N, 6, S, S), or (N, 0, S, S) where `guides` were not asked for."""
+        the reference, (N, 6, S, S), or (N, 0, S, S) where `guides` were not asked for. A share of crops lacks
+        the albedo, the normal, or both."""
         batch = []
         for view, which in rng.choices(self.pairs, self.sizes, k=count):
             parts, spp = self.views[view]["parts"], self.views[view]["spp"]
@@ -55,7 +60,11 @@ class Frames:
                 noisy = torch.where(torch.rand(h, w, device=noisy.device) < 0.5, noisy, other)
             reference = parts["reference"]
             planes = [noisy, reference, parts.get("raw", reference)] + ([parts["guides"]] if self.guides else [])
-            batch.append(_augmented(torch.cat(planes)[:, y : y + side, x : x + side].float(), rng))
+            crop = _augmented(torch.cat(planes)[:, y : y + side, x : x + side].float(), rng)
+            if rng.random() < guide_dropout:
+                for channels, stand_in in rng.choice(_DROPPED):
+                    crop[channels] = stand_in
+            batch.append(crop)
         batch = torch.stack(batch)
         return batch[:, :9], batch[:, 9:12], batch[:, 12:15], batch[:, 15:]
 

@@ -18,5 +18,5 @@ if [ -z "$prefilter" ]; then
         --lr 2e-3:1e-6 --weight-decay 0.1 --out "$OUT/prefilter" "${common[@]}"
     prefilter=$OUT/prefilter/last.safetensors
 fi
-python3 train.py --model "$model" --prefilter "$prefilter" --raw-references --minutes "${MINUTES:-7}" \
-    --lr 3e-3:1e-6 --weight-decay 0.2 --out "$OUT/$model" "${common[@]}"
+python3 train.py --model "$model" --prefilter "$prefilter" --raw-references --guide-dropout "${GUIDE_DROPOUT:-0.15}" \
+    --minutes "${MINUTES:-7}" --lr 3e-3:1e-6 --weight-decay 0.2 --out "$OUT/$model" "${common[@]}"

@@ -47,6 +47,7 @@ def parse():
     parser.add_argument("--average", type=float, default=0.998)
     parser.add_argument("--loss", choices=losses.LOSSES, default="ssim")
     parser.add_argument("--raw-references", action="store_true", help="see `demc train --help`")
+    parser.add_argument("--guide-dropout", type=float, default=0.0, metavar="SHARE", help="see `demc train --help`")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--every", type=float, default=60, metavar="S", help="seconds between validations")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -55,6 +56,8 @@ def parse():
     options = parser.parse_args()
     if not (options.steps or options.minutes):
         parser.error("give --steps, --minutes or both")
+    if options.guide_dropout and options.model == "prefilter":
+        parser.error("--guide-dropout is for networks: a prefilter without guides has nothing to do")
     if options.patch % 16:
         parser.error("--patch must be a multiple of 16")
     return options
@@ -113,7 +116,7 @@ def facts(options, config, step, seconds, frames, validation, score):
     """The metadata of a weights file, as the crate reads it."""
     training = {
         "frames": frames, "steps": step, "batch": options.batch, "patch": options.patch, "lr": list(options.lr),
-        "loss": options.loss, "raw_references": options.raw_references, "optimizer": "muon",
+        "loss": options.loss, "raw_references": options.raw_references, "guide_dropout": options.guide_dropout, "optimizer": "muon",
         "weight_decay": options.weight_decay, "precision": "f32" if options.f32 else "bf16",
         "average": options.average, "seed": options.seed, "init": options.init, "prefilter": options.prefilter,
         "only": [], "seconds": seconds, "validation_frames": validation,
@@ -179,7 +182,7 @@ def main():
             break
         lr = options.lr[0] + (options.lr[1] - options.lr[0]) * done
         lr *= min(1, (step + 1) / _WARM_UP)
-        noisy, reference, raw, guides = frames.draw(rng, options.batch, options.patch)
+        noisy, reference, raw, guides = frames.draw(rng, options.batch, options.patch, options.guide_dropout)
         image, exposed = net(noisy, options.learn_guides)
         target = net.target(reference, guides) * exposed
         raw = raw * exposed if options.raw_references and net.makes_radiance else None
