@@ -360,9 +360,8 @@ def render_crop(options, ledger, scene, region, crop, facts):
         )
         with Edits() as passes:
             rendering.combined_only(passes, layers)
-            rendering.enable_passes(passes, layers, vector=crop.middle is not None)
-            if options.light_passes:
-                rendering.enable_light_passes(passes, layers)
+            is_moving = crop.middle is not None
+            rendering.enable_passes(passes, layers, vector=is_moving, light=options.light_passes)
             store_position(passes, layers)
             for file, spp, n, frame in crop.noisy():
                 noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0

@@ -50,19 +50,15 @@ def prepare_scene(edits, scene, as_framed=False):
         edits.set(layer.cycles, "use_denoising", False)
 
 
-def enable_passes(edits, layers, vector=False):
-    """Turns on what demc needs, and leaves on what the user has on."""
+def enable_passes(edits, layers, vector=False, light=False):
+    """Turns on what demc needs, and leaves on what the user has on. `light` adds the passes that `kpcn`
+    reads besides."""
+    names = ("use_pass_combined",) + DATA_PASSES
+    names += (("use_pass_vector",) if vector else ()) + (LIGHT_PASSES if light else ())
     for layer in layers:
-        for name in ("use_pass_combined",) + DATA_PASSES + (("use_pass_vector",) if vector else ()):
+        for name in names:
             edits.set(layer, name, True)
         edits.set(layer.cycles, "denoising_store_passes", True)
-
-
-def enable_light_passes(edits, layers):
-    """Turns on diffuse light, emission and environment, which `kpcn` reads."""
-    for layer in layers:
-        for name in LIGHT_PASSES:
-            edits.set(layer, name, True)
 
 
 def leave_out_vectors(edits, layers):
