@@ -13,6 +13,17 @@ pub fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
+/// The rows above, at and below `row` that `window` reaches, each with its weight, as [`around`] reads them.
+pub fn rows_around<'a>(
+    rows: &'a [&'a [f32]],
+    row: usize,
+    window: &'a [f32],
+) -> impl Iterator<Item = (f32, &'a [f32])> {
+    window.iter().enumerate().filter_map(move |(tap, weight)| {
+        Some((*weight, *rows.get((row + tap).checked_sub(window.len() / 2)?)?))
+    })
+}
+
 /// Writes to `output`, for every value of lines of `squares` values, the weighted sum of the values around
 /// it. `rows` are those above, at and below it, each with its weight, and `window` holds an odd number of
 /// weights for the values to the left and right. Values beyond the frame count as zero.

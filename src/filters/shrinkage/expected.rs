@@ -48,11 +48,9 @@ pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
     let window = WINDOWS[1];
     let rows: Vec<&[f32]> = of_squares.chunks(3 * squares).map(|row| &row[..2 * squares]).collect();
     let errors = each_row(sums, squares, 1, render, |row, features, error| {
-        let lines = window.iter().enumerate().filter_map(|(tap, weight)| {
-            Some((*weight, *rows.get((row + tap).checked_sub(window.len() / 2)?)?))
-        });
+        let near_rows = squares::rows_around(&rows, row, window);
         let (mut of_rows, mut around) = (vec![0.0; 2 * squares], vec![0.0; 2 * squares]);
-        squares::around(lines, squares, window, &mut of_rows, &mut around);
+        squares::around(near_rows, squares, window, &mut of_rows, &mut around);
         let mut inputs = vec![0.0; INPUTS * squares];
         inputs[..FEATURES * squares].copy_from_slice(features);
         let (own, near) = inputs[FEATURES * squares..].split_at_mut(squares);

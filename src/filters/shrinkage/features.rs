@@ -49,10 +49,8 @@ pub fn each_row(
             for (place, (window, features)) in
                 WINDOWS.iter().zip(of_windows.chunks_exact_mut(OF_WINDOW * squares)).enumerate()
             {
-                let lines = window.iter().enumerate().filter_map(|(tap, weight)| {
-                    Some((*weight, *sums.get((row + tap).checked_sub(window.len() / 2)?)?))
-                });
-                squares::around(lines, squares, window, of_rows, around);
+                let rows = squares::rows_around(&sums, row, window);
+                squares::around(rows, squares, window, of_rows, around);
                 vectorised::run(Describe { sums: around, features, squares });
                 if place == 0 {
                     let light = around[LIGHT * squares..].iter().zip(&around[COUNT * squares..]);

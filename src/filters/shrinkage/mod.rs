@@ -55,9 +55,12 @@ const SNAP: f32 = 1.0 / 64.0;
 const DOUBT: (f32, f32) = (0.5, 2.0);
 
 /// Beyond [`FINAL_SAMPLES`] samples, what is taken of the denoised frame falls with the number of samples to
-/// the power of [`FINAL_POWER`], because few frames that were learned from had more.
+/// the power of [`FINAL_POWER`], because few frames that were learned from had more. It falls to
+/// [`FINAL_LEAST`], since a frame that tells of thousands of samples is mostly one that was allowed so many, of
+/// which adaptive sampling took fewer; but not where light changes by more than noise of so many samples does.
 const FINAL_SAMPLES: f32 = 192.0;
 const FINAL_POWER: f32 = 0.75;
+const FINAL_LEAST: f32 = 0.3;
 
 /// By how much the render's light may differ from the denoised light, relative to the latter, before a
 /// pixel's share is reduced. This holds for shares near zero; the larger the share, the more it may differ. A
@@ -193,7 +196,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
     let (few, many) = KEPT_SAMPLES;
     let doubt = render.samples.map_or(0.0, |_| (DOUBT.1 / samples).min(DOUBT.0)).max(SNAP);
-    let belief = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
+    let by_count = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
@@ -232,6 +235,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
                 }
                 let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
                 let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
+                let belief = by_count.max(FINAL_LEAST * (LARGEST_CHANGE / change.abs()).min(1.0));
                 let shrunk = 1.0 - belief * (1.0 - share_of_render(judged, change, doubt));
                 let direct = match keeps {
                     0.0 => 0.0,
