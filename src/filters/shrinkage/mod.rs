@@ -354,6 +354,25 @@ mod tests {
     }
 
     #[test]
+    fn frames_that_tell_thousands_of_samples_are_denoised_where_they_are_noisy() {
+        let (truth, albedo) = (planes(picture), planes(|_, _, _| 0.5));
+        let mut radiance = noisy(0.3);
+        // An edge or a highlight that the denoiser lost, three pixels long: no firefly.
+        let place = 35 * SIZE.0 + 40;
+        (0..3).for_each(|c| radiance.channel_mut(c)[place..place + 3].fill(30.0));
+        let kept = shrunk(&truth, &radiance, &albedo, Some(4096));
+        let highlight = kept.channel(0)[place..place + 3].iter().sum::<f32>() / 90.0;
+        assert!(highlight > 0.85, "{highlight}");
+        let (mut without, mut before) = (kept, radiance);
+        for image in [&mut without, &mut before] {
+            (0..3).for_each(|c| {
+                image.channel_mut(c)[place..place + 3].copy_from_slice(&truth.channel(c)[place..place + 3]);
+            });
+        }
+        assert!(error(&without) < 0.6 * error(&before), "{}", error(&without) / error(&before));
+    }
+
+    #[test]
     fn light_seen_directly_is_kept_and_chance_is_not() {
         // A screen of 20x10 whose light is in the albedo, a pixel that has its albedo's brightness, and a
         // star.
