@@ -67,6 +67,27 @@ pub fn each_row(
     made
 }
 
+/// The relative variance that the noise of a quarter of the squares stays below, of those that have any.
+///
+/// Detail of a pixel's size cannot be told from noise where it lies, but it lies in parts of a frame only, while
+/// noise is everywhere: the calm quarter has little else.
+pub fn noise_of_frame(sums: &[f32], squares: usize) -> f32 {
+    let (window, lines) = (WINDOWS[0], (NOISE[1] + 1) * squares);
+    let rows: Vec<&[f32]> = sums.chunks(SUMS * squares).map(|row| &row[..lines]).collect();
+    let of_row = |row: usize| {
+        let (mut of_rows, mut around) = (vec![0.0; lines], vec![0.0; lines]);
+        squares::around(squares::rows_around(&rows, row, window), squares, window, &mut of_rows, &mut around);
+        let noise = move |s: usize| {
+            let [count, light, ratio] = [COUNT, NOISE[0], NOISE[1]].map(|line| around[line * squares + s]);
+            light.min(ratio) / count
+        };
+        (0..squares).map(noise).filter(|noise| *noise > TINY)
+    };
+    let mut noise: Vec<f32> = (0..rows.len()).into_par_iter().flat_map_iter(of_row).collect();
+    let quarter = noise.len() / 4;
+    if noise.is_empty() { 0.0 } else { *noise.select_nth_unstable_by(quarter, f32::total_cmp).1 }
+}
+
 /// Makes features of the sums over a neighbourhood: logarithms of mean squares, and correlations.
 struct Describe<'a> {
     sums: &'a [f32],

@@ -55,12 +55,17 @@ const SNAP: f32 = 1.0 / 64.0;
 const DOUBT: (f32, f32) = (0.5, 2.0);
 
 /// Beyond [`FINAL_SAMPLES`] samples, what is taken of the denoised frame falls with the number of samples to
-/// the power of [`FINAL_POWER`], because few frames that were learned from had more. It falls to
-/// [`FINAL_LEAST`], since a frame that tells of thousands of samples is mostly one that was allowed so many, of
-/// which adaptive sampling took fewer; but not where light changes by more than noise of so many samples does.
+/// the power of [`FINAL_POWER`], because few frames that were learned from had more.
 const FINAL_SAMPLES: f32 = 192.0;
 const FINAL_POWER: f32 = 0.75;
-const FINAL_LEAST: f32 = 0.3;
+
+/// A frame that tells of thousands of samples may be one that was allowed so many, of which adaptive sampling
+/// took far fewer. [`ADAPTIVE_LEAST`] of what was denoised is taken in any case, if the [noise of the
+/// frame](features::noise_of_frame) is that of [`ADAPTIVE_NOISE`]'s second value or more, and none for that
+/// reason up to its first; Blender's default threshold leaves 2e-4 to 1e-2, 4096 samples of the same scenes as
+/// little as 2e-5. Where light changes by more than [`LARGEST_CHANGE`] it counts less: that is no such noise.
+const ADAPTIVE_LEAST: f32 = 0.3;
+const ADAPTIVE_NOISE: (f32, f32) = (1e-4, 3e-4);
 
 /// By how much the render's light may differ from the denoised light, relative to the latter, before a
 /// pixel's share is reduced. This holds for shares near zero; the larger the share, the more it may differ. A
@@ -136,7 +141,8 @@ impl<'a> Shrinkage<'a> {
         }
         let sums = sums::gather(image, render, seen);
         let judged = restraint::judge(&sums, image.width.div_ceil(SQUARE), render);
-        mix(image, render, seen, &judged, shares);
+        let belief = Belief::of(render, &sums, image.width.div_ceil(SQUARE));
+        mix(image, render, seen, (&judged, belief), shares);
         sums
     }
 }
@@ -188,15 +194,46 @@ pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
     });
 }
 
-/// Mixes every pixel, and writes the shares of the render, where they are asked for.
-fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares: Option<&mut Planes>) {
+/// How much is taken of what shrinkage leaves of the denoised frame.
+#[derive(Clone, Copy)]
+struct Belief {
+    by_samples: f32,
+    by_noise: f32,
+}
+
+impl Belief {
+    fn of(render: &Render, sums: &[f32], squares: usize) -> Self {
+        let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
+        let by_samples = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
+        if by_samples >= ADAPTIVE_LEAST {
+            return Self { by_samples, by_noise: 0.0 };
+        }
+        let [none, all] = [ADAPTIVE_NOISE.0, ADAPTIVE_NOISE.1].map(f32::ln);
+        let noise = (features::noise_of_frame(sums, squares) + features::TINY).ln();
+        Self { by_samples, by_noise: ADAPTIVE_LEAST * ((noise - none) / (all - none)).clamp(0.0, 1.0) }
+    }
+
+    /// In a pixel whose light changes by `change`, relative to the denoised light, if all of the render is taken.
+    fn at(self, change: f32) -> f32 {
+        self.by_samples.max(self.by_noise * (LARGEST_CHANGE / change.abs()).min(1.0))
+    }
+}
+
+/// Mixes every pixel, and writes the shares of the render, where they are asked for. `judged` is what was
+/// [judged](restraint::judge) of the squares.
+fn mix(
+    image: &mut Planes,
+    render: &Render,
+    seen: &Seen,
+    (judged, belief): (&[f32], Belief),
+    shares: Option<&mut Planes>,
+) {
     let (width, height) = (image.width, image.height);
     let (squares, square_rows) = (width.div_ceil(SQUARE), height.div_ceil(SQUARE));
     let floor = FLOOR / render.exposure;
     let samples = render.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32;
     let (few, many) = KEPT_SAMPLES;
     let doubt = render.samples.map_or(0.0, |_| (DOUBT.1 / samples).min(DOUBT.0)).max(SNAP);
-    let by_count = (FINAL_SAMPLES / samples).min(1.0).powf(FINAL_POWER);
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
@@ -235,8 +272,7 @@ fn mix(image: &mut Planes, render: &Render, seen: &Seen, judged: &[f32], shares:
                 }
                 let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
                 let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
-                let belief = by_count.max(FINAL_LEAST * (LARGEST_CHANGE / change.abs()).min(1.0));
-                let shrunk = 1.0 - belief * (1.0 - share_of_render(judged, change, doubt));
+                let shrunk = 1.0 - belief.at(change) * (1.0 - share_of_render(judged, change, doubt));
                 let direct = match keeps {
                     0.0 => 0.0,
                     _ if is_seen => keeps,
