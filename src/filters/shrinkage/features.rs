@@ -83,7 +83,7 @@ pub fn noise_of_frame(sums: &[f32], squares: usize) -> f32 {
         };
         (0..squares).map(noise).filter(|noise| *noise > TINY)
     };
-    let mut noise: Vec<f32> = (0..rows.len()).into_par_iter().flat_map_iter(of_row).collect();
+    let mut noise: Vec<f32> = (0..rows.len()).flat_map(of_row).collect();
     let quarter = noise.len() / 4;
     if noise.is_empty() { 0.0 } else { *noise.select_nth_unstable_by(quarter, f32::total_cmp).1 }
 }
