@@ -1,7 +1,7 @@
 """The recipe of a built-in network, from seeds to a score: renders, prefilter, network, evaluation.
 
     python recipe.py --out DIR --assets ASSETS --blend SCENES        in full: days of two cores
-    python recipe.py --out DIR --scale 0.004                         in half an hour of two cores
+    python recipe.py --out DIR --scale 0.004                         in less than an hour of two cores
 
 Scenes come from fixed seeds and weights from random ones: two `demc train` commands make them. --scale takes
 that share of the scenes and of the steps. The score is the geometric mean of RelMSE over that of the noisy
