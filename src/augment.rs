@@ -1,4 +1,5 @@
-//! Changes to a frame that leave it as good a picture: flips, quarter turns, a permutation of RGB, exposure.
+//! Changes to a frame that leave it as good a picture: flips, quarter turns, a permutation of RGB, exposure,
+//! coloured light.
 //!
 //! A pass of vectors must change with the picture. Camera-space normals and motion turn as the image turns.
 //! World space has no axis of its own: a flipped picture shows a mirrored world, a turned one shows a turned
@@ -22,6 +23,8 @@ pub struct Augment {
     pub rgb: [usize; 3],
     /// Radiance is multiplied by this.
     pub exposure: f32,
+    /// So is each of its channels by its own: the scene in light of this colour.
+    pub tint: [f32; 3],
 }
 
 /// Every order of three channels.
@@ -32,7 +35,7 @@ const STOPS: f32 = 2.0;
 
 impl Augment {
     /// Nothing changes.
-    pub const IDENTITY: Self = Self { flip: false, turns: 0, rgb: [0, 1, 2], exposure: 1.0 };
+    pub const IDENTITY: Self = Self { flip: false, turns: 0, rgb: [0, 1, 2], exposure: 1.0, tint: [1.0; 3] };
 
     /// A random one.
     pub fn draw(rng: &mut Rng) -> Self {
@@ -41,7 +44,19 @@ impl Augment {
             turns: rng.below(4),
             rgb: ORDERS[rng.below(6)],
             exposure: ((2.0 * rng.uniform() - 1.0) * STOPS).exp2(),
+            tint: Self::IDENTITY.tint,
         }
+    }
+
+    /// The same in coloured light, with the probability `share`. One channel stays as it is; the others keep a
+    /// random part of their light, often next to none, as with a pure red.
+    pub fn tinted(self, share: f64, rng: &mut Rng) -> Self {
+        if share == 0.0 || f64::from(rng.uniform()) >= share {
+            return self;
+        }
+        let mut tint = [0; 3].map(|_| rng.uniform().powi(3));
+        tint[rng.below(3)] = 1.0;
+        Self { tint, ..self }
     }
 
     /// Applied to every pass of a frame.
@@ -68,8 +83,10 @@ impl Augment {
                 }
             }
         }
-        if pass.carries_radiance() && self.exposure != 1.0 {
-            planes.data.iter_mut().for_each(|v| *v *= self.exposure);
+        if pass.carries_radiance() && (self.exposure, self.tint) != (1.0, Self::IDENTITY.tint) {
+            for (c, tint) in self.tint.iter().enumerate() {
+                planes.channel_mut(c).iter_mut().for_each(|v| *v *= self.exposure * tint);
+            }
         }
         planes
     }
@@ -178,11 +195,21 @@ mod tests {
     }
 
     #[test]
-    fn colours_permute_together_and_only_radiance_is_exposed() {
-        let augment = Augment { rgb: [2, 0, 1], exposure: 4.0, ..Augment::IDENTITY };
+    fn as_many_are_tinted_as_asked_for_and_one_channel_stays() {
+        let rng = &mut Rng::new(1, 2);
+        let tints: Vec<[f32; 3]> = (0..1000).map(|_| Augment::IDENTITY.tinted(0.25, rng).tint).collect();
+        let tinted = tints.iter().filter(|tint| **tint != [1.0; 3]).count();
+        assert!((200..300).contains(&tinted), "{tinted} of 1000");
+        assert!(tints.iter().all(|tint| tint.contains(&1.0) && tint.iter().all(|v| (0.0..=1.0).contains(v))));
+        assert_eq!(Augment::IDENTITY.tinted(0.0, rng), Augment::IDENTITY);
+    }
+
+    #[test]
+    fn colours_permute_together_and_only_radiance_is_exposed_and_tinted() {
+        let augment = Augment { rgb: [2, 0, 1], exposure: 4.0, tint: [1.0, 0.5, 0.0], ..Augment::IDENTITY };
         let colours = square([vec![1.0; 4], vec![2.0; 4], vec![3.0; 4]].concat());
         let pick = |p: Planes| [p.data[0], p.data[4], p.data[8]];
-        assert_eq!(pick(augment.pass(Pass::Combined, &colours)), [12.0, 4.0, 8.0]);
+        assert_eq!(pick(augment.pass(Pass::Combined, &colours)), [12.0, 2.0, 0.0]);
         assert_eq!(pick(augment.pass(Pass::DenoisingAlbedo, &colours)), [3.0, 1.0, 2.0]);
     }
 }

@@ -15,8 +15,8 @@ mod stand_in;
 pub use black::keep_black;
 pub use fireflies::{FIREFLY, tame_alike, tame_fireflies};
 pub use kpcn::{
-    DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
-    kpcn_streams,
+    DIFFUSE_FLOOR, KPCN_CHANNELS, KPCN_COMBINED_OPTIONAL, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED,
+    kpcn_combined, kpcn_streams,
 };
 pub use lbf::{LBF_CHANNELS, LBF_GROUPS, LBF_PASSES, lbf};
 pub use shading::Shading;
@@ -89,13 +89,26 @@ pub fn paper_features(passes: &PassSet, needed_by: &str) -> Result<Planes> {
     let (first_hit, second_hit) = rest.split_at_mut(n);
     normal.copy_from_slice(&get(Pass::Normal)?.data);
     position.copy_from_slice(&get(Pass::Position)?.data);
-    // What the first surface reflects and transmits, whatever the lobe.
-    for pass in [Pass::DiffuseColor, Pass::GlossyColor, Pass::TransmissionColor] {
-        first_hit.iter_mut().zip(&get(pass)?.data).for_each(|(a, b)| *a += b);
-    }
+    first_hit.copy_from_slice(&first_texture(passes, needed_by)?.data);
     second_hit.copy_from_slice(&get(Pass::DenoisingAlbedo)?.data);
     (0..PAPER_FEATURES).for_each(|c| z_score(features.channel_mut(c)));
     Ok(features)
+}
+
+/// The passes of [`first_texture`].
+const FIRST_TEXTURE: [Pass; 3] = [Pass::DiffuseColor, Pass::GlossyColor, Pass::TransmissionColor];
+
+/// What the first surface reflects and transmits, whatever the lobe, (3, H, W).
+///
+/// # Errors
+/// A pass is missing.
+fn first_texture(passes: &PassSet, needed_by: &str) -> Result<Planes> {
+    let mut sum = Planes::new(3, passes.width, passes.height);
+    for pass in FIRST_TEXTURE {
+        let colour = passes.require(pass, needed_by)?;
+        sum.data.iter_mut().zip(&colour.data).for_each(|(a, b)| *a += b);
+    }
+    Ok(sum)
 }
 
 /// Smallest standard deviation that counts: a flatter channel carries nothing and becomes zero.

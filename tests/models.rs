@@ -371,6 +371,7 @@ fn facts() -> Facts {
         loss: "both".into(),
         raw_references: false,
         guide_dropout: 0.0,
+        tint: 0.0,
         optimizer: "adam".into(),
         weight_decay: 0.0,
         precision: None,

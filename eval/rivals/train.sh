@@ -1,9 +1,10 @@
 #!/bin/sh
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
 #   eval/rivals/train.sh DATA OUT SECONDS [NAME...]
-# Learning rates fall over STEPS, which fit 480 seconds of one thread with AVX512-BF16 beside a busy one;
-# scale them with the budget by the environment variable SCALE (2 for twice the steps). One thread each, one
-# after another. A run that is cut by the budget keeps the best weights so far in OUT/NAME/best.safetensors.
+# DATA is a folder or a manifest, or several of them with commas between. Learning rates fall over as many
+# steps as fit one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
+# another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
+# the budget keeps the best weights so far in OUT/NAME/best.safetensors.
 set -eu
 data=$1 out=$2 seconds=$3
 shift 3
@@ -12,18 +13,21 @@ demc=${DEMC:-demc}
 mkdir -p "$out"
 
 for name in "$@"; do
+    # Steps in 100 seconds, and what was found best in short trials (README.md).
     case $name in
-        demc) steps=1500 more="--loss relmse --lr 1e-3:5e-5" ;;
-        demc-nofusion) steps=1750 more="--loss relmse --lr 1e-3:5e-5" ;;
-        semc) steps=720 more="--loss relmse --lr 1e-3:5e-5" ;;
-        kpcn) steps=360 more="--loss smape --lr 3e-4:3e-5 --patch 64" ;;
-        lbf) steps=780 more="--loss both --lr 1e-2:1e-3 --patch 64" ;;
+        demc) rate=790 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
+        demc-nofusion) rate=830 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
+        semc) rate=380 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
+        kpcn) rate=420 more="--loss smape --lr 2e-3:2e-5 --patch 64 --batch 2" ;;
+        lbf) rate=85 more="--loss both --lr 3e-2:3e-4 --batch 2" ;;
         *) echo "train.sh: no recipe for $name" >&2; exit 2 ;;
     esac
-    steps=$(awk "BEGIN { print int($steps * ${SCALE:-1}) }")
-    # shellcheck disable=SC2086 # the options are words
-    "$demc" train --data "$data" --out "$out/$name" --model "$name" --threads 1 --seed 1 \
-        --steps "$steps" --every $((steps / 10 > 0 ? steps / 10 : 1)) $more 2>"$out/$name.log" &
+    steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
+    average=$(awk "BEGIN { print 1 - 20 / $steps }")
+    # shellcheck disable=SC2046,SC2086 # the options are words, and so are the sets of pairs
+    "$demc" train $(printf -- '--data %s ' $(echo "$data" | tr , ' ')) --out "$out/$name" --model "$name" --threads 1 --seed 1 \
+        --steps "$steps" --every $((steps / 15 > 0 ? steps / 15 : 1)) --average "$average" \
+        --optimizer muon --weight-decay 0.1 --tint 0.25 $more 2>"$out/$name.log" &
     pid=$!
     used=0
     while kill -0 $pid 2>/dev/null; do

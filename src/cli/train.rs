@@ -70,6 +70,10 @@ pub struct Args {
     /// without
     #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
     guide_dropout: f64,
+    /// Share of the crops that are put into coloured light, so that a network which answers with colours knows
+    /// saturated ones
+    #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
+    tint: f64,
     /// How gradients become updates: adam, or muon, which needs fewer steps
     #[arg(long, default_value = "adam", value_parser = parse_rule)]
     optimizer: Rule,
@@ -106,7 +110,7 @@ pub struct Args {
     /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for
     /// more steps, edit them there
     #[arg(long, conflicts_with_all = [
-        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "optimizer",
+        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "tint", "optimizer",
         "weight_decay", "precision", "average", "val", "every", "seed", "init", "only", "prefilter",
     ])]
     resume: bool,
@@ -264,6 +268,7 @@ impl Args {
             loss: self.loss,
             raw_references: self.raw_references,
             guide_dropout: self.guide_dropout,
+            tint: self.tint,
             optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest_trained),
             weight_decay: self.weight_decay,

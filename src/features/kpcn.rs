@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use super::{ALBEDO_FLOOR, Inputs, exposure, relative_depth};
+use super::{ALBEDO_FLOOR, FIRST_TEXTURE, Inputs, exposure, first_texture, relative_depth};
 use crate::{
     Result,
     filters::variance::directional,
@@ -14,8 +14,11 @@ use crate::{
 /// The guides of both streams: what Blender's "Denoising Data" switch stores.
 const GUIDES: [Pass; 3] = [Pass::DenoisingNormal, Pass::DenoisingAlbedo, Pass::DenoisingDepth];
 
-/// The passes of [`kpcn_combined`].
+/// The passes of [`kpcn_combined`] that a file must hold.
 pub const KPCN_COMBINED_PASSES: [Pass; 4] = [Pass::Combined, GUIDES[0], GUIDES[1], GUIDES[2]];
+
+/// Those that it reads where they are.
+pub const KPCN_COMBINED_OPTIONAL: [Pass; 3] = FIRST_TEXTURE;
 
 /// The passes of [`kpcn_streams`].
 pub const KPCN_PASSES: [Pass; 7] = [
@@ -42,8 +45,10 @@ pub const DIFFUSE_FLOOR: f32 = 0.00316;
 /// The single stream over Combined, in this order: radiance, exposed and divided by albedo (3, H, W);
 /// that albedo (3, H, W); the network's input (34, H, W).
 ///
-/// An albedo of zero says that diffuse light is zero, but not that Combined is: the floor of the
-/// built-in models replaces [`DIFFUSE_FLOOR`] here.
+/// The albedo is the texture of the first surface, where the file holds that, and Denoising Albedo where no
+/// surface is or the file has none: Cycles carries Denoising Albedo on through glass, by one random path a
+/// sample, and light that is divided and multiplied by noise stays noisy. An albedo of zero says that diffuse
+/// light is zero, but not that Combined is: the floor of the built-in models replaces [`DIFFUSE_FLOOR`] here.
 ///
 /// # Errors
 /// A pass is missing.
@@ -52,6 +57,12 @@ pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     let guides = SharedInputs::new(passes, needed_by)?;
     let exposure = exposure(radiance);
     let mut albedo = guides.albedo.clone();
+    if KPCN_COMBINED_OPTIONAL.iter().all(|pass| passes.get(*pass).is_some()) {
+        let (texture, n) = (first_texture(passes, needed_by)?, albedo.pixels());
+        for i in (0..n).filter(|i| (0..3).any(|c| texture.data[c * n + i] > 0.0)) {
+            (0..3).for_each(|c| albedo.data[c * n + i] = texture.data[c * n + i].clamp(0.0, 1.0));
+        }
+    }
     albedo.data.iter_mut().for_each(|a| *a += ALBEDO_FLOOR);
     let mut irradiance = radiance.clone();
     irradiance.data.iter_mut().zip(&albedo.data).for_each(|(v, a)| *v = v.max(0.0) * exposure / a);
@@ -193,6 +204,24 @@ mod tests {
             }
             assert_eq!(rest.data.iter().any(|v| *v > 0.0), unfiltered);
         }
+    }
+
+    #[test]
+    fn the_single_stream_divides_by_the_first_texture_where_there_is_one() {
+        let mut set = ramps();
+        let albedo = |set: &PassSet| kpcn_combined(set, "kpcn").unwrap().planes[1].data.clone();
+        let denoising: Vec<f32> =
+            set.get(Pass::DenoisingAlbedo).unwrap().data.iter().map(|a| a + 0.05).collect();
+        // One of the three is there by itself, which is not enough.
+        assert_eq!(albedo(&set), denoising);
+        for (pass, value) in FIRST_TEXTURE.into_iter().zip([0.25, 0.125, 0.5]) {
+            let mut colour = Planes::from_vec(3, 7, 5, vec![value; 105]);
+            // The first pixel shows the sky.
+            (0..3).for_each(|c| colour.data[c * 35] = 0.0);
+            set.insert(pass, colour);
+        }
+        let with = albedo(&set);
+        assert_eq!((with[0], with[1], with[104]), (denoising[0], 0.925, 0.925));
     }
 
     #[test]

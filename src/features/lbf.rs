@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use super::{Inputs, PAPER_PASSES, exposure};
+use super::{Inputs, PAPER_PASSES, exposure, first_texture};
 use crate::{
     Result,
     filters::{
@@ -57,10 +57,7 @@ pub fn lbf(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
     colour.data.iter_mut().for_each(|v| *v = v.max(0.0) * exposure);
     let mut normal = get(Pass::Normal)?.clone();
     normal.data.iter_mut().for_each(|v| *v = 0.5 * v.clamp(-1.0, 1.0));
-    let mut first_hit = get(Pass::DiffuseColor)?.clone();
-    for pass in [Pass::GlossyColor, Pass::TransmissionColor] {
-        first_hit.data.iter_mut().zip(&get(pass)?.data).for_each(|(a, b)| *a += b);
-    }
+    let mut first_hit = first_texture(passes, needed_by)?;
     let mut second_hit = get(Pass::DenoisingAlbedo)?.clone();
     for texture in [&mut first_hit, &mut second_hit] {
         texture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));

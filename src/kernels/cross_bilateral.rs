@@ -7,19 +7,18 @@
 //! both, and the squared distance of each group of features. The factors `a_m(i)` are the precisions of pixel
 //! i.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::{
-    exponential::exp,
+    Block, LANES,
     filter::{Size, each_row},
     simd::{Kernel, Simd, Tier},
 };
 
 /// Added to the noise of two colours before their distance is divided by it.
 const NOISE_FLOOR: f32 = 1e-4;
-
-/// No exponent goes below minus this: the weight of such a neighbour does not count.
-const MAX_EXPONENT: f32 = 38.0;
 
 /// One image to be filtered.
 #[derive(Clone, Copy)]
@@ -40,11 +39,79 @@ pub struct CrossBilateral<'a> {
     pub precision: &'a [f32],
 }
 
-/// Distances of a row to a shifted one, one line of `w` values for each precision, and the weights that they
-/// give.
-struct Lines {
-    distance: Vec<f32>,
-    weight: Vec<f32>,
+/// The planes of [`Margins`]: three of colour, its noise, whether there is a pixel at all, then the features.
+const NOISE: usize = 3;
+const INSIDE: usize = 4;
+const FEATURES: usize = 5;
+
+/// All that is compared, with margins of zeros, so that a block of lanes can look as far as the filter does
+/// at any column. What a row needs lies together: row by row, in it plane by plane.
+struct Margins {
+    planes: usize,
+    /// Values of a row of one plane, margins included.
+    stride: usize,
+    values: Vec<f32>,
+}
+
+impl Margins {
+    fn new(filter: &CrossBilateral) -> Self {
+        let (Size { h, w }, n) = (filter.size, filter.size.pixels());
+        let planes = FEATURES + filter.features.len() / n.max(1);
+        let stride = w.next_multiple_of(LANES) + 2 * filter.radius;
+        let mut values = vec![0.0; h * planes * stride];
+        values.par_chunks_mut((planes * stride).max(1)).enumerate().for_each(|(y, row)| {
+            let mut inner = row.chunks_mut(stride).map(|line| &mut line[filter.radius..][..w]);
+            let mut next = || inner.next().expect("there is a line for every plane");
+            let line_of = |plane: &[f32], line: &mut [f32]| line.copy_from_slice(&plane[y * w..][..w]);
+            filter.image.chunks(n).for_each(|plane| line_of(plane, next()));
+            line_of(filter.noise, next());
+            next().fill(1.0);
+            filter.features.chunks(n).for_each(|plane| line_of(plane, next()));
+        });
+        Self { planes, stride, values }
+    }
+
+    /// All planes of row `y`.
+    fn row(&self, y: usize) -> &[f32] {
+        &self.values[y * self.planes * self.stride..][..self.planes * self.stride]
+    }
+
+    /// The lanes of a plane of a row that begin at column `x - radius` of the image.
+    #[inline(always)]
+    fn lanes<S: Simd>(&self, simd: S, row: &[f32], plane: usize, x: usize) -> S::V {
+        let lanes: &[f32; LANES] = row[plane * self.stride + x..].first_chunk().expect("margins suffice");
+        // SAFETY: a reference to as many values is valid for reading them.
+        unsafe { simd.read(lanes.as_ptr()) }
+    }
+
+    /// The squared distances of a block to the lanes of a row that begin at column `from - radius`, summed over
+    /// `planes`. No closure, which may be compiled without the tier's instructions.
+    #[inline(always)]
+    fn squares<S: Simd>(
+        &self,
+        simd: S,
+        own: &[Block],
+        row: &[f32],
+        planes: Range<usize>,
+        from: usize,
+    ) -> S::V {
+        let mut sum = simd.splat(0.0);
+        for plane in planes {
+            let difference =
+                simd.fma(self.lanes(simd, row, plane, from), simd.splat(-1.0), simd.get(&own[plane]));
+            sum = simd.fma(difference, difference, sum);
+        }
+        sum
+    }
+}
+
+/// A block of pixels of a row, to be filtered, and how it compares with the neighbours that are looked at.
+struct Own {
+    /// What is compared, in the order of [`Margins`].
+    values: Vec<Block>,
+    precision: Vec<Block>,
+    /// Distances to the neighbours, one block for each precision.
+    distance: Vec<Block>,
 }
 
 impl CrossBilateral<'_> {
@@ -69,8 +136,9 @@ impl CrossBilateral<'_> {
         self.check();
         let (n, w) = (self.size.pixels(), self.size.w);
         assert_eq!((output.len(), total.len()), (3 * n, n));
+        let margins = Margins::new(&self);
         each_row(w, [output], total, |y, [output], total| {
-            tier.run(Forward { filter: &self, y, output, total })
+            tier.run(Forward { filter: &self, margins: &margins, y, output, total })
         });
     }
 
@@ -90,80 +158,91 @@ impl CrossBilateral<'_> {
         let (n, w) = (self.size.pixels(), self.size.w);
         assert_eq!((output.len(), total.len(), output_gradient.len()), (3 * n, n, 3 * n));
         assert_eq!(into.len(), self.precisions() * n);
+        let margins = Margins::new(&self);
         // A row of gradients for every precision, row by row.
         let mut rows: Vec<Vec<&mut [f32]>> = (0..self.size.h).map(|_| Vec::new()).collect();
         for plane in into.chunks_mut(n) {
             rows.iter_mut().zip(plane.chunks_mut(w)).for_each(|(row, chunk)| row.push(chunk));
         }
         rows.into_par_iter().enumerate().for_each(|(y, into)| {
-            tier.run(Backward { filter: &self, y, output, total, output_gradient, into });
+            tier.run(Backward { filter: &self, margins: &margins, y, output, total, output_gradient, into });
         });
     }
 
-    /// Calls `visit(x0..x1, neighbour of x0, lines)` for every neighbour of row `y` that lies inside the
-    /// image, with the distances and weights of the columns `x0..x1`.
-    #[inline(always)]
-    fn neighbours(&self, y: usize, mut visit: impl FnMut((usize, usize), usize, &Lines)) {
-        let (Size { h, w }, n) = (self.size, self.size.pixels());
-        let r = self.radius as isize;
-        let unit = 1.0 / (self.radius.max(1) * self.radius.max(1)) as f32;
-        let mut lines = Lines { distance: vec![0.0; self.precisions() * w], weight: vec![0.0; w] };
-        for dy in -r..=r {
-            let row = y as isize + dy;
-            if row < 0 || row >= h as isize {
-                continue;
-            }
-            for dx in (-r..=r).filter(|dx| dx.unsigned_abs() < w) {
-                let (x0, x1) = ((-dx).max(0) as usize, (w as isize - dx.max(0)) as usize);
-                let (at, from) = (y * w + x0, row as usize * w + (x0 as isize + dx) as usize);
-                let len = x1 - x0;
-                let weight = &mut lines.weight[x0..x1];
-                let mut distances = lines.distance.chunks_exact_mut(w).map(|line| &mut line[x0..x1]);
-                let mut next = || distances.next().expect("there is a line for every precision");
-                let mut precision = self.precision.chunks_exact(n).map(|plane| &plane[at..][..len]);
-                let mut own = || precision.next().expect("there is a plane for every line");
+    /// The rows that a pixel of row `y` looks at.
+    fn rows(&self, y: usize) -> Range<usize> {
+        y.saturating_sub(self.radius)..(y + self.radius + 1).min(self.size.h)
+    }
 
-                let position = (dx * dx + dy * dy) as f32 * unit;
-                next().fill(position);
-                weight.iter_mut().zip(own()).for_each(|(e, a)| *e = a * position);
-
-                let line = next();
-                squared_distance(&self.image[..3 * n], n, at, from, line);
-                let noise = self.noise[at..][..len].iter().zip(&self.noise[from..][..len]);
-                for (((d, (a, b)), e), own) in line.iter_mut().zip(noise).zip(&mut *weight).zip(own()) {
-                    *d /= a + b + NOISE_FLOOR;
-                    *e += own * *d;
-                }
-
-                let mut first = 0;
-                for channels in self.groups {
-                    let line = next();
-                    squared_distance(&self.features[first * n..][..channels * n], n, at, from, line);
-                    weight.iter_mut().zip(&*line).zip(own()).for_each(|((e, d), a)| *e += a * d);
-                    first += channels;
-                }
-                weight.iter_mut().for_each(|e| *e = exp(-e.min(MAX_EXPONENT)));
-                visit((x0, x1), from, &lines);
-            }
+    /// The block of pixels of row `y` that begins at column `x`.
+    fn own(&self, margins: &Margins, y: usize, x: usize) -> Own {
+        let Size { w, .. } = self.size;
+        let inner = margins.row(y).chunks(margins.stride).map(|line| &line[self.radius..][..w]);
+        Own {
+            values: inner.map(|line| block(line, x)).collect(),
+            precision: self
+                .precision
+                .chunks(self.size.pixels())
+                .map(|p| block(&p[y * w..][..w], x))
+                .collect(),
+            distance: vec![Block::default(); self.precisions()],
         }
+    }
+
+    /// The weights of the neighbours in `row`, all planes of a row, that begin at column `from - radius`;
+    /// `position` is their squared distance in units of the radius. Leaves all distances in `own`.
+    #[inline(always)]
+    fn weights<S: Simd>(
+        &self,
+        simd: S,
+        own: &mut Own,
+        margins: &Margins,
+        row: &[f32],
+        (from, position): (usize, f32),
+    ) -> S::V {
+        let minus = simd.splat(-1.0);
+        let Own { values, precision, distance } = own;
+        let noise = simd.add(simd.get(&values[NOISE]), margins.lanes(simd, row, NOISE, from));
+        let colour = simd.div(
+            margins.squares(simd, values, row, 0..NOISE, from),
+            simd.add(noise, simd.splat(NOISE_FLOOR)),
+        );
+        let position = simd.splat(position);
+        simd.set(&mut distance[0], position);
+        simd.set(&mut distance[1], colour);
+        let mut exponent = simd.mul(simd.get(&precision[0]), position);
+        exponent = simd.fma(simd.get(&precision[1]), colour, exponent);
+        let mut first = FEATURES;
+        for (group, channels) in self.groups.iter().enumerate() {
+            let apart = margins.squares(simd, values, row, first..first + channels, from);
+            simd.set(&mut distance[2 + group], apart);
+            exponent = simd.fma(simd.get(&precision[2 + group]), apart, exponent);
+            first += channels;
+        }
+        let weight = simd.exp(simd.mul(exponent, minus));
+        simd.mul(weight, margins.lanes(simd, row, INSIDE, from))
+    }
+
+    /// The squared distance in pixels of a neighbour, in units of the radius; `from` counts from the left end
+    /// of the square.
+    #[inline(always)]
+    fn position(&self, y: usize, row: usize, from: usize) -> f32 {
+        let (dy, dx) = (y.abs_diff(row), from.abs_diff(self.radius));
+        (dx * dx + dy * dy) as f32 / (self.radius.max(1) * self.radius.max(1)) as f32
     }
 }
 
-/// Writes to `line` the squared distances of the pixels from `at` on to those from `from` on, summed over
-/// planes of `n` values.
-#[inline(always)]
-fn squared_distance(planes: &[f32], n: usize, at: usize, from: usize, line: &mut [f32]) {
-    line.fill(0.0);
-    for plane in planes.chunks_exact(n) {
-        let (a, b) = (&plane[at..][..line.len()], &plane[from..][..line.len()]);
-        for ((d, a), b) in line.iter_mut().zip(a).zip(b) {
-            *d += (a - b) * (a - b);
-        }
-    }
+/// The values of a row from column `x` on, and zeros beyond its last.
+fn block(row: &[f32], x: usize) -> Block {
+    let mut block = Block::default();
+    let count = LANES.min(row.len() - x);
+    block.0[..count].copy_from_slice(&row[x..][..count]);
+    block
 }
 
 struct Forward<'a, 'f> {
     filter: &'a CrossBilateral<'f>,
+    margins: &'a Margins,
     y: usize,
     output: [&'a mut [f32]; 3],
     total: &'a mut [f32],
@@ -171,30 +250,39 @@ struct Forward<'a, 'f> {
 
 impl Kernel for Forward<'_, '_> {
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let Self { filter, y, output: [r, g, b], total } = self;
-        let n = filter.size.pixels();
-        for out in [&mut *r, &mut *g, &mut *b, &mut *total] {
-            out.fill(0.0);
-        }
-        filter.neighbours(y, |(x0, x1), from, lines| {
-            let weight = &lines.weight[x0..x1];
-            for (out, c) in [(&mut *r, 0), (&mut *g, 1), (&mut *b, 2)] {
-                let image = &filter.image[c * n + from..][..x1 - x0];
-                for ((out, v), w) in out[x0..x1].iter_mut().zip(image).zip(weight) {
-                    *out += v * w;
+    fn run<S: Simd>(self, simd: S) {
+        let Self { filter, margins, y, mut output, total } = self;
+        let w = filter.size.w;
+        for x in (0..w).step_by(LANES) {
+            let mut own = filter.own(margins, y, x);
+            // Three colours, and the weights.
+            let mut sums = [simd.splat(0.0); 4];
+            for row in filter.rows(y) {
+                let planes = margins.row(row);
+                for dx in 0..=2 * filter.radius {
+                    let at = (x + dx, filter.position(y, row, dx));
+                    let weight = filter.weights(simd, &mut own, margins, planes, at);
+                    for c in 0..3 {
+                        sums[c] = simd.fma(margins.lanes(simd, planes, c, x + dx), weight, sums[c]);
+                    }
+                    sums[3] = simd.add(sums[3], weight);
                 }
             }
-            total[x0..x1].iter_mut().zip(weight).for_each(|(t, w)| *t += w);
-        });
-        for out in [r, g, b] {
-            out.iter_mut().zip(&*total).for_each(|(v, t)| *v /= t);
+            let count = LANES.min(w - x);
+            let mut lanes = Block::default();
+            simd.set(&mut lanes, sums[3]);
+            total[x..][..count].copy_from_slice(&lanes.0[..count]);
+            for (out, sum) in output.iter_mut().zip(sums) {
+                simd.set(&mut lanes, simd.div(sum, sums[3]));
+                out[x..][..count].copy_from_slice(&lanes.0[..count]);
+            }
         }
     }
 }
 
 struct Backward<'a, 'f> {
     filter: &'a CrossBilateral<'f>,
+    margins: &'a Margins,
     y: usize,
     output: &'a [f32],
     total: &'a [f32],
@@ -204,32 +292,41 @@ struct Backward<'a, 'f> {
 
 impl Kernel for Backward<'_, '_> {
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let Self { filter, y, output, total, output_gradient, mut into } = self;
-        let (n, w) = (filter.size.pixels(), filter.size.w);
-        let mut slope = vec![0.0; w];
-        filter.neighbours(y, |(x0, x1), from, lines| {
-            let (at, len) = (y * w + x0, x1 - x0);
-            let slope = &mut slope[..len];
-            slope.fill(0.0);
-            for c in 0..3 {
-                let x = &filter.image[c * n + from..][..len];
-                let out = &output[c * n + at..][..len];
-                let g = &output_gradient[c * n + at..][..len];
-                for (((s, x), out), g) in slope.iter_mut().zip(x).zip(out).zip(g) {
-                    *s += g * (x - out);
+    fn run<S: Simd>(self, simd: S) {
+        let Self { filter, margins, y, output, total, output_gradient, mut into } = self;
+        let Size { w, .. } = filter.size;
+        let n = filter.size.pixels();
+        let mut sums = vec![Block::default(); into.len()];
+        for x in (0..w).step_by(LANES) {
+            let mut own = filter.own(margins, y, x);
+            let colours = |planes: &[f32]| [0, 1, 2].map(|c| block(&planes[c * n + y * w..][..w], x));
+            let (output, gradient) = (colours(output), colours(output_gradient));
+            sums.fill(Block::default());
+            for row in filter.rows(y) {
+                let planes = margins.row(row);
+                for dx in 0..=2 * filter.radius {
+                    let at = (x + dx, filter.position(y, row, dx));
+                    let weight = filter.weights(simd, &mut own, margins, planes, at);
+                    let mut slope = simd.splat(0.0);
+                    for c in 0..3 {
+                        let value = margins.lanes(simd, planes, c, x + dx);
+                        let off = simd.fma(simd.get(&output[c]), simd.splat(-1.0), value);
+                        slope = simd.fma(simd.get(&gradient[c]), off, slope);
+                    }
+                    let slope = simd.mul(slope, weight);
+                    for (sum, distance) in sums.iter_mut().zip(&own.distance) {
+                        let added = simd.fma(slope, simd.get(distance), simd.get(sum));
+                        simd.set(sum, added);
+                    }
                 }
             }
             // d w / d a = -D w, and the sum of weights divides.
-            for ((s, w), t) in slope.iter_mut().zip(&lines.weight[x0..x1]).zip(&total[at..][..len]) {
-                *s *= -w / t;
+            let total = block(&total[y * w..][..w], x).0;
+            for (into, sum) in into.iter_mut().zip(&sums) {
+                let pixels = into[x..].iter_mut().zip(&sum.0).zip(&total);
+                pixels.for_each(|((into, sum), total)| *into -= sum / total);
             }
-            for (into, line) in into.iter_mut().zip(lines.distance.chunks_exact(w)) {
-                for ((g, d), s) in into[x0..x1].iter_mut().zip(&line[x0..x1]).zip(&*slope) {
-                    *g += d * s;
-                }
-            }
-        });
+        }
     }
 }
 
@@ -269,7 +366,7 @@ mod tests {
             }
             let exponent: f64 =
                 distances.iter().enumerate().map(|(m, d)| f64::from(f.precision[m * n + i]) * d).sum();
-            let weight = (-exponent.min(f64::from(MAX_EXPONENT))).exp();
+            let weight = (-exponent.min(40.0)).exp();
             sum += weight * f64::from(f.image[c * n + j]);
             total += weight;
         }

@@ -9,8 +9,8 @@
 //! Departures: (1) variance comes from neighbouring pixels, since Cycles writes none of its samples; (2)
 //! exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
 //! networks knew one studio's exposure; (3) both streams are trained at once, end to end, with any of
-//! `demc train`'s losses; (4) without light passes one stream filters Combined over Denoising Albedo, with a
-//! larger floor; (5) emission and environment are added back unfiltered, and volumes count as specular; (6)
+//! `demc train`'s losses; (4) without light passes one stream filters Combined over the texture of the first
+//! surface, with a larger floor; (5) emission and environment are added back unfiltered, and volumes count as specular; (6)
 //! the default width is 32; `--widths 100` is the published one.
 
 use dfdx::{
@@ -22,8 +22,8 @@ use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Tape
 use crate::{
     Result,
     features::{
-        Inputs, KPCN_CHANNELS, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED, kpcn_combined,
-        kpcn_streams,
+        Inputs, KPCN_CHANNELS, KPCN_COMBINED_OPTIONAL, KPCN_COMBINED_PASSES, KPCN_PASSES, KPCN_UNFILTERED,
+        kpcn_combined, kpcn_streams,
     },
     kernels::Shape,
     nn::{Activation, Conv, Field, Images, Init, Param, Stats},
@@ -64,7 +64,7 @@ pub static DESIGN: Design = Design {
 
 /// KPCN with a single stream over Combined.
 pub static COMBINED: Design = Design {
-    inputs: "kpcn-combined/logarithm/1",
+    inputs: "kpcn-combined/logarithm/2",
     least_parameters: |config| stream_parameters(1, config),
     ..DESIGN
 };
@@ -165,7 +165,7 @@ impl Network for Kpcn {
     fn optional_passes(&self) -> &'static [Pass] {
         match self.config.architecture {
             Architecture::Kpcn => &KPCN_UNFILTERED,
-            _ => &[],
+            _ => &KPCN_COMBINED_OPTIONAL,
         }
     }
 

@@ -5,14 +5,13 @@
 //! perceptron chooses for each pixel from the secondary features (Sections 3.3 and 4.1). Both are trained end
 //! to end: the loss is that of the filtered image, and its gradient passes through the filter.
 //!
-//! Departures: (1) the window is 21x21, not 55x55, which takes a seventh of the time; (2) deviations
-//! come from neighbouring pixels, since Cycles writes none of its samples, and there is no visibility
-//! feature; (3) files do not tell the sampling rate, which is left out of the secondary features; (4) those
-//! describe colour too, and their median deviation is that of 3x3 pixels, not of wavelet details; (5) the
-//! weight of colour is learned like the others, not fixed; variances are summed over channels before
-//! distances are divided by them; features are not prefiltered; (6) exposure is normalised and colour
-//! statistics are of its logarithm; (7) Adam trains it, with any of `demc train`'s losses; (8) no spikes
-//! are removed afterwards.
+//! Departures: (1) deviations come from neighbouring pixels, since Cycles writes none of its samples, and
+//! there is no visibility feature; (2) files do not tell the sampling rate, which is left out of the secondary
+//! features; (3) those describe colour too, and their median deviation is that of 3x3 pixels, not of wavelet
+//! details; (4) the weight of colour is learned like the others, not fixed; variances are summed over channels
+//! before distances are divided by them; features are not prefiltered; (5) exposure is normalised and colour
+//! statistics are of its logarithm; (6) Adam or Muon trains it, with any of `demc train`'s losses; (7) no
+//! spikes are removed afterwards.
 
 use dfdx::{
     tensor::{Cpu, Merge, NoneTape, Tape, TensorFromVec},
@@ -36,8 +35,8 @@ pub fn config() -> Config {
     Config::new(Architecture::Lbf, &[PUBLISHED_WIDTH])
 }
 
-/// Pixels from the centre of the filter's window to its edge.
-const RADIUS: usize = 10;
+/// Pixels from the centre of the filter's window, 55x55, to its edge.
+const RADIUS: usize = 27;
 
 /// Parameters of the filter: position, colour, each group of features.
 const PRECISIONS: usize = 2 + LBF_GROUPS.len();
@@ -50,7 +49,7 @@ const SOFTPLUS_LIMIT: f32 = 30.0;
 
 /// See [`Design`].
 pub static DESIGN: Design = Design {
-    inputs: "lbf/logarithm/1",
+    inputs: "lbf/logarithm/2",
     levels: 1,
     prefilter_levels: 0,
     least_parameters: |config| config.widths[0],

@@ -38,6 +38,9 @@ pub struct Facts {
     /// Share of the crops that lacked guides.
     #[serde(default)]
     pub guide_dropout: f64,
+    /// Share of the crops that were in coloured light.
+    #[serde(default)]
+    pub tint: f64,
     /// How gradients became updates; files from before there was a choice do not say.
     #[serde(default = "adam")]
     pub optimizer: String,

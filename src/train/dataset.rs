@@ -145,9 +145,9 @@ impl Dataset {
     /// proportion to their pixels, and never where they are too small. Where other renders of the frame have
     /// as many samples, each pixel comes from one of two renders: Cycles draws the samples of each pixel
     /// independently, so the mixture is a render with a seed of its own, and no network can learn the noise
-    /// of the stored renders by heart. `guide_dropout` is the share of crops that lack guides. The dataset
-    /// must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
-    pub fn draw(&self, side: usize, guide_dropout: f64, rng: &mut Rng) -> Sample {
+    /// of the stored renders by heart. `guide_dropout` is the share of crops that lack guides, `tint` that of
+    /// those in coloured light. The dataset must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
+    pub fn draw(&self, side: usize, guide_dropout: f64, tint: f64, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
             if drawn.1.side() >= side {
@@ -163,7 +163,7 @@ impl Dataset {
             sample.passes = mixed(&sample.passes, &other, rng);
         }
         drop_guides(&mut sample.passes, guide_dropout, rng);
-        let augment = Augment::draw(rng);
+        let augment = Augment::draw(rng).tinted(tint, rng);
         Sample {
             passes: augment.passes(&sample.passes),
             reference: augment.passes(&sample.reference),
@@ -343,7 +343,7 @@ mod tests {
         let mut rng = Rng::new(1, 0);
         let mut met = BTreeSet::new();
         for _ in 0..64 {
-            let sample = data.draw(8, 0.0, &mut rng);
+            let sample = data.draw(8, 0.0, 0.0, &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             let values: BTreeSet<u32> = depth.iter().map(|v| *v as u32).collect();
             // All passes of a pixel come from one render; exposure alone may scale radiance.
@@ -365,7 +365,7 @@ mod tests {
         for _ in 0..400 {
             let side = data.draw_side(16, 8, &mut rng);
             sides[[8, 16].iter().position(|s| *s == side).expect("a multiple of 8")] += 1;
-            let sample = data.draw(side, 0.0, &mut rng);
+            let sample = data.draw(side, 0.0, 0.0, &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             assert_eq!(depth.len(), side * side);
             assert!(side == 8 || depth[0] == 2.0, "a frame of 12x12 holds no crop of 16x16");

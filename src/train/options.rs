@@ -43,6 +43,9 @@ pub struct TrainOptions {
     /// [`Denoiser::dispensable`](crate::models::Denoiser::dispensable).
     #[serde(default)]
     pub guide_dropout: f64,
+    /// Share of the crops in coloured light, see [`Augment::tinted`](crate::augment::Augment::tinted).
+    #[serde(default)]
+    pub tint: f64,
     /// How gradients become updates.
     #[serde(default)]
     pub optimizer: Rule,
@@ -111,8 +114,10 @@ impl TrainOptions {
             let reason = "cannot do without its guides; leave it out";
             return refuse("guide_dropout", format!("{name} {reason}"));
         }
-        if !(0.0..=1.0).contains(&self.guide_dropout) {
-            return refuse("guide_dropout", format!("{}: must be from 0 to 1", self.guide_dropout));
+        for (setting, share) in [("guide_dropout", self.guide_dropout), ("tint", self.tint)] {
+            if !(0.0..=1.0).contains(&share) {
+                return refuse(setting, format!("{share}: must be from 0 to 1"));
+            }
         }
         if !network.makes_radiance() && self.loss.needs_radiance() {
             let reason = "makes no radiance that a display would show; take geomean";

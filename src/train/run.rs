@@ -221,7 +221,7 @@ fn draw(dataset: &Dataset, options: &TrainOptions, multiple: usize, step: usize)
     let rng = &mut Rng::new(options.seed, 1 + step as u64);
     let side = dataset.draw_side(options.patch, multiple, rng);
     let (count, seed) = (options.batch * options.patch.pow(2) / side.pow(2), rng.next_u64());
-    let crop = |crop| dataset.draw(side, options.guide_dropout, &mut Rng::new(seed, crop));
+    let crop = |crop| dataset.draw(side, options.guide_dropout, options.tint, &mut Rng::new(seed, crop));
     (0..count as u64).into_par_iter().map(crop).collect()
 }
 
@@ -332,6 +332,7 @@ fn facts(options: &TrainOptions, row: &log::LogRow) -> Facts {
         loss: options.loss.to_string(),
         raw_references: options.raw_references,
         guide_dropout: options.guide_dropout,
+        tint: options.tint,
         optimizer: options.optimizer.to_string(),
         weight_decay: options.weight_decay,
         precision: Some(options.precision),
