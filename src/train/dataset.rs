@@ -83,6 +83,15 @@ impl Values {
     }
 }
 
+/// How many of the crops are changed beyond what every crop may be; none by default.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Shares {
+    /// Of crops that lack guides, 0 to 1.
+    pub guide_dropout: f64,
+    /// Of crops in coloured light, 0 to 1; see [`Augment::tinted`].
+    pub tint: f64,
+}
+
 impl Dataset {
     /// Decodes every pair: of the noisy frame the `passes` that must be there and those that may, of the
     /// reference the `targets`, and if `raw_references` also the reference before it was denoised. Frames
@@ -145,9 +154,8 @@ impl Dataset {
     /// proportion to their pixels, and never where they are too small. Where other renders of the frame have
     /// as many samples, each pixel comes from one of two renders: Cycles draws the samples of each pixel
     /// independently, so the mixture is a render with a seed of its own, and no network can learn the noise
-    /// of the stored renders by heart. `guide_dropout` is the share of crops that lack guides, `tint` that of
-    /// those in coloured light. The dataset must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
-    pub fn draw(&self, side: usize, guide_dropout: f64, tint: f64, rng: &mut Rng) -> Sample {
+    /// of the stored renders by heart. The dataset must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
+    pub fn draw(&self, side: usize, shares: Shares, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
             if drawn.1.side() >= side {
@@ -162,8 +170,8 @@ impl Dataset {
             let other = other.passes(&other.passes, (x, y), (side, side));
             sample.passes = mixed(&sample.passes, &other, rng);
         }
-        drop_guides(&mut sample.passes, guide_dropout, rng);
-        let augment = Augment::draw(rng).tinted(tint, rng);
+        drop_guides(&mut sample.passes, shares.guide_dropout, rng);
+        let augment = Augment::draw(rng).tinted(shares.tint, rng);
         Sample {
             passes: augment.passes(&sample.passes),
             reference: augment.passes(&sample.reference),
@@ -343,7 +351,7 @@ mod tests {
         let mut rng = Rng::new(1, 0);
         let mut met = BTreeSet::new();
         for _ in 0..64 {
-            let sample = data.draw(8, 0.0, 0.0, &mut rng);
+            let sample = data.draw(8, Shares::default(), &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             let values: BTreeSet<u32> = depth.iter().map(|v| *v as u32).collect();
             // All passes of a pixel come from one render; exposure alone may scale radiance.
@@ -365,7 +373,7 @@ mod tests {
         for _ in 0..400 {
             let side = data.draw_side(16, 8, &mut rng);
             sides[[8, 16].iter().position(|s| *s == side).expect("a multiple of 8")] += 1;
-            let sample = data.draw(side, 0.0, 0.0, &mut rng);
+            let sample = data.draw(side, Shares::default(), &mut rng);
             let depth = &sample.passes.get(Pass::Depth).unwrap().data;
             assert_eq!(depth.len(), side * side);
             assert!(side == 8 || depth[0] == 2.0, "a frame of 12x12 holds no crop of 16x16");

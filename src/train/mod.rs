@@ -13,7 +13,7 @@ mod options;
 mod run;
 
 pub use checkpoint::{CHECKPOINT, check_size};
-pub use dataset::{Dataset, Sample};
+pub use dataset::{Dataset, Sample, Shares};
 pub use log::LogRow;
 pub use loss::Loss;
 pub use optimizer::{Optimizer, Rule};

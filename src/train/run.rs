@@ -11,7 +11,7 @@ use dfdx::tensor_ops::Backward;
 use rayon::prelude::*;
 
 use super::{
-    Dataset, Optimizer, Sample, TrainOptions,
+    Dataset, Optimizer, Sample, Shares, TrainOptions,
     checkpoint::{self, CHECKPOINT, Progress},
     log,
     options::train_only,
@@ -221,7 +221,8 @@ fn draw(dataset: &Dataset, options: &TrainOptions, multiple: usize, step: usize)
     let rng = &mut Rng::new(options.seed, 1 + step as u64);
     let side = dataset.draw_side(options.patch, multiple, rng);
     let (count, seed) = (options.batch * options.patch.pow(2) / side.pow(2), rng.next_u64());
-    let crop = |crop| dataset.draw(side, options.guide_dropout, options.tint, &mut Rng::new(seed, crop));
+    let shares = Shares { guide_dropout: options.guide_dropout, tint: options.tint };
+    let crop = |crop| dataset.draw(side, shares, &mut Rng::new(seed, crop));
     (0..count as u64).into_par_iter().map(crop).collect()
 }
 
