@@ -333,6 +333,7 @@ impl Kernel for Backward<'_, '_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::exponential::LIMIT;
 
     /// Reproducible values in 0..1.
     fn random(seed: u32, n: usize) -> Vec<f32> {
@@ -366,7 +367,7 @@ mod tests {
             }
             let exponent: f64 =
                 distances.iter().enumerate().map(|(m, d)| f64::from(f.precision[m * n + i]) * d).sum();
-            let weight = (-exponent.min(40.0)).exp();
+            let weight = (-exponent.min(f64::from(LIMIT))).exp();
             sum += weight * f64::from(f.image[c * n + j]);
             total += weight;
         }

@@ -10,8 +10,8 @@
 //! exposure is normalised, and diffuse light too is read (not filtered) as a logarithm: the published
 //! networks knew one studio's exposure; (3) both streams are trained at once, end to end, with any of
 //! `demc train`'s losses; (4) without light passes one stream filters Combined over the texture of the first
-//! surface, with a larger floor; (5) emission and environment are added back unfiltered, and volumes count as specular; (6)
-//! the default width is 32; `--widths 100` is the published one.
+//! surface, with a larger floor; (5) emission and environment are added back unfiltered, and volumes count as
+//! specular; (6) the default width is 32; `--widths 100` is the published one.
 
 use dfdx::{
     tensor::{Cpu, Merge, NoneTape, Tape},

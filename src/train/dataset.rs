@@ -154,7 +154,8 @@ impl Dataset {
     /// proportion to their pixels, and never where they are too small. Where other renders of the frame have
     /// as many samples, each pixel comes from one of two renders: Cycles draws the samples of each pixel
     /// independently, so the mixture is a render with a seed of its own, and no network can learn the noise
-    /// of the stored renders by heart. The dataset must hold a frame of `side` pixels in both directions, as it does for a side from [`Self::draw_side`].
+    /// of the stored renders by heart. The dataset must hold a frame of `side` pixels in both directions, as it
+    /// does for a side from [`Self::draw_side`].
     pub fn draw(&self, side: usize, shares: Shares, rng: &mut Rng) -> Sample {
         let (index, stored) = loop {
             let drawn = self.draw_frame(rng);
