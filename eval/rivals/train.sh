@@ -4,7 +4,8 @@
 # DATA is a folder or a manifest, or several of them with commas between. Learning rates fall over as many
 # steps as fit one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
 # another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
-# the budget keeps the best weights so far in OUT/NAME/best.safetensors.
+# the budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where
+# it was stopped: OUT/NAME.seconds holds the time used so far.
 set -eu
 data=$1 out=$2 seconds=$3
 shift 3
@@ -24,17 +25,26 @@ for name in "$@"; do
     esac
     steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
     average=$(awk "BEGIN { print 1 - 20 / $steps }")
-    # shellcheck disable=SC2046,SC2086 # the options are words, and so are the sets of pairs
-    "$demc" train $(printf -- '--data %s ' $(echo "$data" | tr , ' ')) --out "$out/$name" --model "$name" --threads 1 --seed 1 \
-        --steps "$steps" --every $((steps / 15 > 0 ? steps / 15 : 1)) --average "$average" \
-        --optimizer muon --weight-decay 0.1 --tint 0.25 $more 2>"$out/$name.log" &
+    spent=0
+    if [ -e "$out/$name.seconds" ]; then spent=$(cat "$out/$name.seconds"); fi
+    if [ "$spent" -ge "$seconds" ]; then continue; fi
+    if [ -e "$out/$name/checkpoint.safetensors" ]; then
+        set_up="--resume"
+    else
+        # shellcheck disable=SC2046 # each set of pairs is two words
+        set_up="$(printf -- '--data %s ' $(echo "$data" | tr , ' ')) --model $name --seed 1 --steps $steps \
+            --every $((steps / 15 > 0 ? steps / 15 : 1)) --average $average --optimizer muon --weight-decay 0.1 --tint 0.25 $more"
+    fi
+    # shellcheck disable=SC2086 # the options are words
+    "$demc" train --out "$out/$name" --threads 1 $set_up 2>>"$out/$name.log" &
     pid=$!
-    used=0
+    used=$spent
     while kill -0 $pid 2>/dev/null; do
         sleep 1
         # Processor time, so that a busy machine takes nothing from any of them.
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
-        used=${time:-$used}
+        used=$((spent + ${time:-$((used - spent))}))
+        echo "$used" >"$out/$name.seconds"
         if [ "$used" -ge "$seconds" ]; then kill -INT $pid 2>/dev/null || true; wait $pid || true; break; fi
     done
     wait $pid 2>/dev/null || true
