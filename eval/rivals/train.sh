@@ -25,12 +25,11 @@ for name in "$@"; do
     esac
     steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
     average=$(awk "BEGIN { print 1 - 20 / $steps }")
-    spent=0
-    if [ -e "$out/$name.seconds" ]; then spent=$(cat "$out/$name.seconds"); fi
-    if [ "$spent" -ge "$seconds" ]; then continue; fi
     if [ -e "$out/$name/checkpoint.safetensors" ]; then
-        set_up="--resume"
+        spent=$(cat "$out/$name.seconds") set_up="--resume"
+        if [ "$spent" -ge "$seconds" ]; then continue; fi
     else
+        spent=0
         # shellcheck disable=SC2046 # each set of pairs is two words
         set_up="$(printf -- '--data %s ' $(echo "$data" | tr , ' ')) --model $name --seed 1 --steps $steps \
             --every $((steps / 15 > 0 ? steps / 15 : 1)) --average $average --optimizer muon --weight-decay 0.1 --tint 0.25 $more"
@@ -43,7 +42,7 @@ for name in "$@"; do
         sleep 1
         # Processor time, so that a busy machine takes nothing from any of them.
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
-        used=$((spent + ${time:-$((used - spent))}))
+        if [ -n "$time" ]; then used=$((spent + time)); fi
         echo "$used" >"$out/$name.seconds"
         if [ "$used" -ge "$seconds" ]; then kill -INT $pid 2>/dev/null || true; wait $pid || true; break; fi
     done
