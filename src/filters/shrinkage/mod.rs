@@ -522,6 +522,22 @@ mod tests {
     }
 
     #[test]
+    fn a_lamp_in_a_mirror_is_kept_and_two_sparks_side_by_side_are_not() {
+        // The mirror is a little grey, so no light equals its albedo. The lamp covers four pixels.
+        let lamp = [(40, 30), (41, 30), (40, 31), (41, 31)];
+        let sparks = [(20, 20), (21, 21), (70, 50), (71, 50)];
+        let is_bright = |x, y| lamp.contains(&(x, y)) || sparks.contains(&(x, y));
+        let albedo = planes(|_, x, y| if is_bright(x, y) { 30.0 } else { 0.5 });
+        let (truth, wall) = (planes(picture), noisy(0.02));
+        let (w, _) = SIZE;
+        let radiance = planes(|c, x, y| if is_bright(x, y) { 32.0 } else { wall.channel(c)[y * w + x] });
+        let kept = shrunk(&truth, &radiance, &albedo, Some(64));
+        let at = |(x, y): (usize, usize)| kept.channel(1)[y * w + x];
+        assert!(lamp.iter().all(|pixel| at(*pixel) > 0.9 * 32.0), "{:?}", lamp.map(at));
+        assert!(sparks.iter().all(|pixel| at(*pixel) < 0.1 * 32.0), "{:?}", sparks.map(at));
+    }
+
+    #[test]
     fn tiny_frames_of_any_brightness_stay_finite() {
         for (w, h) in [(1, 1), (1, 9), (9, 1), (2, 3), (4, 4), (5, 17)] {
             for v in [0.0, 1e-30, 1.0, 65504.0] {

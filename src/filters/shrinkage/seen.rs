@@ -11,8 +11,8 @@ use crate::{kernels::logarithm::ln, planes::Planes};
 /// surfaces, and all of it is kept.
 const UNLIKE: f64 = 1e-3;
 
-/// Beyond white, such light may be this many times as bright as in the brightest of the 8 pixels around. What
-/// is brighter counts less.
+/// Beyond white, such light may be this many times as bright as in the second brightest of the 8 pixels around.
+/// What is brighter counts less.
 const ALONE: f32 = 4.0;
 
 /// By how much radiance may differ from the albedo and still be light that is seen directly: a share of the
@@ -130,8 +130,8 @@ impl Seen<'_> {
     }
 
     /// The share of a pixel's light that is seen directly or by way of mirrors, as far as the albedo shows it
-    /// beyond white. One such pixel alone, as in a rough mirror, is as likely to be noise, and its share is
-    /// less.
+    /// beyond white. One such pixel alone, or two side by side, as in a rough mirror, are as likely to be noise,
+    /// and their share is less.
     pub fn beyond_white(&self, x: usize, y: usize) -> f32 {
         let Self { radiance, albedo, film } = self;
         let beyond = |x: usize, y: usize| {
@@ -145,9 +145,11 @@ impl Seen<'_> {
             return 0.0;
         }
         let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
-        let company = others.map(|(x, y)| beyond(x, y).0).fold(0.0, f32::max);
+        let (_, second) = others.map(|(x, y)| beyond(x, y).0).fold((0.0, 0.0), |(first, second), other| {
+            (f32::max(first, other), f32::max(second, first.min(other)))
+        });
         let share = film * light / radiance.channel(c)[y * radiance.width + x];
-        share * (ALONE * company / light).min(1.0)
+        share * (ALONE * second / light).min(1.0)
     }
 }
 
