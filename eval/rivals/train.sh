@@ -11,31 +11,24 @@ data=$1 out=$2 seconds=$3
 shift 3
 [ $# -gt 0 ] || set -- demc demc-nofusion semc kpcn lbf
 demc=${DEMC:-demc}
+# shellcheck source=eval/rivals/recipe.sh
+. "$(dirname "$0")/recipe.sh"
 mkdir -p "$out"
 
 for name in "$@"; do
-    # Steps in 100 seconds, and what was found best in short trials (README.md).
-    case $name in
-        demc) rate=790 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
-        demc-nofusion) rate=830 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
-        semc) rate=380 more="--loss relmse --lr 5e-3:5e-5 --batch 4" ;;
-        kpcn) rate=420 more="--loss smape --lr 2e-3:2e-5 --patch 64 --batch 2" ;;
-        lbf) rate=85 more="--loss both --lr 3e-2:3e-4 --batch 2" ;;
-        *) echo "train.sh: no recipe for $name" >&2; exit 2 ;;
-    esac
+    recipe "$name"
     steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
-    average=$(awk "BEGIN { print 1 - 20 / $steps }")
     if [ -e "$out/$name/checkpoint.safetensors" ]; then
         spent=$(cat "$out/$name.seconds") set_up="--resume"
         if [ "$spent" -ge "$seconds" ]; then continue; fi
     else
         spent=0
         # shellcheck disable=SC2046 # each set of pairs is two words
-        set_up="$(printf -- '--data %s ' $(echo "$data" | tr , ' ')) --model $name --seed 1 --steps $steps \
-            --every $((steps / 15 > 0 ? steps / 15 : 1)) --average $average --optimizer muon --weight-decay 0.1 --tint 0.25 $more"
+        set_up="$(printf -- '--data %s ' $(echo "$data" | tr , ' ')) $(options "$name" "$steps") \
+            --every $((steps / 15 > 0 ? steps / 15 : 1))"
     fi
     # shellcheck disable=SC2086 # the options are words
-    "$demc" train --out "$out/$name" --threads 1 $set_up 2>>"$out/$name.log" &
+    "$demc" train --out "$out/$name" $set_up 2>>"$out/$name.log" &
     pid=$!
     used=$spent
     while kill -0 $pid 2>/dev/null; do

@@ -1,0 +1,25 @@
+# shellcheck shell=sh disable=SC2034 # its variables are for the scripts that read it
+# How the paper's networks and the learned rivals are trained; train.sh and trials.sh read this.
+
+# Sets what was found best for a method in short trials (README.md), and `rate`, its steps in 100 seconds.
+recipe() {
+    tint=0.25
+    case $1 in
+        demc) rate=790 loss=relmse lr=5e-3 patch=128 batch=4 ;;
+        demc-nofusion) rate=830 loss=relmse lr=5e-3 patch=128 batch=4 ;;
+        semc) rate=380 loss=relmse lr=5e-3 patch=128 batch=4 ;;
+        kpcn) rate=420 loss=smape lr=2e-3 patch=64 batch=2 ;;
+        lbf) rate=85 loss=both lr=3e-2 patch=128 batch=2 ;;
+        *) echo "no recipe for $1" >&2; exit 2 ;;
+    esac
+}
+
+# Prints the options of `demc train` for a method, whose recipe is set, and a number of steps.
+options() {
+    awk -v name="$1" -v steps="$2" -v tint="$tint" -v loss="$loss" -v lr="$lr" -v patch="$patch" -v batch="$batch" \
+        'BEGIN {
+            printf "--model %s --steps %d --average %g --lr %g:%g ", name, steps, 1 - 20 / steps, lr, lr / 100
+            printf "--loss %s --patch %d --batch %d --tint %g ", loss, patch, batch, tint
+            print "--optimizer muon --weight-decay 0.1 --seed 1 --threads 1"
+        }'
+}
