@@ -5,6 +5,7 @@ mod common;
 use std::{
     fs,
     sync::{Arc, Barrier},
+    time::{Duration, Instant},
 };
 
 use common::files::{data, read_exr, samples};
@@ -84,6 +85,12 @@ fn a_batch_that_is_stopped_begins_no_other_file() {
     waits.0.wait();
     stopper.stop();
     assert_eq!(fs::read_dir(out.path()).unwrap().count(), 0);
+    // What was read already is not denoised either: the batch's threads end, and let go of the model.
+    let patience = Instant::now() + Duration::from_secs(20);
+    while Arc::strong_count(&waits) > 1 {
+        assert!(Instant::now() < patience, "the batch goes on");
+        std::thread::sleep(Duration::from_millis(10));
+    }
 }
 
 #[test]

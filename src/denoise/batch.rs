@@ -64,9 +64,9 @@ pub(super) struct Shared {
     source: Source,
     pub model: Arc<dyn Denoiser>,
     pub options: Options,
-    /// Locked for reading while a file is being written. Once the user has asked to stop it is locked for
-    /// writing and never released, so that no file is begun any more.
-    pub writing: RwLock<()>,
+    /// Locked for reading while a file is being written, and for writing once the user has asked to stop, to wait
+    /// for such files.
+    writing: RwLock<()>,
     is_stopped: AtomicBool,
 }
 
@@ -164,10 +164,9 @@ impl Batch {
                 Message::LaneEnded => running -= 1,
                 Message::Stop => {
                     shared.is_stopped.store(true, Ordering::Relaxed);
-                    // This waits for files that are being written and lets no other begin. The process may
-                    // then end without waiting for the model.
-                    let gate = shared.writing.write().unwrap_or_else(PoisonError::into_inner);
-                    std::mem::forget(gate);
+                    // This waits for files that are being written. No other begins after it, so the process may
+                    // end without waiting for the model. In one that goes on, each lane ends after its frame.
+                    drop(shared.writing.write().unwrap_or_else(PoisonError::into_inner));
                     while let Ok(message) = messages.try_recv() {
                         if let Message::Ended(job, outcome) = message {
                             report(&job, &outcome);
@@ -218,8 +217,26 @@ impl Shared {
         }
     }
 
-    fn is_stopped(&self) -> bool {
+    /// Whether nothing is to be begun any more.
+    pub fn is_stopped(&self) -> bool {
         self.is_stopped.load(Ordering::Relaxed)
+    }
+
+    /// Writes a file and tells how its job ended; none if the batch has been stopped, or has ended.
+    ///
+    /// Whoever stops the batch waits until both is done.
+    pub fn write(
+        &self,
+        job: Job,
+        write: impl FnOnce(&Job) -> Outcome,
+        ended: &Sender<Message>,
+    ) -> Option<()> {
+        let _writing = self.writing.read().unwrap_or_else(PoisonError::into_inner);
+        if self.is_stopped() {
+            return None;
+        }
+        let outcome = write(&job);
+        ended.send(Message::Ended(job, Box::new(outcome))).ok()
     }
 
     /// Reads a file; none if it is watched and not whole yet, in which case it is waited for.
@@ -238,10 +255,11 @@ impl Shared {
     pub fn take_up_existing(&self, job: &Job, ended: &Sender<Message>) -> bool {
         let existing = if self.options.overwrite { None } else { job::existing(&job.output) };
         let Some(headers) = existing else { return false };
-        let _writing = self.writing.read().unwrap_or_else(PoisonError::into_inner);
-        let taken_up = attempt(&job.output, || job::take_up(&headers, &self.options));
-        let outcome = taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped);
-        let _ = ended.send(Message::Ended(job.clone(), Box::new(outcome)));
+        let take_up = |job: &Job| {
+            let taken_up = attempt(&job.output, || job::take_up(&headers, &self.options));
+            taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped)
+        };
+        let _ = self.write(job.clone(), take_up, ended);
         true
     }
 }

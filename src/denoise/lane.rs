@@ -4,7 +4,7 @@
 use std::{
     path::{Path, PathBuf},
     sync::{
-        Arc, PoisonError,
+        Arc,
         mpsc::{Receiver, Sender, SyncSender, sync_channel},
     },
     thread,
@@ -166,6 +166,9 @@ impl Lane {
         let (model, reach) = (&**model, self.reach());
         let mut window = Window::new(reach);
         for loaded in frames {
+            if self.shared.is_stopped() {
+                return;
+            }
             let (job, denoised) = match loaded {
                 Loaded::Frame(job, frame) => {
                     let denoise = |frame| {
@@ -208,17 +211,18 @@ impl Lane {
     fn store_all(&self, frames: &Receiver<(Job, Views<Denoised>)>) {
         let options = &self.shared.options;
         for (job, denoised) in frames {
-            let stored = {
-                let _writing = self.shared.writing.read().unwrap_or_else(PoisonError::into_inner);
-                attempt(&job.input, || {
+            let store = |job: &Job| {
+                let stored = attempt(&job.input, || {
                     let (frame, report) =
                         self.on_own_threads(|| job::insert(denoised, &job.output, options))?;
                     frame.write(&job.output)?;
                     Ok::<_, Error>(report)
-                })
+                });
+                stored.map_or_else(Outcome::Failed, Outcome::Done)
             };
-            let outcome = stored.map_or_else(Outcome::Failed, Outcome::Done);
-            let _ = self.end(job, outcome);
+            if self.shared.write(job, store, &self.ended).is_none() {
+                return;
+            }
         }
     }
 }
