@@ -5,11 +5,11 @@
 recipe() {
     tint=0.25
     case $1 in
-        demc) rate=790 loss=relmse lr=5e-3 patch=128 batch=4 ;;
-        demc-nofusion) rate=830 loss=relmse lr=5e-3 patch=128 batch=4 ;;
-        semc) rate=380 loss=relmse lr=5e-3 patch=128 batch=4 ;;
-        kpcn) rate=420 loss=smape lr=2e-3 patch=64 batch=2 ;;
-        lbf) rate=85 loss=both lr=3e-2 patch=128 batch=2 ;;
+        demc) rate=770 loss=relmse lr=5e-3 patch=64 batch=16 ;;
+        demc-nofusion) rate=830 loss=relmse lr=5e-3 patch=64 batch=16 ;;
+        semc) rate=370 loss=relmse lr=5e-3 patch=64 batch=16 ;;
+        kpcn) rate=250 loss=smape lr=2e-3 patch=32 batch=8 ;;
+        lbf) rate=350 loss=both lr=3e-2 patch=128 batch=1 ;;
         *) echo "no recipe for $1" >&2; exit 2 ;;
     esac
 }
