@@ -1,6 +1,8 @@
 # shellcheck shell=sh disable=SC2034 # its variables are for the scripts that read it
 # How the paper's networks and the learned rivals are trained; train.sh and trials.sh read this.
 
+methods="demc demc-nofusion semc kpcn lbf"
+
 # Sets what was found best for a method in short trials (README.md), and `rate`, its steps in 100 seconds.
 recipe() {
     tint=0.25

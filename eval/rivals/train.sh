@@ -9,10 +9,11 @@
 set -eu
 data=$1 out=$2 seconds=$3
 shift 3
-[ $# -gt 0 ] || set -- demc demc-nofusion semc kpcn lbf
 demc=${DEMC:-demc}
 # shellcheck source=eval/rivals/recipe.sh
 . "$(dirname "$0")/recipe.sh"
+# shellcheck disable=SC2086 # the methods are words
+[ $# -gt 0 ] || set -- $methods
 mkdir -p "$out"
 
 for name in "$@"; do

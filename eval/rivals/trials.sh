@@ -1,17 +1,18 @@
 #!/bin/sh
-# Tries the same seven settings with every learned method, for the same processor time each:
+# Tries the same seven settings with every learned method, as far as it has them, for about the same time each:
 #   eval/rivals/trials.sh DATA HELD_OUT OUT SECONDS [NAME...]
 # DATA and HELD_OUT are folders or manifests of pairs. The settings are the recipe as it is; a learning rate 2.5
 # times as large, or as small; twice or half as many crops a step; crops of half the size, as many pixels of them;
-# no coloured light. Steps are as many as the recipe makes in SECONDS (SPEED as in train.sh), fewer of larger
-# ones. Writes OUT/trials.csv; trials that are in it already are not made again.
+# no coloured light. Steps are as many as the recipe makes in SECONDS (SPEED as in train.sh), half as many of
+# twice the crops. Writes OUT/trials.csv; trials that are in it already are not made again.
 set -eu
 data=$1 held_out=$2 out=$3 seconds=$4
 shift 4
-[ $# -gt 0 ] || set -- demc demc-nofusion semc kpcn lbf
 demc=${DEMC:-demc}
 # shellcheck source=eval/rivals/recipe.sh
 . "$(dirname "$0")/recipe.sh"
+# shellcheck disable=SC2086 # the methods are words
+[ $# -gt 0 ] || set -- $methods
 mkdir -p "$out"
 table=$out/trials.csv
 [ -e "$table" ] || echo "model,trial,lr,patch,batch,tint,steps,processor_seconds,relmse,ssim" >"$table"
@@ -31,6 +32,8 @@ for name in "$@"; do
             smaller-crops) patch=$((patch / 2)) batch=$((batch * 4)) ;;
             no-tint) tint=0 ;;
         esac
+        # There are no crops of less than 32x32, nor half ones.
+        if [ "$patch" -lt 32 ] || [ "$batch" -lt 1 ]; then continue; fi
         steps=$(compute "int($rate * $seconds / 100 * ${SPEED:-1})")
         run=$out/$name-$trial
         rm -rf "$run"
