@@ -2,7 +2,7 @@
 
     python export_passes.py SCENE.blend --out DIR           with bpy from PyPI
     blender -b SCENE.blend -P export_passes.py -- --out DIR in Blender
-    (run from Blender's text editor, it renders the open scene into `demc` beside the .blend)
+    (opened and run in Blender's text editor, it renders the open scene into `demc` beside the .blend)
 
 Writes <scene>_<spp>spp.exr and <scene>_ref.exr, with the frame before the extension where --frames
 is given. Each file's header tells what it was made with, so that a rerun makes what is missing and
@@ -18,7 +18,10 @@ import traceback
 
 import bpy
 
-sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
+_here = os.path.dirname(os.path.abspath(bpy.path.abspath(__file__)))
+if not os.path.isdir(_here):  # Blender's text editor calls the script a file below the .blend
+    _here = os.path.dirname(bpy.path.abspath(bpy.data.texts[os.path.basename(__file__)].filepath))
+sys.path.insert(0, _here)
 
 from demc_blender import command_line as cl
 from demc_blender import exr, names, picking, rendering

@@ -31,8 +31,7 @@ const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 /// # Errors
 /// The pattern wants a number, and the frame has none.
 pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
-    let text = pattern.to_string_lossy();
-    let Some((head, width, tail)) = placeholder(&text) else { return Ok(pattern.into()) };
+    let Some((head, width, tail)) = placeholder(pattern) else { return Ok(pattern.into()) };
     let Some(number) = frame_number(frame) else {
         let pattern = pattern.display();
         let why = format!("its name ends in no number to put into {pattern}; rename it, or name one file");
@@ -40,24 +39,32 @@ pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
     };
     // As Blender writes it: the width is that of the digits, whatever the sign.
     let sign = if number < 0 { "-" } else { "" };
-    Ok(format!("{head}{sign}{:0width$}{tail}", number.unsigned_abs()).into())
+    Ok(pattern.with_file_name(format!("{head}{sign}{:0width$}{tail}", number.unsigned_abs())))
 }
 
 /// Whether a pattern names another file for each frame.
 pub fn has_number(pattern: &Path) -> bool {
-    placeholder(&pattern.to_string_lossy()).is_some()
+    placeholder(pattern).is_some()
 }
 
-/// What stands before the place of the number, its least width, and what stands behind.
-fn placeholder(pattern: &str) -> Option<(&str, usize, &str)> {
-    if let Some(start) = pattern.rfind('#') {
-        let head = pattern[..=start].trim_end_matches('#');
-        return Some((head, start + 1 - head.len(), &pattern[start + 1..]));
-    }
-    let (head, rest) = pattern.rsplit_once('%')?;
-    let (width, tail) = rest.split_once('d')?;
-    let width = if width.is_empty() { Some(1) } else { width.parse().ok().filter(|width| *width < 20) };
-    Some((head, width?, tail))
+/// What stands in a pattern's last part before the place of the number, its least width, and what stands behind;
+/// none where a file has the pattern for its name.
+fn placeholder(pattern: &Path) -> Option<(String, usize, String)> {
+    let name = pattern.file_name()?.to_string_lossy();
+    let (head, width, tail) = match name.rfind('#') {
+        Some(last) => {
+            let head = name[..=last].trim_end_matches('#');
+            (head, last + 1 - head.len(), &name[last + 1..])
+        }
+        None => {
+            let (head, rest) = name.rsplit_once('%')?;
+            let (width, tail) = rest.split_once('d')?;
+            let width =
+                if width.is_empty() { Some(1) } else { width.parse().ok().filter(|width| *width < 20) };
+            (head, width?, tail)
+        }
+    };
+    (!pattern.is_file()).then(|| (head.into(), width, tail.into()))
 }
 
 impl Sources {
@@ -115,7 +122,7 @@ fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<(Layer,
     }
     let layer = layers.swap_remove(own_view);
     let mut found = passes::read_layer(frame, &layer, &[pass])?;
-    set.check_same_pixels(&found)?;
+    set.check_same_pixels(&found, &format!("its {pass} in"))?;
     let planes = found.remove(pass).expect("the layer holds it");
     Ok((layer, planes))
 }
@@ -137,6 +144,11 @@ mod tests {
         assert_eq!(named("rgb.-0003.exr", "albedo.####.exr").unwrap(), "albedo.-0003.exr");
         assert_eq!(named("rgb.exr", "albedo.exr").unwrap(), "albedo.exr");
         assert_eq!(named("rgb.exr", "100%.exr").unwrap(), "100%.exr");
+        assert_eq!(named("rgb.17.exr", "cut#3/50%done/albedo.#.exr").unwrap(), "cut#3/50%done/albedo.17.exr");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("take#2.exr");
+        std::fs::write(&path, "").unwrap();
+        assert!(beside(Path::new("rgb.17.exr"), &path).unwrap() == path && !has_number(&path));
         assert!(named("rgb.exr", "albedo.####.exr").unwrap_err().to_string().contains("no number"));
         assert!(has_number(Path::new("a.#.exr")) && !has_number(Path::new("a.exr")));
     }

@@ -6,7 +6,7 @@ mod common;
 use std::{fs, path::Path, sync::OnceLock};
 
 use assert_cmd::Command;
-use common::files::{data, write_render};
+use common::files::{data, deep_file, write_render};
 use demc::{frame::Frame, passes};
 use proptest::prelude::*;
 use tempfile::TempDir;
@@ -120,37 +120,6 @@ fn a_view_layer_that_is_not_there() {
 fn deep_data() {
     let (_dir, path) = file(&deep_file());
     fails_with(&path, &[], 1, &["deep data", "without deep output"]);
-}
-
-/// The header of a 2x1 deep scan-line image (OpenEXR file layout, `type` `deepscanline`).
-fn deep_file() -> Vec<u8> {
-    const DEEP: u32 = 1 << 11;
-    let mut bytes = vec![0x76, 0x2f, 0x31, 0x01];
-    bytes.extend((2u32 | DEEP).to_le_bytes());
-    let mut attribute = |name: &str, kind: &str, value: &[u8]| {
-        bytes.extend(name.bytes().chain([0]).chain(kind.bytes()).chain([0]));
-        bytes.extend((value.len() as i32).to_le_bytes());
-        bytes.extend(value);
-    };
-    let ints = |values: &[i32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-    let float = |v: f32| v.to_le_bytes();
-    let channel = [b"Z\0".as_slice(), &ints(&[2, 0, 1, 1]), &[0]].concat();
-    attribute("channels", "chlist", &channel);
-    attribute("chunkCount", "int", &ints(&[1]));
-    attribute("compression", "compression", &[2]);
-    attribute("dataWindow", "box2i", &ints(&[0, 0, 1, 0]));
-    attribute("displayWindow", "box2i", &ints(&[0, 0, 1, 0]));
-    attribute("lineOrder", "lineOrder", &[0]);
-    attribute("maxSamplesPerPixel", "int", &ints(&[1]));
-    attribute("name", "string", b"deep");
-    attribute("pixelAspectRatio", "float", &float(1.0));
-    attribute("screenWindowCenter", "v2f", &[0; 8]);
-    attribute("screenWindowWidth", "float", &float(1.0));
-    attribute("type", "string", b"deepscanline");
-    attribute("version", "int", &ints(&[1]));
-    bytes.push(0);
-    bytes.extend([0u8; 64]);
-    bytes
 }
 
 #[test]

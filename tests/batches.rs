@@ -290,12 +290,16 @@ fn a_render_that_is_made_again_is_denoised_again_with_overwrite() {
 #[cfg(unix)]
 fn ctrl_c_ends_a_watch_soon() {
     let mut watch = Watch::start("--watch --jobs 2");
+    // One that is broken is tried first, and is told in the end.
+    fs::write(watch.path("cut.exr"), &fs::read(data("blender5.exr")).unwrap()[..5000]).unwrap();
+    std::thread::sleep(Duration::from_millis(2500));
     write_render(&watch.path("shot.0001.exr"), 8, 6, |_, _| 0.25);
     assert!(watch.next().starts_with("[1] "));
     let start = Instant::now();
     Process::new("kill").args(["-INT", &watch.child.id().to_string()]).status().unwrap();
-    let (code, rest, ..) = watch.end();
-    assert_eq!((code, rest.as_str()), (Some(130), "1 denoised"));
+    let (code, rest, errors, _) = watch.end();
+    assert_eq!((code, rest.as_str()), (Some(130), "1 denoised, 1 failed"));
+    assert!(errors.contains("cut.exr: is truncated"), "{errors}");
     assert!(start.elapsed() < Duration::from_secs(5));
 }
 

@@ -49,7 +49,8 @@ impl Shot {
     }
 
     fn out(&self) -> PathBuf {
-        self.folder.path().join("out")
+        // Blender 5 takes words in braces for variables.
+        self.folder.path().join("out of {version}")
     }
 
     fn script(&self, script: &Path) -> Command {
@@ -104,6 +105,19 @@ impl Shot {
 
 fn size(set: &PassSet) -> (usize, usize) {
     (set.width, set.height)
+}
+
+#[test]
+fn it_runs_in_the_text_editor() {
+    for python in python::blenders() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut command = Command::new(&python);
+        command.env("PYTHONDONTWRITEBYTECODE", "1").arg(snippet("in_text_editor.py"));
+        let output = command.arg(scripts().join("export_passes.py")).arg(folder.path()).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stdout);
+        let trouble = String::from_utf8_lossy(&output.stderr);
+        assert!(said.contains("usage: export_passes.py"), "{said}{trouble}");
+    }
 }
 
 #[test]
@@ -289,6 +303,6 @@ fn mistyped_places_are_told_in_a_line() {
         assert!(said.contains("'a/b' is no file name: leave out folders"), "{said}");
         fs::write(shot.out(), "a file").unwrap();
         let said = shot.refuse("", 1);
-        assert!(said.contains("out is a file, not a folder (--out)"), "{said}");
+        assert!(said.contains("out of {version} is a file, not a folder (--out)"), "{said}");
     }
 }

@@ -119,6 +119,15 @@ fn tiles_give_the_same_bits_as_the_whole_frame() {
                 "{name}, {tile}"
             );
         }
+        // Here some tiles see all of the frame, and others come after them.
+        let small = random_passes(63, 65, 12);
+        let whole = network.infer(&small, None).expect("all passes are there");
+        for tile in [16, 40] {
+            assert!(
+                network.infer(&small, Some(tile)).expect("all passes are there") == whole,
+                "{name}, {tile}"
+            );
+        }
     }
 }
 

@@ -265,6 +265,8 @@ fn guides_come_from_files_of_their_own() {
     assert!(several.contains("for several frames"), "{several}");
     // Another size.
     common::files::write_render(&path("albedo.0007.exr"), 8, 8, |_, _| 0.5);
+    let alone = said(&frame, &["--temporal", "--albedo", path("rgb.0007.exr").to_str().unwrap()]);
+    assert!(alone.contains("one file for several frames"), "neighbours have guides of their own: {alone}");
     let other = said(&frame, &["--albedo", &albedo, "--normal", &normal]);
     assert!(other.contains("8x8") && other.contains("128x128"), "{other}");
 }

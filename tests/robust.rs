@@ -3,7 +3,11 @@
 
 mod common;
 
-use std::{fs, path::Path};
+use std::{
+    fs,
+    path::Path,
+    time::{Duration, SystemTime},
+};
 
 use common::{demc, files::data};
 use exr::prelude::*;
@@ -134,6 +138,9 @@ fn leftovers_of_killed_runs_are_removed_and_what_is_being_written_is_not() {
     let out = dir.path().join("out");
     fs::create_dir(&out).unwrap();
     fs::write(out.join(".demc-dead00.tmp"), "half a frame").unwrap();
+    let dead = fs::File::options().write(true).open(out.join(".demc-dead00.tmp")).unwrap();
+    dead.set_modified(SystemTime::now() - Duration::from_secs(48 * 3600)).unwrap();
+    drop(dead);
     let living = fs::File::create(out.join(".demc-living.tmp")).unwrap();
     living.lock().unwrap();
     let mut command = demc();

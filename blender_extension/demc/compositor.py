@@ -9,8 +9,11 @@ _MARK = "demc"
 
 def wire(scene, picture):
     """Adds an image node with the result, a Split node and a viewer. Nodes of the user's stay as they are;
-    those that an earlier result brought make room for the new ones. Returns the tree."""
+    those that an earlier result brought make room for the new ones. Returns the tree, or None where the user
+    has nodes that are turned off."""
     tree = _tree(scene)
+    if tree is None:
+        return None
     for node in [node for node in tree.nodes if node.get(_MARK)]:
         tree.nodes.remove(node)
     noisy = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
@@ -43,6 +46,8 @@ def _tree(scene):
             scene.compositing_node_group = _group(scene)
         return scene.compositing_node_group
     if not scene.use_nodes:
+        if scene.node_tree is not None:
+            return None
         scene.use_nodes = True
     return scene.node_tree
 

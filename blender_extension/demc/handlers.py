@@ -9,20 +9,34 @@ from bpy.app.handlers import persistent
 from . import jobs, outcome, panel, passes, plans
 
 _LOOK_SECONDS = 0.3
+# No operator is at hand to take a key.
+_CANCELS = "The X in Render Properties > demc Denoiser"
 
-# Files that the render under way has written.
+# Files of the animation that the render under way has written.
 _written = []
+# When files of the current frame were written that were there before it: a single render that is written has
+# another name, and leaves them as they are.
+_before = {}
 
 
 @persistent
-def _on_init(_scene, _depsgraph=None):
+def _on_init(scene, _depsgraph=None):
     _written.clear()
+    _before.clear()
+    _before.update((path, _written_at(path)) for path in plans.frame_files(scene, scene.frame_current))
 
 
 @persistent
 def _on_write(scene, _depsgraph=None):
-    if scene.demc.after_render:
-        _written.append(bpy.path.abspath(scene.render.frame_path(frame=scene.frame_current)))
+    if not scene.demc.after_render:
+        return
+    for path in plans.frame_files(scene, scene.frame_current):
+        if scene.render.is_movie_format or _written_at(path) not in (None, _before.get(path)):
+            _written.append(path)
+
+
+def _written_at(path):
+    return os.stat(path).st_mtime_ns if os.path.isfile(path) else None
 
 
 @persistent
@@ -52,7 +66,8 @@ def _begin(scene, written):
         if written and not frames:
             lack = passes.missing(scene, frames=True)
             raise jobs.JobError(lack[0].text if lack else "The frames are no EXR files")
-        jobs.begin(plans.of_files(scene, frames) if frames else plans.of_render(scene))
+        # Results of these frames that are there are of a render before.
+        jobs.begin(plans.of_files(scene, frames, overwrite=True) if frames else plans.of_render(scene))
     except jobs.JobError as error:
         jobs.refuse(str(error))
         print(f"demc: {error}")
@@ -67,7 +82,7 @@ def _begin_later(name, written):
     scene = bpy.data.scenes.get(name)
     if scene is not None and _begin(scene, written):
         bpy.app.timers.register(_follow, first_interval=_LOOK_SECONDS)
-    panel.show_progress(jobs.current())
+    panel.show_progress(jobs.current(), _CANCELS)
     return None
 
 
@@ -77,7 +92,7 @@ def _follow():
     if job is None:
         return None
     runs = job.poll()
-    panel.show_progress(job)
+    panel.show_progress(job, _CANCELS)
     if runs:
         return _LOOK_SECONDS
     _finish(job)

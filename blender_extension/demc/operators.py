@@ -45,7 +45,7 @@ class _Denoise:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         runs = self._job.poll()
-        panel.show_progress(self._job)
+        panel.show_progress(self._job, "Esc")
         if runs:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)
@@ -55,7 +55,7 @@ class _Denoise:
         """Called where Blender takes the operator away: its window closes, or another file is opened."""
         context.window_manager.event_timer_remove(self._timer)
         self._job.kill()
-        panel.show_progress(self._job)
+        panel.show_progress(self._job, "Esc")
 
     def _begin(self, context):
         try:

@@ -25,7 +25,8 @@ def take(job):
     # Radiance, as the render: without this, Blender would show it as if it were data.
     image.colorspace_settings.is_data = False
     if scene is not None and scene.demc.use_compositor:
-        compositor.wire(scene, image)
+        if compositor.wire(scene, image) is None:
+            job.notes.append("the compositor's Use Nodes is off: the result is not wired into it")
     _show(image)
     return image
 

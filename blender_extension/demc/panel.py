@@ -64,12 +64,12 @@ class DEMC_PT_options(bpy.types.Panel):
             layout.prop(settings, "frame_last")
 
 
-def show_progress(job):
+def show_progress(job, cancels):
     """Says in the status bar how far a job is while it runs, and has the panel drawn anew. job: may be
-    None."""
+    None. cancels: what ends it."""
     runs = job is not None and job.state == jobs.RUNNING
     for workspace in bpy.data.workspaces:
-        workspace.status_text_set(f"demc denoises {_how_far(job)}. Esc cancels" if runs else None)
+        workspace.status_text_set(f"demc denoises {_how_far(job)}. {cancels} cancels" if runs else None)
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PROPERTIES":

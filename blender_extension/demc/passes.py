@@ -22,18 +22,25 @@ def is_multilayer(scene):
     return scene.render.image_settings.file_format == "OPEN_EXR_MULTILAYER"
 
 
-def missing(scene, frames=False):
+def missing(scene, frames=False, still=False):
     """What a render of the scene would lack for demc, most important first. `frames` asks for what frames in
-    files need as well."""
+    files need as well, `still` for what a render in memory needs alone."""
+    is_sequence = scene.demc.use_temporal and not still
     lacks = _of_scene(scene)
     if hasattr(scene, "cycles"):
-        for layer in rendered_layers(scene):
-            lacks += _of_layer(scene, layer)
-    if scene.demc.use_temporal:
+        for layer in _read_layers(scene):
+            lacks += _of_layer(layer, is_sequence)
+    if is_sequence:
         lacks += _of_sequence(scene)
-    if frames or scene.demc.use_temporal:
+    if frames or is_sequence:
         lacks += _of_output(scene)
     return lacks
+
+
+def _read_layers(scene):
+    """The view layers that demc needs passes of: the one that was chosen, or all."""
+    rendered = rendered_layers(scene)
+    return [layer for layer in rendered if layer.name == scene.demc.view_layer] or rendered
 
 
 def prepare(scene):
@@ -64,10 +71,12 @@ def prepare(scene):
 def _prepare_output(scene, put):
     settings = scene.render.image_settings
     if not is_multilayer(scene):
-        # Blender 5 offers the format for this media type alone.
+        # Blender 5 offers the format for this media type alone, and chooses it then.
+        words = "frames are saved as OpenEXR MultiLayer"
         if hasattr(settings, "media_type"):
-            settings.media_type = "MULTI_LAYER_IMAGE"
-        put(settings, "file_format", "OPEN_EXR_MULTILAYER", "frames are saved as OpenEXR MultiLayer")
+            put(settings, "media_type", "MULTI_LAYER_IMAGE", words)
+        else:
+            put(settings, "file_format", "OPEN_EXR_MULTILAYER", words)
     if settings.exr_codec not in _LOSSLESS:
         put(settings, "exr_codec", "ZIP", "files are compressed without loss (ZIP)")
 
@@ -94,14 +103,14 @@ def _has_strips(scene):
     return editor is not None and len(getattr(editor, "strips", None) or getattr(editor, "sequences", ())) > 0
 
 
-def _of_layer(scene, layer):
+def _of_layer(layer, is_sequence):
     lacks = []
     if not layer.use_pass_combined:
         lacks.append(Lack(f"{layer.name} lacks Combined: turn on View Layer > Passes > Data > Combined", True))
     if not layer.cycles.denoising_store_passes:
         lacks.append(Lack(f"{layer.name} lacks albedo and normals: turn on View Layer > Passes > Data > Denoising "
                           "Data", True))
-    if scene.demc.use_temporal and not layer.use_pass_vector:
+    if is_sequence and not layer.use_pass_vector:
         lacks.append(Lack(f"{layer.name} lacks motion: turn on View Layer > Passes > Data > Vector", True))
     return lacks
 

@@ -12,6 +12,14 @@ from .settings import WEIGHTS_FILE
 LAYER = "Denoised"
 _NOTHING = "Nothing is rendered yet: press F12 first"
 _SUFFIX = ".exr"
+# How Denoise This Render saves a render, in the order in which it is set: the media type decides which formats
+# there are, and choosing a format changes what is below it.
+_SAVED_AS = (
+    ("media_type", "MULTI_LAYER_IMAGE"), ("file_format", "OPEN_EXR_MULTILAYER"), ("color_depth", "32"),
+    ("exr_codec", "ZIP"), ("views_format", "MULTIVIEW"),
+    # Blender 5.0 writes no other files with pixels that are not square.
+    ("use_exr_interleave", True),
+)
 
 
 def of_render(scene):
@@ -19,7 +27,7 @@ def of_render(scene):
     render = bpy.data.images.get("Render Result")
     if render is None:
         raise JobError(_NOTHING)
-    _refuse(scene, passes.missing(scene), "the render")
+    _refuse(scene, passes.missing(scene, still=True), "the render")
     scratch = tempfile.mkdtemp(prefix="demc-", dir=bpy.app.tempdir)
     name = os.path.splitext(os.path.basename(bpy.data.filepath))[0] or "render"
     noisy = os.path.join(scratch, f"{name}_{scene.name}_{scene.frame_current:04}{_SUFFIX}".replace(os.sep, "_"))
@@ -53,7 +61,7 @@ def of_range(scene):
     if first > last:
         raise JobError(f"The first frame, {first}, lies behind the last, {last}")
     step = 1 if settings.use_own_range else scene.frame_step
-    wanted = [bpy.path.abspath(scene.render.frame_path(frame=frame)) for frame in range(first, last + 1, step)]
+    wanted = [path for frame in range(first, last + 1, step) for path in frame_files(scene, frame)]
     found = [path for path in wanted if os.path.isfile(path)]
     if not found:
         raise JobError(f"None of the frames {first} to {last} is there, such as {wanted[0]}: render the animation first")
@@ -62,9 +70,19 @@ def of_range(scene):
     return of_files(scene, found)
 
 
-def of_files(scene, paths):
-    """Frames that were rendered to files."""
-    return Job("frames", paths, _output(scene, os.path.dirname(paths[0])), _options_of_files(scene), len(paths))
+def of_files(scene, paths, overwrite=False):
+    """Frames that were rendered to files. `overwrite` makes results anew that are there."""
+    options = _options_of_files(scene, overwrite)
+    return Job("frames", paths, _output(scene, os.path.dirname(paths[0])), options, len(paths))
+
+
+def frame_files(scene, frame):
+    """The files that a frame of the animation is rendered to: one, or one for each eye."""
+    render = scene.render
+    eyes = [""]
+    if render.use_multiview and render.image_settings.views_format == "INDIVIDUAL":
+        eyes = [view.name for view in render.views if view.use]
+    return [bpy.path.abspath(render.frame_path(frame=frame, view=eye)) for eye in eyes]
 
 
 def _refuse(scene, lacks, what):
@@ -102,13 +120,17 @@ def _options(scene):
     return options
 
 
-def _options_of_files(scene):
+def _options_of_files(scene, overwrite=False):
     settings = scene.demc
     options = _options(scene)
+    if settings.use_temporal and settings.light_passes:
+        raise JobError("Temporal leaves light passes as they are: turn off Light Passes or Temporal")
+    if settings.use_temporal and settings.alpha == "denoise":
+        raise JobError("Temporal leaves alpha as it is: set Alpha to Automatic or Keep, or turn off Temporal")
     options += [] if settings.keep_noisy else ["--replace"]
     if settings.use_temporal:
         options += ["--temporal", str(settings.temporal)]
-    if settings.overwrite:
+    if settings.overwrite or overwrite:
         options.append("--overwrite")
     return options
 
@@ -117,25 +139,28 @@ def _save(render, scene, path):
     """Saves a render with all its passes as floats, by settings of a copy: the scene's own stay as they
     are."""
     settings = scene.render.image_settings
-    kept = {}
-
-    def put(name, value):
-        if hasattr(settings, name):
-            kept.setdefault(name, getattr(settings, name))
-            setattr(settings, name, value)
-
+    # All of it before anything is set, since one setting changes others.
+    kept = {name: getattr(settings, name) for name, _ in _SAVED_AS if hasattr(settings, name)}
     try:
-        put("media_type", "MULTI_LAYER_IMAGE")
-        put("file_format", "OPEN_EXR_MULTILAYER")
-        put("color_depth", "32")
-        put("exr_codec", "ZIP")
-        render.save_render(path, scene=scene)
+        for name, value in _SAVED_AS:
+            if name in kept:
+                setattr(settings, name, value)
+        _save_as_set(render, scene, path)
     except RuntimeError as error:
         # Blender has no other way to tell that there is no render.
         if "buffer" in str(error):
             raise JobError(_NOTHING) from None
         raise JobError(f"The render cannot be saved to {path}: {' '.join(str(error).split())}") from None
     finally:
-        # In the order in which they were set: the media type decides which formats there are.
         for name, value in kept.items():
             setattr(settings, name, value)
+
+
+def _save_as_set(render, scene, path):
+    try:
+        render.save_render(path, scene=scene)
+    except RuntimeError:
+        # The first time, Blender goes by the views format that the scene had when it was rendered.
+        if not scene.render.use_multiview:
+            raise
+        render.save_render(path, scene=scene)

@@ -90,7 +90,8 @@ def _plain(channels, layer):
     found = {}
     for name in sorted(channels):
         parts = name.split(".")
-        if layer in parts[:-1] and parts[-1] in "RGBA":
+        # Before it stands the view layer, whose own name may be the same.
+        if layer in parts[1:-1] and parts[-1] in "RGBA":
             found.setdefault(parts[-1], channels[name])
     if not {"R", "G", "B"} <= found.keys():
         raise ValueError(f"no layer {layer} among {', '.join(sorted(channels))}")

@@ -8,6 +8,7 @@ import os
 import pathlib
 import sys
 import tempfile
+import time
 import unittest
 
 ARCHIVE = pathlib.Path(sys.argv.pop(1)).resolve()
@@ -104,6 +105,76 @@ class Extension(unittest.TestCase):
         bpy.ops.demc.denoise_render()
         self.assertEqual(len(tree.nodes), count)
 
+    def image_settings(self):
+        """How the scene says that images are saved, all of it."""
+        settings = self.scene.render.image_settings
+        names = [p.identifier for p in settings.bl_rna.properties if p.type in ("ENUM", "INT", "BOOLEAN", "FLOAT")]
+        return {name: getattr(settings, name) for name in names}
+
+    def test_this_render_leaves_how_images_are_saved_as_it_is(self):
+        self.prepared()
+        bpy.ops.render.render()
+        settings = self.scene.render.image_settings
+        for media, kind, depth in (("IMAGE", "PNG", "8"), ("IMAGE", "JPEG", "8"), ("IMAGE", "OPEN_EXR", "16"),
+                                   ("VIDEO", "FFMPEG", "8"), ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "16")):
+            if hasattr(settings, "media_type"):
+                settings.media_type = media
+            settings.file_format, settings.color_depth = kind, depth
+            if "EXR" in kind:
+                settings.exr_codec = "DWAB"
+            before = self.image_settings()
+            self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"}, kind)
+            self.assertEqual(self.image_settings(), before)
+
+    def test_pixels_that_are_not_square(self):
+        self.prepared()
+        self.scene.render.pixel_aspect_x = 2.0
+        bpy.ops.render.render()
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+
+    def test_both_eyes(self):
+        self.prepared()
+        self.scene.render.use_multiview = True
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        eyes = [f"shot_000{frame}_{eye}.exr" for frame in (1, 2) for eye in "LR"]
+        self.assertEqual(self.clean(), eyes)
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
+        self.assertEqual(self.scene.render.image_settings.views_format, "INDIVIDUAL")
+
+    def test_a_single_render_needs_nothing_that_frames_need(self):
+        self.prepared()
+        self.scene.demc.use_temporal = self.scene.render.use_motion_blur = True
+        bpy.ops.render.render()
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.scene.view_layers.new("without").cycles.denoising_store_passes = False
+        bpy.ops.render.render()
+        self.refused(bpy.ops.demc.denoise_render, "without lacks albedo")
+        self.scene.demc.view_layer = self.scene.view_layers[0].name
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+
+    def test_what_goes_not_with_temporal_is_said(self):
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.scene.demc.use_temporal = self.scene.demc.light_passes = True
+        self.refused(bpy.ops.demc.denoise_range, "turn off Light Passes or Temporal")
+        self.scene.demc.light_passes, self.scene.demc.alpha = False, "denoise"
+        self.refused(bpy.ops.demc.denoise_range, "set Alpha to")
+
+    def test_a_view_layer_of_the_results_name(self):
+        def picture():
+            bpy.ops.render.render()
+            self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+            return bpy.data.images[f"Denoised {self.scene.name}"].pixels[:]
+
+        self.prepared()
+        self.scene.demc.use_compositor = False
+        usual = picture()
+        self.scene.view_layers[0].name = "Denoised"
+        # Not assertEqual, which would look for hours at how thousands of numbers differ.
+        self.assertTrue(picture() == usual, "the noisy picture is shown")
+
     def test_frames_of_a_range_and_of_a_folder(self):
         self.prepared()
         bpy.ops.render.render(animation=True)
@@ -121,6 +192,39 @@ class Extension(unittest.TestCase):
         self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
         bpy.ops.render.render(animation=True)
         self.assertEqual([name for name in self.clean() if name.startswith("shot_")], ["shot_0001.exr", "shot_0002.exr"])
+
+    def test_a_render_in_a_window_is_followed_by_timers(self):
+        handlers = sys.modules[f"{MODULE}.handlers"]
+        self.prepared()
+        bpy.ops.render.render()
+        self.assertIsNone(handlers._begin_later(self.scene.name, []))
+        while handlers._follow() is not None:
+            time.sleep(0.02)
+        self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
+
+    def test_frames_that_are_rendered_again_are_denoised_again(self):
+        self.prepared()
+        self.scene.demc.after_render = True
+        bpy.ops.render.render(animation=True)
+        results = [pathlib.Path(self.folder, "clean", f"shot_000{frame}.exr") for frame in (1, 2)]
+        before = [result.read_bytes() for result in results]
+        self.scene.cycles.seed += 1
+        bpy.ops.render.render(animation=True)
+        for result, was in zip(results, before):
+            self.assertNotEqual(result.read_bytes(), was)
+
+    def test_a_render_that_is_written_is_no_frame_of_an_animation(self):
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.scene.demc.after_render = True
+        bpy.ops.render.render(write_still=True)
+        self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
+        self.assertFalse([name for name in self.clean() if name.startswith("shot_000")])
+
+    def test_prepare_tells_what_it_did(self):
+        done = sys.modules[f"{MODULE}.passes"].prepare(self.scene)
+        self.assertEqual(done, ["Denoising Data is on", "frames are saved as OpenEXR MultiLayer"])
+        self.assertEqual(sys.modules[f"{MODULE}.passes"].prepare(self.scene), [])
 
     def test_undo_takes_back_what_was_prepared(self):
         def state():

@@ -56,8 +56,9 @@ def trouble_heard():
     if not _chatter:
         return ""
     _flush_c()
-    size = os.fstat(_chatter.fileno()).st_size
-    lines = os.pread(_chatter.fileno(), size, 0).decode(errors="replace").splitlines()
+    # Blender goes on writing where this ends: at the end, as before.
+    os.lseek(_chatter.fileno(), 0, os.SEEK_SET)
+    lines = os.read(_chatter.fileno(), os.fstat(_chatter.fileno()).st_size).decode(errors="replace").splitlines()
     told = [" ".join(line.split()) for line in lines if any(word in line.lower() for word in _TROUBLE)]
     return "; ".join(dict.fromkeys(told[-3:]))
 

@@ -45,9 +45,11 @@ class Ledger:
     def add(self, **row):
         """Adds a row for a file that is there; columns that are not named stay empty."""
         row["sha256"] = _sha256(os.path.join(self.folder, row["file"]))
-        line = ",".join(str(row.get(column, "")) for column in COLUMNS) + "\n"
         with open(self.path, "a", encoding="utf-8", newline="") as file:
-            file.write(("" if file.tell() else ",".join(COLUMNS) + "\n") + line)
+            table = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+            if not file.tell():
+                table.writeheader()
+            table.writerow(row)
 
     def write_manifest(self, pairs):
         """Replaces manifest.csv by these pairs: scene, noisy file, reference, samples."""

@@ -174,7 +174,9 @@ def render_to(scene, path, layer=None, attributes=None):
     os.close(handle)
     os.remove(temporary)
     old = scene.render.filepath
-    scene.render.filepath = temporary
+    # Blender 5 looks for variables in braces, {blend_name} for one.
+    has_variables = bpy.app.version >= (5, 0)
+    scene.render.filepath = temporary.replace("{", "{{").replace("}", "}}") if has_variables else temporary
     command_line.forget_chatter()
     try:
         try:

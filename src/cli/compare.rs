@@ -84,7 +84,7 @@ pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
         let [a, b] = [&image.view_layer, &reference.view_layer];
         warn_line(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
     }
-    image.check_same_pixels(&reference)?;
+    image.check_same_pixels(&reference, "its reference")?;
     let [image, reference] =
         [image, reference].map(|mut set| set.remove(Pass::Combined).expect("it is there"));
     let scores = metrics::score(&image, &reference).map_err(|why| {

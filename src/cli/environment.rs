@@ -9,8 +9,8 @@ use crate::{
     },
 };
 
-/// The most threads that a variable may ask for; more than this cannot be started, and nobody means it.
-const MOST_THREADS: usize = 4096;
+/// The most threads that may be asked for; more than this cannot be started, and nobody means it.
+pub const MOST_THREADS: u16 = 4096;
 
 /// Refuses settings that mean nothing.
 ///
@@ -20,7 +20,7 @@ pub fn check() -> Result<()> {
     for variable in ["RAYON_NUM_THREADS", "RAYON_RS_NUM_CPUS"] {
         let Some(value) = std::env::var_os(variable) else { continue };
         let threads = value.to_str().and_then(|text| text.parse::<usize>().ok());
-        if threads.is_none_or(|threads| threads > MOST_THREADS) {
+        if threads.is_none_or(|threads| threads > MOST_THREADS.into()) {
             return Err(refused(
                 variable,
                 &value.to_string_lossy(),

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::{Error, Result, denoise::Input, testset::is_hidden};
+use crate::{Error, Result, denoise::Input, frame::Frame, testset::is_hidden};
 
 /// What the user's inputs name.
 #[derive(Default)]
@@ -25,7 +25,8 @@ pub struct Search {
     /// Whether the directories in them are searched too, at any depth. Links to directories are not followed,
     /// since the same files would be found twice.
     pub recursive: bool,
-    /// A directory that is left out, where results are written.
+    /// The directory where results are written: it is no part of a search, and those that are in it are no
+    /// inputs, as long as there are others.
     pub except: Option<PathBuf>,
 }
 
@@ -85,7 +86,24 @@ pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
         (fs::canonicalize(file).unwrap_or_else(|_| file.clone()), file.file_name().map(ToOwned::to_owned))
     };
     all.files.retain(|input| seen.insert(identity(input)));
+    if let Some(out) = search.except.as_ref().and_then(|out| fs::canonicalize(out).ok()) {
+        leave_out_results(&mut all.files, &out);
+    }
     Ok(all)
+}
+
+/// Leaves out what demc wrote below the folder of the results, where there are other inputs: `renders/*/*.exr`
+/// names the results in `renders/clean` too, the second time.
+fn leave_out_results(files: &mut Vec<Input>, out: &Path) {
+    let is_below = |file: &Path| {
+        let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        fs::canonicalize(folder).is_ok_and(|folder| folder.starts_with(out))
+    };
+    let is_result = |input: &Input| {
+        is_below(&input.file) && Frame::read_headers(&input.file).is_ok_and(|file| file.is_result())
+    };
+    let (results, others): (Vec<Input>, Vec<Input>) = std::mem::take(files).into_iter().partition(is_result);
+    *files = if others.is_empty() { results } else { others };
 }
 
 /// Whether a path that was found is to be read: a file that is not hidden, or a link whose target is missing,

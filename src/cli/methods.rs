@@ -7,6 +7,7 @@ use std::{
 
 use clap::Args as ClapArgs;
 
+use super::environment::MOST_THREADS;
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::peak_memory;
 use crate::{
@@ -27,7 +28,7 @@ pub struct Args {
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
     pub models: Vec<String>,
     /// Threads for every method [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
     threads: Option<u16>,
     /// View layer to read [default: the one with the most passes]
     #[arg(long, value_name = "NAME")]

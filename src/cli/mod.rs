@@ -125,10 +125,10 @@ fn main_with(Cli { command }: Cli) -> ExitCode {
     }
     let done = catch_unwind(|| environment::check().and_then(|()| run(command)))
         .unwrap_or_else(|panic| Err(Error::Internal(panic_message(&*panic))));
-    done.unwrap_or_else(|error| {
+    lines::end(done.unwrap_or_else(|error| {
         warn_line(&format!("demc: {error}"));
         ExitCode::from(if matches!(error, Error::Usage(_)) { USAGE } else { SOME_FAILED })
-    })
+    }))
 }
 
 fn run(command: Command) -> Result<ExitCode> {

@@ -13,6 +13,7 @@ use std::{
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::environment::MOST_THREADS;
 use super::lines::{ExitCode, warn_line};
 use crate::{
     Error, Result,
@@ -115,8 +116,8 @@ pub struct Args {
     ])]
     resume: bool,
     /// Threads to use; all processors without it
-    #[arg(long)]
-    threads: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
+    threads: Option<u16>,
 }
 
 /// One scene in this many is held out for validation.
@@ -311,7 +312,8 @@ fn stored_options(config: &Path) -> Result<TrainOptions> {
 pub fn run(args: &Args) -> Result<ExitCode> {
     // This thread works too. A step is hundreds of short parallel loops, and handing one over to other
     // threads takes longer than many of them last.
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).use_current_thread();
+    let pool =
+        rayon::ThreadPoolBuilder::new().num_threads(args.threads.map_or(0, usize::from)).use_current_thread();
     pool.build_global().map_err(|e| usage(format!("--threads: {e}")))?;
     let config = args.out.join("config.json");
     let options = if args.resume {

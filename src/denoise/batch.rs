@@ -172,15 +172,12 @@ impl Batch {
                             report(&job, &outcome);
                         }
                     }
+                    shared.tell_leftovers(End::Stopped, report);
                     return End::Stopped;
                 }
             }
         }
-        if let Source::Watch(watch) = &shared.source {
-            for (job, error) in watch.leftovers() {
-                report(&job, &Outcome::Failed(error));
-            }
-        }
+        shared.tell_leftovers(End::Complete, report);
         End::Complete
     }
 }
@@ -214,6 +211,15 @@ impl Shared {
                     Next::End => return None,
                 }
             },
+        }
+    }
+
+    /// Reports the watched files that never became whole.
+    fn tell_leftovers(&self, end: End, mut report: impl FnMut(&Job, &Outcome)) {
+        if let Source::Watch(watch) = &self.source {
+            for (job, error) in watch.leftovers(end) {
+                report(&job, &Outcome::Failed(error));
+            }
         }
     }
 
@@ -253,11 +259,16 @@ impl Shared {
 
     /// Whether the result of a job exists already; if so, the job's end is reported.
     pub fn take_up_existing(&self, job: &Job, ended: &Sender<Message>) -> bool {
-        let existing = if self.options.overwrite { None } else { job::existing(&job.output) };
-        let Some(headers) = existing else { return false };
+        if self.options.overwrite {
+            return false;
+        }
+        let headers = match job::existing(&job.output) {
+            Ok(None) => return false,
+            existing => existing,
+        };
         let take_up = |job: &Job| {
-            let taken_up = attempt(&job.output, || job::take_up(&headers, &self.options));
-            taken_up.map_or_else(Outcome::Failed, |()| Outcome::Skipped)
+            let take_up = || headers?.map_or(Ok(()), |headers| job::take_up(&headers, &self.options));
+            attempt(&job.output, take_up).map_or_else(Outcome::Failed, |()| Outcome::Skipped)
         };
         let _ = self.write(job.clone(), take_up, ended);
         true

@@ -7,7 +7,7 @@ use std::{
 };
 
 use super::{
-    lights::{Along, Alpha, Source, light_passes},
+    lights::{Along, Alpha, Source, denoised_lights, light_passes},
     window,
     wrap::{self, Wrap},
 };
@@ -439,18 +439,18 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
                 report.notes.push(format!("{what}: {recoded}"));
             }
         }
-        let at = beauty.0;
-        if let Some(error) = error {
-            let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
-            frame.set_expected_error(&result, &view_name(layer), error.mean());
-            let name = layer_name(&layer.name, &error_layer(options));
-            // Such a layer of an earlier result would not be true of this one, so it is replaced.
-            if options.confidence || frame.is_own_layer(&name) {
-                let values = error.plane();
-                let channel =
-                    NewChannel { component: "X", kind: SampleKind::Float, values: values.channel(0) };
-                frame.set_layer(at.part, &name, layer.view.as_deref(), &[channel])?;
-            }
+        let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
+        frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
+        let name = layer_name(&layer.name, &error_layer(options));
+        // Such a layer of an earlier result would not be true of this one, so it is replaced, by numbers that are
+        // none where nothing is known.
+        if options.confidence || frame.is_own_layer(&name) {
+            let unknown = || {
+                Planes::from_vec(1, radiance.width, radiance.height, vec![f32::NAN; radiance.data.len() / 3])
+            };
+            let values = error.as_ref().map_or_else(unknown, ExpectedError::plane);
+            let channel = NewChannel { component: "X", kind: SampleKind::Float, values: values.channel(0) };
+            frame.set_layer(beauty.0.part, &name, layer.view.as_deref(), &[channel])?;
         }
     }
     report.notes.dedup();
@@ -536,9 +536,16 @@ fn file_name(name: &str) -> String {
 }
 
 /// The headers of the EXR that exists at `output`, if there is one. It is whole, since results are written
-/// whole.
-pub(super) fn existing(output: &Path) -> Option<Frame> {
-    Frame::read_headers(output).ok()
+/// whole; what a full disk or a failed copy left is none.
+///
+/// # Errors
+/// The system does not let it be read, so nobody knows what would be lost.
+pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
+    match Frame::read_headers(output) {
+        Ok(headers) => Ok(Some(headers)),
+        Err(error @ Error::Io { .. }) if output.exists() => Err(error),
+        Err(_) => Ok(None),
+    }
 }
 
 /// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
@@ -575,10 +582,8 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
         Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
         None => headers.is_own_layer(&layer_name(chosen, &at.name)),
     };
-    let lights = light_passes();
-    let mut lights =
-        lights.iter().filter_map(|pass| layer.passes.get(pass)).chain(layer.light_groups.values());
-    if options.passes && !lights.any(is_own) {
+    let lights = denoised_lights(layer);
+    if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
         return lacks("denoised light passes");
     }
     if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {

@@ -51,6 +51,15 @@ pub fn light_passes() -> Vec<Pass> {
     lit.chain(ADDED).chain([Pass::ShadowCatcher]).collect()
 }
 
+/// Where the light passes and light groups of a layer are that can be denoised: light is stored with its colour
+/// or, elsewhere, needs none.
+pub fn denoised_lights(layer: &Layer) -> Vec<&PassChannels> {
+    let lit =
+        LIT.iter().filter(|(_, colour)| layer.passes.contains_key(colour)).flat_map(|(lights, _)| lights);
+    let passes = lit.chain(&ADDED).chain(&[Pass::ShadowCatcher]).filter_map(|pass| layer.passes.get(pass));
+    passes.chain(layer.light_groups.values()).collect()
+}
+
 /// Where a companion comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {

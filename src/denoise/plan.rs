@@ -32,10 +32,24 @@ pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
 /// As [`plan`], but with the folders below the one that was named.
 ///
 /// # Errors
-/// As [`plan`].
+/// As [`plan`]; or a result would have the path of another input.
 pub fn plan_tree(inputs: impl IntoIterator<Item = Input>, out: &Path) -> Result<Vec<Job>> {
+    let inputs: Vec<Input> = inputs.into_iter().collect();
+    let sources: HashMap<Place, PathBuf> =
+        inputs.iter().filter_map(|input| Some((place(&input.file)?, input.file.clone()))).collect();
     let mut plan = Plan::new(out);
-    inputs.into_iter().map(|input| plan.place(input)).collect()
+    let place_one = |input| {
+        let job = plan.place(input)?;
+        match place(&job.output).and_then(|place| sources.get(&place)) {
+            None => Ok(job),
+            Some(other) => Err(Error::Usage(format!(
+                "{}: the result would overwrite the input {}; choose another --out",
+                job.input.display(),
+                other.display()
+            ))),
+        }
+    };
+    inputs.into_iter().map(place_one).collect()
 }
 
 /// The results that have been given a path so far.
@@ -69,7 +83,7 @@ impl Plan {
                 output.display()
             )));
         }
-        if is_same_file(&input, &output) {
+        if place(&output).is_some_and(|existing| place(&input) == Some(existing)) {
             return Err(Error::Usage(format!(
                 "{}: the result would overwrite its input; choose another --out",
                 input.display()
@@ -79,17 +93,20 @@ impl Plan {
     }
 }
 
-/// Whether two paths lead to the same file. Folders may be mounted twice, so on Unix the files' places on the
-/// disk are compared.
-fn is_same_file(a: &Path, b: &Path) -> bool {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        let place = |path| fs::metadata(path).map(|file| (file.dev(), file.ino()));
-        matches!((place(a), place(b)), (Ok(a), Ok(b)) if a == b)
-    }
-    #[cfg(not(unix))]
-    {
-        matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b)
-    }
+/// What tells files apart. Folders may be mounted twice, so on Unix that is a file's place on the disk.
+#[cfg(unix)]
+type Place = (u64, u64);
+#[cfg(not(unix))]
+type Place = PathBuf;
+
+/// The place of a file, if it exists.
+#[cfg(unix)]
+fn place(path: &Path) -> Option<Place> {
+    use std::os::unix::fs::MetadataExt;
+    fs::metadata(path).ok().map(|file| (file.dev(), file.ino()))
+}
+
+#[cfg(not(unix))]
+fn place(path: &Path) -> Option<Place> {
+    fs::canonicalize(path).ok()
 }

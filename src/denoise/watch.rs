@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant, SystemTime},
 };
 
-use super::Job;
+use super::{Job, batch::End};
 use crate::{Error, frame::Frame};
 
 /// Time from one look to the next, at least.
@@ -141,12 +141,14 @@ impl Watch {
         }
     }
 
-    /// The files that never became whole, each with the error of reading it.
-    pub(super) fn leftovers(&self) -> Vec<(Job, Error)> {
+    /// The files that never became whole, each with the error of reading it. Those that were changing when the
+    /// watch was stopped do not count.
+    pub(super) fn leftovers(&self, end: End) -> Vec<(Job, Error)> {
         let files = std::mem::take(&mut self.state().files).into_values();
         let unfinished = |file: File| match file.status {
             Status::Taken => None,
             Status::Broken(error, _) => Some((file.job, error)),
+            Status::Coming if end == End::Stopped => None,
             Status::Coming => Frame::read(&file.job.input).err().map(|error| (file.job, error)),
         };
         files.filter_map(unfinished).collect()
@@ -263,7 +265,7 @@ mod tests {
         assert!(scene.is_taken());
         scene.watch.put_back(&scene.folder.path().join("a.exr"), broken());
         assert!(!scene.is_taken());
-        let [(job, error)] = &scene.watch.leftovers()[..] else { panic!() };
+        let [(job, error)] = &scene.watch.leftovers(End::Complete)[..] else { panic!() };
         assert!(job.input.ends_with("a.exr") && error.to_string().contains("truncated"), "{error}");
     }
 
@@ -271,11 +273,11 @@ mod tests {
     fn empty_and_missing_files_are_waited_for_and_told_of_in_the_end() {
         let scene = Scene::new(false);
         assert!(!scene.is_taken());
-        assert!(scene.watch.leftovers()[0].1.to_string().contains("cannot read"));
+        assert!(scene.watch.leftovers(End::Complete)[0].1.to_string().contains("cannot read"));
         let scene = Scene::new(false);
         scene.write(b"");
         assert!(!scene.is_taken());
-        assert!(scene.watch.leftovers()[0].1.to_string().contains("is empty"));
+        assert!(scene.watch.leftovers(End::Complete)[0].1.to_string().contains("is empty"));
     }
 
     #[test]

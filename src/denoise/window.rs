@@ -111,8 +111,9 @@ struct Held {
     /// All but its passes, until it is written; none where only its neighbours are denoised.
     rest: Option<Views<()>>,
     moments: BTreeMap<ViewKey, Moment>,
-    /// Why it could not be read.
+    /// Why it could not be read: the error, until it is told, and its text.
     error: Option<Error>,
+    trouble: Option<String>,
 }
 
 /// Frames of one sequence, by number, in memory.
@@ -155,13 +156,14 @@ impl Window {
             Ok(rest) => (is_written.then_some(rest), None),
             Err(error) => (None, Some(error)),
         };
-        self.held.insert(number, Held { rest, moments, error });
+        let trouble = error.as_ref().map(Error::to_string);
+        self.held.insert(number, Held { rest, moments, error, trouble });
     }
 
     /// Takes in a frame that has a single view and comes from no file.
     pub fn enter_shot(&mut self, number: i64, shot: Shot, model: &dyn Denoiser) {
         let moments = BTreeMap::from([(ViewKey::default(), Moment::new(shot, model))]);
-        self.held.insert(number, Held { rest: None, moments, error: None });
+        self.held.insert(number, Held { rest: None, moments, error: None, trouble: None });
     }
 
     /// What becomes of a frame that [`Window::enter_shot`] took in.
@@ -407,8 +409,8 @@ impl Window {
         let Some(held) = self.held.get(&there) else {
             return said(format!("frame {there} is not there"));
         };
-        if let Some(error) = &held.error {
-            return said(format!("frame {there} cannot be read ({error})"));
+        if let Some(trouble) = &held.trouble {
+            return said(format!("frame {there} cannot be read ({trouble})"));
         }
         let Some(other) = held.moments.get(view) else {
             return said(format!("frame {there} has no such view layer or view"));

@@ -46,7 +46,9 @@ pub fn directional(image: &Planes) -> Planes {
     const SECOND_DIFFERENCE: f32 = 6.0;
     let (width, height) = (image.width, image.height);
     let mut least = Planes::from_vec(image.channels, width, height, vec![f32::INFINITY; image.data.len()]);
-    for (dx, dy) in [(1, 0), (0, 1), (1, 1), (1, -1)] {
+    // In a frame of one column or one row, a direction that leaves it would find no noise.
+    let stays = |(dx, dy): &(isize, isize)| (*dy != 0 || width > 1) && (*dx != 0 || height > 1);
+    for (dx, dy) in [(1, 0), (0, 1), (1, 1), (1, -1)].into_iter().filter(stays) {
         let mut squares = Planes::new(image.channels, width, height);
         for c in 0..image.channels {
             let from = image.channel(c);

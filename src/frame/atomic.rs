@@ -2,11 +2,14 @@
 //!
 //! A process that is killed leaves its temporary file behind. It holds a lock on it as long as it lives, so
 //! that the next one in that folder tells leftovers, which it removes, from what others are writing there at
-//! the same time.
+//! the same time. Other machines do not see the lock on every network drive: their files count as leftovers
+//! after a day.
 
 use std::{
     fs::{self, File},
     path::Path,
+    sync::LazyLock,
+    time::Duration,
 };
 
 use tempfile::NamedTempFile;
@@ -15,6 +18,15 @@ use crate::{Error, Result};
 
 const PREFIX: &str = ".demc-";
 const SUFFIX: &str = ".tmp";
+
+/// [`PREFIX`] and a name of this machine since it was started, where the system tells one (Linux does).
+static OWN_PREFIX: LazyLock<String> = LazyLock::new(|| {
+    let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    format!("{PREFIX}{}", id.chars().filter(char::is_ascii_alphanumeric).take(12).collect::<String>())
+});
+
+/// No frame takes this long to write.
+const LONG: Duration = Duration::from_secs(24 * 3600);
 
 /// Lets `write` fill a new file that takes the name `path` only when it is complete.
 ///
@@ -48,6 +60,11 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
         if !(name.starts_with(PREFIX) && name.ends_with(SUFFIX)) {
             continue;
         }
+        let age =
+            entry.metadata().and_then(|file| file.modified()).map(|time| time.elapsed().unwrap_or_default());
+        if !name.starts_with(&*OWN_PREFIX) && age.is_ok_and(|age| age < LONG) {
+            continue;
+        }
         // A file that cannot be opened or locked belongs to another process.
         let Ok(file) = File::options().write(true).open(entry.path()) else { continue };
         if file.try_lock().is_ok() {
@@ -60,7 +77,7 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
 /// A new file with a unique name, locked.
 fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
-    builder.prefix(PREFIX).suffix(SUFFIX);
+    builder.prefix(&*OWN_PREFIX).suffix(SUFFIX);
     // Temporary files are private by default; this one becomes a file for the whole farm to read.
     #[cfg(unix)]
     {
@@ -79,7 +96,7 @@ fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write;
+    use std::{io::Write, time::SystemTime};
 
     use super::*;
 
@@ -96,17 +113,20 @@ mod tests {
     fn leftovers_go_and_what_is_being_written_stays() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("frame.exr");
-        for name in [".demc-1234.tmp", ".demc-abcdef.tmp", "other.tmp", ".demc-notes"] {
+        let own = format!("{}1234.tmp", *OWN_PREFIX);
+        for name in [&own, ".demc-old.tmp", ".demc-elsewhere.tmp", "other.tmp", ".demc-notes"] {
             fs::write(folder.path().join(name), "x").unwrap();
         }
+        let old = File::options().write(true).open(folder.path().join(".demc-old.tmp")).unwrap();
+        old.set_modified(SystemTime::now() - 2 * LONG).unwrap();
         atomically(&path, |mut file| {
             prepare_folder(folder.path())?;
-            assert_eq!(names(folder.path()).len(), 3, "{:?}", names(folder.path()));
+            assert_eq!(names(folder.path()).len(), 4, "{:?}", names(folder.path()));
             file.write_all(b"whole").map_err(Error::io("write", &path))
         })
         .unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"whole");
-        assert_eq!(names(folder.path()), [".demc-notes", "frame.exr", "other.tmp"]);
+        assert_eq!(names(folder.path()), [".demc-elsewhere.tmp", ".demc-notes", "frame.exr", "other.tmp"]);
     }
 
     #[test]

@@ -75,8 +75,8 @@ impl fmt::Display for Recoded {
     }
 }
 
-/// Channels by full name, bound for one part.
-type Named<'a> = Vec<(String, NewChannel<'a>)>;
+/// Channels by full name, as it is stored, bound for one part.
+type Named<'a> = Vec<(Vec<u8>, NewChannel<'a>)>;
 
 /// What [`Frame::set_expected_error`] noted in a part.
 fn expected_errors(attributes: &Attributes) -> Vec<(String, f64)> {
@@ -116,12 +116,12 @@ impl Frame {
             Some(view) if own_part => (format!("{name}-{view}"), name.to_owned()),
             Some(view) => (name.to_owned(), format!("{name}.{view}")),
         };
-        let named: Named<'_> = channels.iter().map(|c| (format!("{prefix}.{}", c.component), *c)).collect();
+        let named = channels.iter().map(|c| (format!("{prefix}.{}", c.component).into_bytes(), *c));
+        let named: Named<'_> = named.collect();
         let beside_view = &self.parts[beside].view;
-        let holder = self
-            .parts
-            .iter()
-            .position(|p| p.view == *beside_view && p.channels.iter().any(|c| c.name == named[0].0));
+        let holder = self.parts.iter().position(|p| {
+            p.view == *beside_view && p.channels.iter().any(|c| c.name.as_bytes() == named[0].0)
+        });
         let (part, recoded) = match holder {
             Some(part) => (part, self.set_channels(part, &named)?),
             None if own_part => {
@@ -135,17 +135,20 @@ impl Frame {
     }
 
     /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one), beside
-    /// the layer `name` that demc made of it.
+    /// the layer `name` that demc made of it; or forgets that of an earlier result, where none is known.
     ///
     /// # Panics
     /// If demc made no such layer.
-    pub fn set_expected_error(&mut self, name: &str, view_layer: &str, error: f64) {
+    pub fn set_expected_error(&mut self, name: &str, view_layer: &str, error: Option<f64>) {
         let is_holder = |part: &usize| self.marked(*part).iter().any(|layer| layer == name);
         let part = (0..self.parts.len()).find(is_holder).expect("the layer was made before");
         let attributes = &mut self.stored[part].attributes;
         let mut errors = expected_errors(attributes);
+        if errors.is_empty() && error.is_none() {
+            return;
+        }
         errors.retain(|(name, _)| name != view_layer);
-        errors.push((view_layer.into(), error));
+        errors.extend(error.map(|error| (view_layer.into(), error)));
         let lines: Vec<String> = errors.iter().map(|(name, error)| format!("{error:.3e} {name}")).collect();
         attributes.set_text(EXPECTED_ERROR, &lines.join("\n"));
     }
@@ -168,6 +171,11 @@ impl Frame {
     /// overwrote it.
     pub fn is_own_layer(&self, name: &str) -> bool {
         (0..self.parts.len()).any(|part| self.marked(part).iter().any(|layer| layer == name))
+    }
+
+    /// Whether demc made any of its layers.
+    pub fn is_result(&self) -> bool {
+        (0..self.parts.len()).any(|part| !self.marked(part).is_empty())
     }
 
     /// Whether there is a layer of that name, in any letter case, that demc did not make.
@@ -216,8 +224,9 @@ impl Frame {
             .iter()
             .map(|&(index, values)| {
                 assert_eq!(values.len(), header.layer_size.area(), "one value for each pixel");
-                let stored = &self.parts[part].channels[index];
-                (stored.name.clone(), NewChannel { component: "", kind: stored.kind, values })
+                // The name as it is stored, which in old files need not be UTF-8.
+                let name = header.channels.list[index].name.as_slice().to_vec();
+                (name, NewChannel { component: "", kind: self.parts[part].channels[index].kind, values })
             })
             .collect();
         let recoded = self.set_channels(part, &named)?;
@@ -296,7 +305,7 @@ impl Frame {
             return Err(Error::invalid(&self.path, why));
         }
         let Stored { attributes: old_attributes, layout: old } = &self.stored[part];
-        let is_new = |name: &Text| new.iter().any(|(n, _)| name.as_slice() == n.as_bytes());
+        let is_new = |name: &Text| new.iter().any(|(n, _)| name.as_slice() == n.as_slice());
         let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name));
         let loses = kept().any(|c| !survives(old.compression, c.sample_type));
         let compression = if loses { Compression::ZIP16 } else { old.compression };
@@ -357,14 +366,14 @@ fn survives(compression: Compression, kind: SampleType) -> bool {
     compression == Compression::PXR24 || compression.is_lossless_for(kind)
 }
 
-fn describe(name: &str, kind: SampleKind) -> ChannelDescription {
+fn describe(name: &[u8], kind: SampleKind) -> ChannelDescription {
     let kind = match kind {
         SampleKind::Half => SampleType::F16,
         SampleKind::Float => SampleType::F32,
         SampleKind::Uint => SampleType::U32,
     };
     // Radiance is marked as not "perceptually linear", as Blender marks it.
-    ChannelDescription::new(Text::from_slice_unchecked(name.as_bytes()), kind, false)
+    ChannelDescription::new(Text::from_slice_unchecked(name), kind, false)
 }
 
 fn channel_list(mut channels: Vec<ChannelDescription>) -> ChannelList {
@@ -391,7 +400,7 @@ struct Encoder<'a> {
 impl<'a> Encoder<'a> {
     fn new(layout: &'a Header, part: usize, old: Option<&'a Header>, new: &'a Named<'a>) -> Self {
         let source = |channel: &ChannelDescription| {
-            let fresh = new.iter().find(|(n, _)| channel.name.as_slice() == n.as_bytes());
+            let fresh = new.iter().find(|(n, _)| channel.name.as_slice() == n.as_slice());
             fresh.map(|(_, c)| Source::New(c.values)).unwrap_or_else(|| {
                 let kept = old.and_then(|h| h.channels.find_index_of_channel(&channel.name));
                 Source::Kept(kept.expect("a channel that is not new was there before"))

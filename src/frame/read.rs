@@ -3,7 +3,7 @@
 
 use std::{
     collections::HashMap,
-    fs::File,
+    fs::{self, File},
     io::{self, BufReader, ErrorKind, Read},
     path::Path,
 };
@@ -37,6 +37,10 @@ impl Frame {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let (mut source, mut frame) = open(path)?;
+        if frame.stored.iter().all(|stored| stored.layout.deep) {
+            let why = "holds deep data, which has no single colour per pixel; render without deep output or flatten it first";
+            return Err(Error::invalid(path, why));
+        }
         frame.chunks = source.chunks(&frame.stored, frame.multi_part).map_err(|e| e.of(path))?;
         frame.describe();
         Ok(frame)
@@ -45,7 +49,7 @@ impl Frame {
     /// Reads a file's headers alone: what it holds, none of its pixels.
     ///
     /// # Errors
-    /// As [`Frame::read`], except that damaged pixels are not noticed.
+    /// As [`Frame::read`], except that damaged pixels are not noticed, and deep data is taken.
     pub fn read_headers(path: impl AsRef<Path>) -> Result<Self> {
         let (_, mut frame) = open(path.as_ref())?;
         frame.describe();
@@ -55,11 +59,16 @@ impl Frame {
 
 /// Reads a file's headers; what comes next in the source are the offset tables.
 fn open(path: &Path) -> Result<(Source, Frame)> {
-    let file = File::open(path).map_err(Error::io("read", path))?;
-    let info = file.metadata().map_err(Error::io("read", path))?;
+    // Before it is opened: a pipe without a writer would wait for ever.
+    let info = fs::metadata(path).map_err(Error::io("read", path))?;
     if info.is_dir() {
         return Err(Error::invalid(path, "is a directory; name the EXR files in it"));
     }
+    if !info.is_file() {
+        return Err(Error::invalid(path, "is no file on a disk, in which demc can go back; save it as one"));
+    }
+    let file = File::open(path).map_err(Error::io("read", path))?;
+    let info = file.metadata().map_err(Error::io("read", path))?;
     if info.len() == 0 {
         return Err(Error::invalid(path, "is empty; render it or copy it again"));
     }
@@ -80,13 +89,6 @@ fn open(path: &Path) -> Result<(Source, Frame)> {
         chunks: Vec::new(),
     };
     source.headers(&mut frame).map_err(|e| e.of(path))?;
-    if frame.stored.iter().all(|stored| stored.layout.deep) {
-        return Err(Error::invalid(
-            path,
-            "holds deep data, which has no single colour per pixel; render without deep output or \
-             flatten it first",
-        ));
-    }
     Ok((source, frame))
 }
 

@@ -321,8 +321,8 @@ fn run_tiled<N: Network + ?Sized>(network: &N, passes: &PassSet, tile: Option<us
                 .planes
                 .iter_mut()
                 .map(|planes| {
-                    // A frame in one piece is not needed again.
-                    let whole = seen == (width, height);
+                    // A frame in one piece is not needed again. (Of several tiles, one may see all of it.)
+                    let whole = size == (width, height);
                     let seen = if whole { std::mem::take(planes) } else { planes.window((x0, y0), seen) };
                     (Shape::new(1, seen.channels, seen.height, seen.width), seen.data)
                 })

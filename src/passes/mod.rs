@@ -312,22 +312,22 @@ impl PassSet {
         }
     }
 
-    /// Whether the pixels of `reference` are those of this frame: as many, at the same place of the display
-    /// window.
+    /// Whether the pixels of `other` are those of this frame: as many, at the same place of the display window.
+    /// `what` it is to this frame, such as "its reference".
     ///
     /// # Errors
     /// They are not.
-    pub fn check_same_pixels(&self, reference: &PassSet) -> Result<()> {
+    pub fn check_same_pixels(&self, other: &PassSet, what: &str) -> Result<()> {
         let place = |set: &PassSet| (set.width, set.height, set.origin);
-        if place(self) == place(reference) {
+        if place(self) == place(other) {
             return Ok(());
         }
         let said = |set: &PassSet| {
             let PassSet { width, height, origin: (x, y), .. } = set;
             format!("{width}x{height} pixels at {x},{y}")
         };
-        let (own, other, path) = (said(self), said(reference), reference.path.display());
-        let why = format!("holds {own}, its reference {path} {other}; render both at one size and region");
+        let (own, path, of_other) = (said(self), other.path.display(), said(other));
+        let why = format!("holds {own}, {what} {path} {of_other}; render both at one size and region");
         Err(Error::invalid(&self.path, why))
     }
 

@@ -239,7 +239,7 @@ pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
     let shot = shot::prepare(&pair.noisy, view_layer)?;
     shot.passes.require(Pass::Combined, NOISY)?;
     let mut reference = passes::load_like(&pair.reference, &shot.passes.view_layer)?;
-    shot.passes.check_same_pixels(&reference)?;
+    shot.passes.check_same_pixels(&reference, "its reference")?;
     reference.require(Pass::Combined, "a reference")?;
     let reference = reference.remove(Pass::Combined).expect("it is there");
     Ok(Loaded { shot, reference })

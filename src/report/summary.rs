@@ -118,10 +118,12 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
             let common: Vec<_> = common.iter().filter(|&&pair| valid(of, pair)).collect();
             let statistics = METRICS.map(|(_, metric)| {
                 let values: Vec<f64> = common.iter().filter_map(|pair| metric(of[*pair])).collect();
-                let ratios: Vec<f64> = common
-                    .iter()
-                    .filter_map(|pair| Some(metric(of[*pair])? / metric(base.get(*pair)?)?))
-                    .collect();
+                // There is no ratio to a baseline that is exact.
+                let ratio = |pair: &&&Files| {
+                    let base = metric(base.get(**pair)?)?;
+                    (base != 0.0).then_some(metric(of[**pair])? / base)
+                };
+                let ratios: Vec<f64> = common.iter().filter_map(|pair| ratio(&pair)).collect();
                 Statistics {
                     mean: mean(&values),
                     median: median(&values),
@@ -208,6 +210,18 @@ mod tests {
 
     fn close(found: Option<f64>, expected: f64) {
         assert!((found.unwrap() - expected).abs() < 1e-12, "{found:?} for {expected}");
+    }
+
+    #[test]
+    fn a_baseline_that_is_exact_has_no_ratio_and_hides_no_other() {
+        let rows = [
+            row("a", "x", 4, Some(1.0)),
+            row("b", "x", 4, Some(4.0)),
+            row("a", "base", 4, Some(2.0)),
+            row("b", "base", 4, Some(0.0)),
+        ];
+        let summary = summarise(&rows, &models(&["x", "base"]), "base");
+        close(summary[0].of("relmse").ratio, 0.5);
     }
 
     #[test]

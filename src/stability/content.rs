@@ -3,7 +3,7 @@
 //!
 //! In: the rows of [`super::run`]. Renders of one scene at one sample count count as its noise seeds. Two
 //! bounds apply. The result has at most the input's RelMSE, since a denoiser that makes a frame worse had
-//! better be off. And the sum of its light is within 2% of the reference's, about the least difference in
+//! better be off; where the input is exact, at most [`HARMLESS`]. And the sum of its light is within 2% of the reference's, about the least difference in
 //! brightness that an eye sees (Weber's fraction). This tolerance grows by as much as the input's own sum is
 //! off, since the input may have fireflies or lack light that only few paths find.
 
@@ -14,6 +14,9 @@ use std::{
 
 use super::{Trial, TrialRow};
 use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean};
+
+/// RelMSE that a method may bring to an input that is exact: nothing that an eye sees.
+const HARMLESS: f64 = 1e-4;
 
 /// How far the energy of a result may be from one, in addition to how far its input's is.
 const ENERGY: f64 = 0.02;
@@ -92,12 +95,16 @@ impl Case {
         ]
     }
 
-    fn judge(&mut self, input_energy: Option<f64>) {
+    /// Finds the faults, given the energy of the input, and the largest RelMSE where the input had none.
+    fn judge(&mut self, input_energy: Option<f64>, harm: f64) {
         if self.failed > 0 {
             self.faults.push(format!("no result for {} renders", self.failed));
         }
         if let Some(ratio) = self.to_input.filter(|ratio| *ratio > 1.0) {
             self.faults.push(format!("{ratio:.2} x the input's RelMSE"));
+        }
+        if harm > HARMLESS {
+            self.faults.push(format!("RelMSE {harm:.1e} where the input is exact"));
         }
         if let (Some(energy), Some(input)) = (self.energy, input_energy)
             && (energy - 1.0).abs() > ENERGY + (input - 1.0).abs()
@@ -137,6 +144,10 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
             });
             geometric_mean(&ratios.collect::<Vec<f64>>())
         };
+        let is_exact = |row: &&&TrialRow| {
+            of(scene, spp, NOISY).iter().any(|twin| twin.noisy == row.noisy && twin.relmse == Some(0.0))
+        };
+        let harm = own.iter().filter(is_exact).filter_map(|row| row.relmse).fold(0.0, f64::max);
         let input: Vec<f64> = of(scene, spp, NOISY).iter().filter_map(|row| row.energy).collect();
         let mut case = Case {
             scene: scene.into(),
@@ -153,7 +164,7 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
             faults: Vec::new(),
         };
         if model != NOISY {
-            case.judge(mean(&input));
+            case.judge(mean(&input), harm);
         }
         case
     };
@@ -209,6 +220,25 @@ mod tests {
             energy: Some(energy),
             ..TrialRow::default()
         }
+    }
+
+    #[test]
+    fn what_harms_an_exact_input_fails() {
+        let rows = [
+            row(NOISY, 0, 0.0, 1.0),
+            row("gentle", 0, 1e-5, 1.0),
+            row("harmful", 0, 0.05, 1.0),
+            row(NOISY, 1, 0.2, 1.0),
+            row("gentle", 1, 0.1, 1.0),
+            row("harmful", 1, 0.1, 1.0),
+        ];
+        let cases = cases(&rows, NOISY);
+        assert_eq!(cases.iter().map(Case::passes).collect::<Vec<_>>(), [None, Some(true), Some(false)]);
+        assert!(
+            cases[2].faults[0].contains("RelMSE 5.0e-2 where the input is exact"),
+            "{:?}",
+            cases[2].faults
+        );
     }
 
     #[test]

@@ -242,7 +242,7 @@ impl Stored {
         let mut reference = passes::load_like(&pair.reference, &noisy.view_layer)?;
         reference.sanitize();
         reference.require_all(targets.iter().copied(), "training")?;
-        noisy.check_same_pixels(&reference)?;
+        noisy.check_same_pixels(&reference, "its reference")?;
         if noisy.width.min(noisy.height) < least {
             return Err(Error::invalid(
                 &pair.noisy,

@@ -16,6 +16,7 @@ use clap::{Args as ClapArgs, ValueEnum};
 use frames::Frames;
 use progress::{Progress, Style};
 
+use super::environment::MOST_THREADS;
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::{
     inputs::{self, Inputs, Search},
@@ -68,7 +69,7 @@ pub struct Args {
     overwrite: bool,
 
     /// Threads to use [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
     threads: Option<u16>,
 
     /// Denoise N frames at once, each with its share of the threads: the same results, sooner where frames
@@ -184,7 +185,8 @@ pub fn run(args: Args) -> Result<ExitCode> {
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
-    let is_one = matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
+    // Beside a single frame, those around it are read where they make it steadier.
+    let is_one = args.temporal.is_none() && matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
     let sources = args.guides.sources(&args.names, is_one)?;
     let model = models::open(&args.model)?;
     if args.report.is_some() {

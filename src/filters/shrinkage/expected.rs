@@ -88,7 +88,7 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
                     (0..3).map(|c| (noisy[c][x].max(0.0) - clean[c][x]) / (clean[c][x] + floor)).sum::<f32>()
                         / 3.0;
                 let unit: f32 = (0..3)
-                    .map(|c| clean[c][x] * clean[c][x])
+                    .map(|c| (clean[c][x] * clean[c][x]).min(f32::MAX))
                     .map(|square| (square + least) / (square + RELMSE_EPSILON as f32))
                     .sum();
                 changes[x / SQUARE] += (change * change).min(LARGEST_CHANGE);

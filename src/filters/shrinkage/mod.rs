@@ -359,6 +359,20 @@ mod tests {
     }
 
     #[test]
+    fn noise_is_told_in_a_frame_of_one_row_or_one_column() {
+        let mut rng = Rng::new(3, 0);
+        let noise: Vec<f32> = (0..300).map(|_| 2.0 * rng.uniform()).collect();
+        let noise = [&noise[..], &noise, &noise].concat();
+        for (width, height) in [(300, 1), (1, 300)] {
+            let plane = |values: Vec<f32>| Planes::from_vec(3, width, height, values);
+            let (flat, albedo) = (plane(vec![1.0; 900]), plane(vec![0.5; 900]));
+            let image = shrunk(&flat, &plane(noise.clone()), &albedo, Some(4));
+            let change: f32 = image.data.iter().map(|v| (v - 1.0).abs()).sum::<f32>() / 900.0;
+            assert!(change < 0.05, "{width}x{height}: {change} of the noise of 0.5 is back");
+        }
+    }
+
+    #[test]
     fn a_blurred_frame_without_noise_is_taken_back_and_a_noisy_one_is_not() {
         let (blurred, albedo) = (planes(|_, _, _| 0.3), planes(|_, _, _| 0.5));
         for samples in [None, Some(64), Some(4096)] {

@@ -71,7 +71,7 @@ pub fn gather(image: &Planes, render: &Render, seen: &Seen) -> Vec<f32> {
             columns.fill(0.0);
             for y in first_row..(first_row + SQUARE).min(end - first) {
                 let [above, row, below] = [0, 1, 2].map(|next| &rows[y + next]);
-                vectorised::run(Add { above, row, below, columns: &mut columns });
+                vectorised::run(Add { above, row, below, has_one_row: height == 1, columns: &mut columns });
             }
             for (line, columns) in sums.chunks_exact_mut(squares).zip(columns.chunks_exact(width)) {
                 let of_squares = columns.chunks(SQUARE).map(|part| part.iter().sum::<f32>());
@@ -178,6 +178,7 @@ struct Add<'a> {
     above: &'a PixelRow,
     row: &'a PixelRow,
     below: &'a PixelRow,
+    has_one_row: bool,
     /// [`SUMS`] lines with a value for each column.
     columns: &'a mut [f32],
 }
@@ -185,13 +186,14 @@ struct Add<'a> {
 impl Vectorised for Add<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self { above, row, below, columns } = self;
+        let Self { above, row, below, has_one_row, columns } = self;
         let width = row.light.len() - 2;
         let of_rows = |line: fn(&PixelRow) -> &Vec<f32>| [above, row, below].map(|row| &line(row)[..]);
         let scales = [0, 1].map(|of| &row.scales[of][1..][..width]);
         let (light, ratio) = (of_rows(|row| &row.light), of_rows(|row| &row.ratio));
-        add_differences(light, scales[0], &mut columns[NOISE[0] * width..][..width]);
-        add_differences(ratio, scales[1], &mut columns[NOISE[1] * width..][..width]);
+        let sides = [width == 1, has_one_row];
+        add_differences(light, scales[0], sides, &mut columns[NOISE[0] * width..][..width]);
+        add_differences(ratio, scales[1], sides, &mut columns[NOISE[1] * width..][..width]);
         let own = &row.residual[1..][..width];
         let lines: Vec<&mut [f32]> = columns.chunks_exact_mut(width).collect();
         let Ok(lines) = <[&mut [f32]; SUMS]>::try_from(lines) else {
@@ -200,7 +202,11 @@ impl Vectorised for Add<'_> {
         let [count, residual, _, _, cut, right, under, smooth, texture, by_smooth, by_texture, by_noisy, sum] =
             lines;
         let next = [own, &row.residual[2..][..width], &below.residual[1..][..width]];
-        for (sums, next) in [residual, right, under].into_iter().zip(next) {
+        // A neighbour that is the pixel itself would tell of detail where there is noise.
+        let is_another = [true, width > 1, !has_one_row];
+        for ((sums, next), _) in
+            [residual, right, under].into_iter().zip(next).zip(is_another).filter(|(_, is)| *is)
+        {
             sums.iter_mut().zip(own.iter().zip(next)).for_each(|(sum, (own, next))| *sum += own * next);
         }
         let (denoised, albedo) = (of_rows(|row| &row.denoised), of_rows(|row| &row.albedo));
@@ -226,13 +232,22 @@ fn detail([above, row, below]: [&[f32]; 3], x: usize) -> f32 {
 }
 
 /// Adds the variance of noise that follows from the smallest of four second differences, each times `scale`.
+/// In a frame of one column or one row, the mirror images of a pixel are the pixel itself, and tell nothing of
+/// noise.
 #[inline(always)]
-fn add_differences([above, row, below]: [&[f32]; 3], scale: &[f32], sums: &mut [f32]) {
+fn add_differences(
+    [above, row, below]: [&[f32]; 3],
+    scale: &[f32],
+    [has_one_column, has_one_row]: [bool; 2],
+    sums: &mut [f32],
+) {
+    let [no_across, no_down] =
+        [has_one_column, has_one_row].map(|is_one| if is_one { f32::MAX } else { 0.0 });
     let width = sums.len();
     for x in 0..width {
         let twice = 2.0 * row[x + 1];
-        let across = (twice - row[x] - row[x + 2]).abs();
-        let down = (twice - above[x + 1] - below[x + 1]).abs();
+        let across = (twice - row[x] - row[x + 2]).abs().max(no_across);
+        let down = (twice - above[x + 1] - below[x + 1]).abs().max(no_down);
         let falling = (twice - above[x] - below[x + 2]).abs();
         let rising = (twice - above[x + 2] - below[x]).abs();
         let least = (across.min(down).min(falling.min(rising)) * scale[x]).min(LARGEST_DIFFERENCE);

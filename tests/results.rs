@@ -1,0 +1,166 @@
+//! What `demc denoise` makes of files that lie where results go: its own are taken up, brought up to date, or
+//! are no inputs; those of others, and inputs, are never lost.
+
+mod common;
+
+use std::{fs, path::Path, time::Duration};
+
+use common::{
+    demc,
+    files::{data, deep_file, read_exr, samples, values, write_render},
+};
+use demc::frame::Frame;
+use predicates::{prelude::*, str::contains};
+use tempfile::TempDir;
+
+/// A folder with a small render at each of these paths.
+fn folder_with(paths: &[&str]) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for (seed, path) in paths.iter().enumerate() {
+        let path = folder.path().join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        write_render(&path, 24, 18, |_, pixel| ((pixel * 31 + seed) % 97) as f32 / 97.0);
+    }
+    folder
+}
+
+/// Denoises in a folder, by `noisy` where no model is named.
+fn denoise(folder: &Path, arguments: &str) -> assert_cmd::assert::Assert {
+    let mut command = demc();
+    let model = if arguments.contains("--model") { "" } else { "--model noisy" };
+    let arguments = arguments.split_whitespace().chain(model.split_whitespace());
+    command.current_dir(folder).arg("denoise").args(arguments).timeout(Duration::from_secs(60)).assert()
+}
+
+#[test]
+fn what_is_no_result_of_demc_is_not_overwritten_unasked() {
+    let folder = folder_with(&["in/deep.exr", "in/flat.exr", "out/flat.exr"]);
+    let [deep, flat] = ["deep", "flat"].map(|name| folder.path().join(format!("out/{name}.exr")));
+    fs::write(&deep, deep_file()).unwrap();
+    let before = [&deep, &flat].map(|path| fs::read(path).unwrap());
+    let words =
+        |name: &str| contains(format!("{name}.exr: exists without 'ViewLayer.Denoised' made by demc"));
+    denoise(folder.path(), "in --out out").code(1).stderr(words("flat").and(contains("deep.exr: ")));
+    assert_eq!([&deep, &flat].map(|path| fs::read(path).unwrap()), before);
+    denoise(folder.path(), "in --out out --overwrite").success();
+    assert!([deep, flat].iter().all(|path| Frame::read(path).unwrap().is_result()));
+}
+
+#[test]
+fn a_result_does_not_take_the_place_of_another_input() {
+    let folder = folder_with(&["a/b/x.exr", "b/x.exr"]);
+    let before = fs::read(folder.path().join("b/x.exr")).unwrap();
+    denoise(folder.path(), "a b --recursive --out . --overwrite")
+        .code(2)
+        .stderr(contains("would overwrite the input b/x.exr"));
+    assert_eq!(fs::read(folder.path().join("b/x.exr")).unwrap(), before);
+}
+
+#[test]
+fn results_are_no_inputs_the_second_time() {
+    let folder = folder_with(&["renders/one/a.exr", "renders/two/b.exr", "flat/c.exr"]);
+    let pattern = "renders/*/*.exr --out renders/clean";
+    denoise(folder.path(), pattern).success().stdout(contains("2 denoised"));
+    denoise(folder.path(), pattern).success().stdout(contains("0 denoised, 2 already there"));
+    denoise(folder.path(), &format!("{pattern} --watch 1")).success();
+    // As a shell writes out `flat/*`.
+    denoise(folder.path(), "flat/c.exr --out flat/clean").success();
+    denoise(folder.path(), "flat/c.exr flat/clean --out flat/clean").success();
+    // A result that is the only input is one, and a render of another program there as well.
+    denoise(folder.path(), "flat/clean/c.exr --out again").success();
+    denoise(folder.path(), "flat/clean --out flat/clean")
+        .code(2)
+        .stderr(contains("would overwrite its input"));
+    fs::copy(folder.path().join("flat/c.exr"), folder.path().join("flat/clean/d.exr")).unwrap();
+    denoise(folder.path(), "flat/*.exr flat/clean/*.exr --out flat/clean")
+        .code(2)
+        .stderr(contains("d.exr: the result would overwrite"));
+}
+
+#[test]
+fn a_frame_without_light_passes_is_taken_up_like_any_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let render = data("s0000_room_0004spp.exr");
+    let arguments = format!("{} --out out --model demc-s --passes", render.display());
+    denoise(folder.path(), &arguments)
+        .success()
+        .stderr(contains("holds no light passes").or(predicate::always()));
+    denoise(folder.path(), &arguments).success();
+}
+
+#[test]
+fn what_an_earlier_result_was_expected_to_be_is_forgotten() {
+    let folder = tempfile::tempdir().unwrap();
+    let render = data("s0000_room_0004spp.exr");
+    denoise(folder.path(), &format!("{} --out first --model demc-s --confidence", render.display()))
+        .success();
+    let name = render.file_name().unwrap();
+    let first = folder.path().join("first").join(name);
+    assert_eq!(Frame::read_headers(&first).unwrap().expected_errors().len(), 1);
+    denoise(folder.path(), &format!("{} --out second", first.display())).success();
+    let second = folder.path().join("second").join(name);
+    assert!(Frame::read_headers(&second).unwrap().expected_errors().is_empty());
+    assert!(values(&read_exr(second), "ViewLayer.Denoised Error.X").iter().all(|v| v.is_nan()));
+}
+
+#[test]
+fn the_beauty_is_replaced_where_a_name_is_not_utf8() {
+    let folder = folder_with(&["in.exr"]);
+    let path = folder.path().join("in.exr");
+    // K\xfcche, as a program wrote it that knew Latin-1 alone; as long as the name it had.
+    let mut bytes = fs::read(&path).unwrap();
+    let name = b"ViewLayer.";
+    let places: Vec<usize> =
+        (0..bytes.len() - name.len()).filter(|at| bytes[*at..].starts_with(name)).collect();
+    places.iter().for_each(|at| bytes[*at..at + name.len()].copy_from_slice(b"K\xfcche1234."));
+    fs::write(&path, bytes).unwrap();
+    denoise(folder.path(), "in.exr --out out --replace").success();
+    let result = Frame::read(folder.path().join("out/in.exr")).unwrap();
+    let channels: usize = result.parts().iter().map(|part| part.channels.len()).sum();
+    assert_eq!(
+        channels,
+        Frame::read(&path).unwrap().parts().iter().map(|part| part.channels.len()).sum::<usize>()
+    );
+}
+
+#[test]
+fn a_frame_is_read_from_files_alone() {
+    let folder = folder_with(&["in/a.exr"]);
+    let made = std::process::Command::new("mkfifo").arg(folder.path().join("in/pipe.exr")).status();
+    if made.is_ok_and(|status| status.success()) {
+        // Nobody writes into it: opening it would wait for ever.
+        denoise(folder.path(), "in/a.exr in/pipe.exr --out out")
+            .code(1)
+            .stderr(contains("pipe.exr: is no file on a disk"));
+        assert!(samples(&read_exr(folder.path().join("out/a.exr")), "ViewLayer.Denoised.R").is_some());
+    }
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn a_full_disk_under_standard_output_is_a_failure() {
+    let folder = folder_with(&["a.exr"]);
+    let full = || fs::File::options().write(true).open("/dev/full").unwrap();
+    for arguments in [
+        vec!["inspect", "a.exr", "--json"],
+        vec!["denoise", "a.exr", "--out", "out", "--model", "noisy", "--json"],
+    ] {
+        let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("demc"));
+        let ended = command.current_dir(folder.path()).args(&arguments).stdout(full()).output().unwrap();
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {said}");
+        assert!(said.contains("cannot write to standard output"), "{said}");
+    }
+    assert!(folder.path().join("out/a.exr").is_file());
+}
+
+#[test]
+fn no_more_threads_than_anybody_means() {
+    for arguments in [
+        "denoise a.exr --out o --threads 5000",
+        "train --out o --data d --threads 5000",
+        "eval --test-set d --out o --threads 5000",
+    ] {
+        demc().args(arguments.split_whitespace()).assert().code(2).stderr(contains("4096"));
+    }
+}
