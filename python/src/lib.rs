@@ -6,8 +6,10 @@
 use std::{
     collections::HashMap,
     ffi::OsString,
+    mem,
     panic::{AssertUnwindSafe, catch_unwind},
     path::PathBuf,
+    process,
     sync::{
         Arc, LazyLock, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -28,6 +30,7 @@ use demc::{
 };
 use numpy::{PyArray1, PyReadonlyArray3, ndarray::Axis};
 use pyo3::{create_exception, exceptions, prelude::*};
+use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 create_exception!(
     demc,
@@ -47,6 +50,22 @@ fn to_python(failure: Failure) -> PyErr {
     }
 }
 
+/// The threads of calls that name no number. A process that was forked from another, as Python's
+/// `multiprocessing` does on Linux, has none of its threads and would wait for them for ever: it gets its own.
+fn shared_pool() -> Result<Arc<ThreadPool>, ThreadPoolBuildError> {
+    static POOL: Mutex<Option<(u32, Arc<ThreadPool>)>> = Mutex::new(None);
+    let mut pool = POOL.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some((of, pool)) = &*pool
+        && *of == process::id()
+    {
+        return Ok(Arc::clone(pool));
+    }
+    let own = Arc::new(ThreadPoolBuilder::new().build()?);
+    // Dropped here, the other process's pool would wait for its threads.
+    mem::forget(pool.replace((process::id(), Arc::clone(&own))));
+    Ok(own)
+}
+
 /// Runs `work` on a thread of its own, with so many threads if that is said; Ctrl-C ends the wait, and tells
 /// `work`.
 fn detached<T: Send + 'static>(
@@ -54,19 +73,16 @@ fn detached<T: Send + 'static>(
     threads: Option<usize>,
     work: impl FnOnce(&AtomicBool) -> demc::Result<T> + Send + 'static,
 ) -> PyResult<T> {
-    let pool = threads.map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build());
-    let pool = pool.transpose().map_err(|e| exceptions::PyValueError::new_err(format!("threads: {e}")))?;
+    let pool = match threads {
+        Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(Arc::new),
+        None => shared_pool(),
+    };
+    let pool = pool.map_err(|e| exceptions::PyValueError::new_err(format!("threads: {e}")))?;
     let stopped = Arc::new(AtomicBool::new(false));
     let (done, result) = channel();
     let asked = Arc::clone(&stopped);
     thread::spawn(move || {
-        let guarded = AssertUnwindSafe(|| match &pool {
-            Some(pool) => {
-                // Not from within: the closure must be handed over whole.
-                pool.install(|| work(&asked))
-            }
-            None => work(&asked),
-        });
+        let guarded = AssertUnwindSafe(|| pool.install(|| work(&asked)));
         let outcome = catch_unwind(guarded)
             .unwrap_or_else(|_| Err(Failure::Internal("its message is on standard error".into())));
         let _ = done.send(outcome);

@@ -4,11 +4,13 @@ import json
 import os
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import threading
+import time
 import unittest
 from unittest import mock
 
@@ -47,6 +49,22 @@ def stacked(channels, layer, components):
 
 
 class Package(unittest.TestCase):
+    @unittest.skipUnless(hasattr(os, "fork"), "this system does not fork")
+    def test_a_forked_process_denoises(self):
+        color, albedo, normal, _ = self.arrays()
+        expected = demc.denoise(color, albedo, normal, "demc-s")  # its threads are there now
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if (demc.denoise(color, albedo, normal, "demc-s") == expected).all() else 1)
+        end = time.monotonic() + 60
+        while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0):
+            if time.monotonic() > end:
+                os.kill(child, signal.SIGKILL)
+                os.waitpid(child, 0)
+                self.fail("it waits for threads that the other process has")
+            time.sleep(0.01)
+        self.assertEqual(ended, (child, 0))
+
     def setUp(self):
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
