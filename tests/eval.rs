@@ -201,6 +201,78 @@ fn an_absent_peer_says_so_and_the_others_are_scored() {
 }
 
 #[test]
+fn rows_go_with_the_weights_that_made_them() {
+    let (weights, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let file = weights.path().join("lbf.safetensors");
+    let rivals = Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/rivals/weights");
+    fs::copy(rivals.join("lbf.safetensors"), &file).unwrap();
+    let mine = weights.path().join("mine.safetensors");
+    fs::copy(&file, &mine).unwrap();
+    let by_file = format!("lbf,{0},{0}:unrestrained", mine.display());
+    let run = || {
+        let mut command = demc();
+        command.env("DEMC_WEIGHTS", weights.path()).args([
+            "eval",
+            "--repeats",
+            "1",
+            "--no-sheets",
+            "--models",
+            &by_file,
+        ]);
+        command.arg("--test-set").arg(data("")).arg("--out").arg(out.path()).assert().success()
+    };
+    run();
+    let before = table(&out.path().join("scores.csv"));
+    // Another number in the last weight.
+    for path in [&file, &mine] {
+        let mut bytes = fs::read(path).unwrap();
+        let last = bytes.len() - 2;
+        bytes[last] ^= 0x40;
+        fs::write(path, bytes).unwrap();
+    }
+    run().stderr(predicate::str::contains("2 of 8 rows are there already"));
+    let after = table(&out.path().join("scores.csv"));
+    for model in ["lbf", "mine", "mine:unrestrained"] {
+        let of = |rows: &[Row]| row(rows, "s0000_room", model)["relmse"].clone();
+        assert_ne!(of(&before), of(&after), "{model}");
+    }
+}
+
+#[test]
+fn files_are_the_same_by_another_path_and_go_by_their_new_names() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for kind in ["0004spp", "ref"] {
+        fs::copy(data(&format!("s0000_room_{kind}.exr")), set.path().join(format!("room_{kind}.exr")))
+            .unwrap();
+    }
+    let run = |test_set: &Path| eval(test_set, out.path(), &["--models", "noisy", "--no-sheets"]).success();
+    run(set.path());
+    run(&set.path().join("."));
+    assert_eq!(table(&out.path().join("scores.csv")).len(), 1);
+    let manifest = set.path().join("manifest.csv");
+    for (scene, spp) in [("room", 4), ("kitchen", 16)] {
+        fs::write(
+            &manifest,
+            format!("scene,noisy,reference,spp\n{scene},room_0004spp.exr,room_ref.exr,{spp}\n"),
+        )
+        .unwrap();
+        run(&manifest);
+        let rows = table(&out.path().join("scores.csv"));
+        assert_eq!((rows.len(), &*rows[0]["scene"], &*rows[0]["spp"]), (1, scene, &*spp.to_string()));
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_folder_whose_name_is_no_text() {
+    use std::os::unix::ffi::OsStrExt;
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join(std::ffi::OsStr::from_bytes(b"out\xff"));
+    eval(&data(""), &out, &["--models", "noisy"]).success();
+    assert!(out.join("report.html").is_file());
+}
+
+#[test]
 fn finished_rows_are_kept_and_missing_ones_run() {
     let out = tempfile::tempdir().unwrap();
     let (scores, program) = (out.path().join("scores.csv"), oidn());

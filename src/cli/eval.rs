@@ -31,7 +31,7 @@ pub struct Args {
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
           value_parser = methods::parse_reach)]
     temporal: Option<u8>,
-    /// Method that the summary's ratios refer to [default: the first of --models]
+    /// Method that the summary's ratios refer to [default: the first of --models that is not noisy]
     #[arg(long, value_name = "NAME")]
     baseline: Option<String>,
     /// Timed runs of each method and scene, each after one that warms up; their median counts

@@ -65,7 +65,7 @@ impl Args {
                         let file = oidn.program();
                         (Box::new(oidn), Some(file))
                     }
-                    None => (models::open(name)?, weights_file(name).map(Into::into)),
+                    None => (models::open(name)?, weights_of(name)),
                 };
             let stamp = match file {
                 Some(file) => format!("{program} {}", report::file_stamp(&file)),
@@ -90,7 +90,8 @@ impl Args {
     /// # Errors
     /// As [`Args::methods`].
     pub fn temporal(&self, methods: &[Contender], reach: usize) -> Result<Vec<Contender>> {
-        let asked: Vec<&str> = self.models.iter().map(|model| model.trim()).collect();
+        let mut seen = HashSet::new();
+        let asked: Vec<&str> = self.models.iter().map(|m| m.trim()).filter(|m| seen.insert(*m)).collect();
         let mut added = Vec::new();
         for name in &asked {
             let short = short_name(name, &asked);
@@ -122,23 +123,24 @@ pub fn parse_reach(text: &str) -> Result<u8> {
     })
 }
 
-/// The name of a method in tables. A weights file has its stem and the arithmetic asked for as its name.
-/// Where another file has the same name its folder is added, and where that does not help either the name is
-/// all that was asked for.
+/// The name of a method in tables. A weights file has its stem and what was asked for behind it as its name.
+/// Where another file, or a method that demc knows, has the same name its folder is added, and where that does
+/// not help either the name is all that was asked for.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
     let stem = |name: &str| {
-        let plain = models::split_precision(name).0;
+        let plain = plain(name);
         let stem = Path::new(plain).file_stem()?.to_string_lossy().into_owned();
         Some(stem + &name[plain.len()..])
     };
     let with_folder = |name: &str| {
-        let folder =
-            Path::new(models::split_precision(name).0).parent()?.file_name()?.to_string_lossy().into_owned();
+        let folder = Path::new(plain(name)).parent()?.file_name()?.to_string_lossy().into_owned();
         Some(format!("{folder}/{}", stem(name)?))
     };
-    let is_best = file.file_stem() == Some("best".as_ref());
-    let short = (!is_best).then(|| stem(name)).flatten().filter(|own| is_unique(own, name, all, stem));
+    let tells_nothing = file.file_stem().is_none_or(|stem| {
+        stem == "best" || stem.to_str().is_some_and(|stem| models::catalogue::find(stem).is_some())
+    });
+    let short = (!tells_nothing).then(|| stem(name)).flatten().filter(|own| is_unique(own, name, all, stem));
     let long = || with_folder(name).filter(|own| is_unique(own, name, all, with_folder));
     short.or_else(long).unwrap_or_else(|| name.into())
 }
@@ -150,7 +152,19 @@ fn is_unique(own: &str, name: &str, all: &[&str], named: impl Fn(&str) -> Option
 
 /// The weights file that a method's name names.
 fn weights_file(name: &str) -> Option<&Path> {
-    Some(Path::new(models::split_precision(name).0)).filter(|path| path.is_file())
+    Some(Path::new(plain(name))).filter(|path| path.is_file())
+}
+
+/// The weights file of a method, by its name or by that of the file; none where the program holds them.
+fn weights_of(name: &str) -> Option<PathBuf> {
+    let known = || models::catalogue::find(plain(name)).and_then(models::catalogue::Method::weights_file);
+    weights_file(name).map(Into::into).or_else(known)
+}
+
+/// What names the method or the file, without what is asked for behind it.
+fn plain(name: &str) -> &str {
+    let name = models::split_precision(name).0;
+    models::split_precision(name.strip_suffix(models::UNRESTRAINED).unwrap_or(name)).0
 }
 
 /// The noisy renders of a test set. References without a noisy render are named on stderr; renders without a
@@ -207,5 +221,11 @@ mod tests {
         let short = all.map(|name| short_name(name, &all));
         assert_eq!(short, ["demc-m", &one, &two, "run3/best", "m", "m:f32"]);
         assert_eq!(short_name(&one, &["demc-m", &one]), "run/best");
+        // No file takes the place of a method that demc knows.
+        let kpcn = file("mine/kpcn.safetensors");
+        assert_eq!(short_name(&kpcn, &[&kpcn]), "mine/kpcn");
+        assert_eq!(short_name(&format!("{m}:unrestrained"), &[&m]), "m:unrestrained");
+        assert_eq!(weights_of(&format!("{m}:unrestrained")).as_deref(), Some(Path::new(&m)));
+        assert!(weights_of("kpcn").is_some() && weights_of("demc-s").is_none());
     }
 }

@@ -60,19 +60,17 @@ fn trials() -> String {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let methods = args.asked.methods()?;
-    if methods.iter().all(|method| method.name != args.baseline) {
+    let asked: Vec<&str> = args.asked.models.iter().map(String::as_str).collect();
+    let baseline = methods::short_name(&args.baseline, &asked);
+    if methods.iter().all(|method| method.name != baseline) {
         let names: Vec<&str> = methods.iter().map(|method| method.name.as_str()).collect();
-        return Err(Error::Usage(format!(
-            "--baseline {}: none of the methods {}",
-            args.baseline,
-            names.join(", ")
-        )));
+        return Err(Error::Usage(format!("--baseline {baseline}: none of the methods {}", names.join(", "))));
     }
     let options = StabilityOptions {
         out: args.out.clone(),
         view_layer: args.asked.view_layer.clone(),
         trials: if args.trials.is_empty() { Trial::ALL.to_vec() } else { in_order(&args.trials) },
-        baseline: args.baseline.clone(),
+        baseline,
         worst: args.worst,
         threads: args.asked.threads(),
     };
@@ -93,7 +91,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let judged = cases.iter().filter_map(Case::passes);
     let (all, bad) = (judged.clone().count(), judged.filter(|passes| !passes).count());
     if all > 0 {
-        print_line(&format!("{bad} of {all} scenes as rendered are out of bounds"));
+        print_line(&format!("{bad} of {all} results on scenes as rendered are out of bounds"));
     }
     print_line(&args.out.join("stability_summary.csv").display().to_string());
     print_line(&args.out.join("stability.html").display().to_string());

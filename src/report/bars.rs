@@ -104,14 +104,13 @@ impl Bars {
             });
             let value = value(row);
             if let Some(method) = names.iter().position(|n| *n == row.model) {
-                // A logarithmic axis has no zero.
-                groups[at].values[method] = value.filter(|v| !is_error || *v > 0.0);
+                groups[at].values[method] = value;
             }
         }
         let scenes = groups.len();
         groups.truncate(MOST_SCENES);
         for (label, value) in means {
-            let values = overall.iter().map(|s| value(s, metric).filter(|v| !is_error || *v > 0.0));
+            let values = overall.iter().map(|s| value(s, metric));
             groups.push(Group { label: (*label).into(), is_mean: true, values: values.collect() });
         }
         let left_out = scenes.saturating_sub(MOST_SCENES);
@@ -148,7 +147,8 @@ impl Bars {
         if !self.is_error {
             return Scale::exactly((0.0, 1.0), false, (bottom, top));
         }
-        let values = self.groups.iter().flat_map(|g| g.values.iter().flatten().copied());
+        // A logarithmic axis has no zero: the bar of an exact result has no length.
+        let values = self.groups.iter().flat_map(|g| g.values.iter().flatten().copied()).filter(|v| *v > 0.0);
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
         let (low, high) = if low > high { (0.001, 1.0) } else { (low, high) };
         // Even the lowest bar has a length.
@@ -207,7 +207,8 @@ impl Bars {
                 canvas.text("×", (middle, area.bottom - 9), Anchor::Centre, cross)?;
                 continue;
             };
-            let top = scale.at(*value).clamp(area.top, area.bottom);
+            let is_drawn = !self.is_error || *value > 0.0;
+            let top = if is_drawn { scale.at(*value).clamp(area.top, area.bottom) } else { area.bottom - 2 };
             canvas.fill([(from, top), (to.max(from + 1), area.bottom)], *colour)?;
             // The top of the bar, or of its number where that stands above it.
             let mut above = top;

@@ -16,6 +16,9 @@ use crate::{
     testset::Pair,
 };
 
+/// How a note begins that says why there is no flicker.
+pub const NO_FLICKER: &str = "no flicker";
+
 /// A frame that another follows, and the methods' results on it.
 pub struct Before<'a> {
     pair: &'a Pair,
@@ -82,7 +85,7 @@ impl<'a> Before<'a> {
         image: &Planes,
         next: &Loaded,
     ) -> Result<Option<f64>, String> {
-        let said = |why: &str| format!("no flicker: {why}");
+        let said = |why: &str| format!("{NO_FLICKER}: {why}");
         let Some(vectors) = next.shot.passes.get(Pass::Vector) else {
             return Err(said("the frame has no Vector"));
         };

@@ -35,7 +35,7 @@ pub use figure::Figure;
 pub use heat::{HeatCell, HeatMap};
 #[cfg(feature = "train")]
 pub use loss::loss_chart;
-pub(crate) use page::{document, picture_of};
+pub(crate) use page::{document, picture_of, sheet_text};
 pub use palette::is_own;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
 pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, sheet_name};

@@ -41,7 +41,10 @@ impl Provenance {
     pub fn now() -> Self {
         let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs());
         Self {
-            command: std::env::args().map(|word| quote(&word)).collect::<Vec<_>>().join(" "),
+            command: std::env::args_os()
+                .map(|word| quote(&word.to_string_lossy()))
+                .collect::<Vec<_>>()
+                .join(" "),
             version: env!("CARGO_PKG_VERSION").into(),
             commit: option_env!("DEMC_COMMIT").map(Into::into),
             cpu: cpu(),

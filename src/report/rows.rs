@@ -96,7 +96,8 @@ pub struct Row {
     pub note: String,
 }
 
-/// What identifies a row, in other runs too: the noisy file, the reference file and the method.
+/// What identifies a row, in other runs too: the noisy file and the reference file, by whatever path they are
+/// reached, and the method.
 pub type Key = (PathBuf, PathBuf, String);
 
 impl Row {
@@ -139,7 +140,14 @@ impl Row {
 
     /// What identifies it.
     pub fn key(&self) -> Key {
-        (self.noisy.clone(), self.reference.clone(), self.model.clone())
+        let (noisy, reference) = self.files();
+        (noisy, reference, self.model.clone())
+    }
+
+    /// The noisy and the reference file, by whatever path they are reached.
+    pub fn files(&self) -> (PathBuf, PathBuf) {
+        let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        (place(&self.noisy), place(&self.reference))
     }
 
     /// Adds to the note.

@@ -14,7 +14,7 @@ use super::{
     bars::Bars,
     chart::Chart,
     figure::Figure,
-    followed::Followed,
+    followed::{Followed, NO_FLICKER, is_next},
     page::Page,
     provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
@@ -83,8 +83,21 @@ pub fn evaluate(
     };
     let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
         rows.into_iter().partition(|row| asked.contains(&row.key()));
-    // A row that failed is tried again.
-    kept.retain(|row| !options.overwrite && row.reason.is_empty() && before.still_holds(row, &now));
+    // A row that failed is tried again, and one without flicker, if the test set now holds the frame before.
+    let by_key: HashMap<(PathBuf, PathBuf), &Pair> =
+        pairs.iter().map(|pair| (Row::new(pair, NOISY).files(), pair)).collect();
+    let wants_flicker = |row: &Row, pair: &Pair| {
+        row.flicker.is_none()
+            && !row.note.contains(NO_FLICKER)
+            && pairs.iter().any(|other| is_next(pair, other))
+    };
+    kept.retain_mut(|row| {
+        let pair = by_key[&row.files()];
+        // A manifest may call the same files otherwise by now.
+        (row.scene, row.spp) = (pair.label(), pair.spp);
+        let is_whole = row.reason.is_empty() && !wants_flicker(row, pair);
+        !options.overwrite && is_whole && before.still_holds(row, &now)
+    });
     let count = others.len();
     others.retain(|row| before.still_holds(row, &now));
     others.iter().for_each(|row| now.keep(row, &before));
@@ -139,7 +152,7 @@ pub fn evaluate(
                 .collect();
             sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
             if pair.frame.is_some() {
-                sequences::store(out, pair, &scene.images, &scene.reference)?;
+                sequences::store(out, name, &scene.images, &scene.reference)?;
             }
             now.sheets.insert(name.clone(), shows(pair));
             now.write(&stored)?;

@@ -4,7 +4,10 @@
 //! sample count, so that only the samples change along a line. A method whose RelMSE is above the noisy
 //! input's makes frames worse.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    path::Path,
+};
 
 use plotters::prelude::*;
 
@@ -45,10 +48,15 @@ impl Samples {
     /// count.
     pub fn new(rows: &[Row], methods: &[String]) -> Option<Self> {
         type Scores = Vec<(f64, f64)>;
-        let mut scored: BTreeMap<(&str, u32, &str), Scores> = BTreeMap::new();
+        // Scenes of one name in different folders are different scenes; noise seeds share a reference.
+        type Scene<'a> = (&'a str, &'a Path);
+        let mut scored: BTreeMap<(Scene, u32, &str), Scores> = BTreeMap::new();
         for row in rows {
             if let (Some(relmse), Some(ssim)) = (row.relmse.filter(|e| *e > 0.0), row.ssim) {
-                scored.entry((&row.scene, row.spp, &row.model)).or_default().push((relmse, ssim));
+                scored
+                    .entry(((&row.scene, &row.reference), row.spp, &row.model))
+                    .or_default()
+                    .push((relmse, ssim));
             }
         }
         let counts: Vec<u32> = rows.iter().map(|row| row.spp).collect::<BTreeSet<_>>().into_iter().collect();
@@ -56,10 +64,11 @@ impl Samples {
         let methods: Vec<&str> = methods.iter().map(String::as_str).collect();
         let drawn: Vec<&str> =
             methods.iter().copied().filter(|m| scored.keys().any(|(_, _, model)| model == m)).collect();
-        let is_whole = |scene: &&str| {
-            counts.iter().all(|spp| drawn.iter().all(|model| scored.contains_key(&(scene, *spp, model))))
+        let is_whole = |scene: &Scene| {
+            counts.iter().all(|spp| drawn.iter().all(|model| scored.contains_key(&(*scene, *spp, model))))
         };
-        let scenes: BTreeSet<&str> = rows.iter().map(|row| row.scene.as_str()).filter(is_whole).collect();
+        let all = rows.iter().map(|row| (row.scene.as_str(), row.reference.as_path()));
+        let scenes: BTreeSet<Scene> = all.filter(is_whole).collect();
         if counts.len() < 2 || scenes.is_empty() {
             return None;
         }
@@ -67,7 +76,7 @@ impl Samples {
         // The seeds of a scene are averaged first, so that a scene with many seeds weighs no more.
         let over_scenes = |spp: u32, model: &str, score: fn(&(f64, f64)) -> f64| -> Vec<f64> {
             let of_scene =
-                |scene: &&str| -> Vec<f64> { scored[&(*scene, spp, model)].iter().map(score).collect() };
+                |scene: &Scene| -> Vec<f64> { scored[&(*scene, spp, model)].iter().map(score).collect() };
             scenes.iter().map(|scene| mean(&of_scene(scene))).collect()
         };
         let line = |(method, colour): (&&str, RGBColor)| Line {
@@ -173,6 +182,19 @@ mod tests {
             ssim: relmse.map(|e| 1.0 - e),
             ..Row::default()
         }
+    }
+
+    #[test]
+    fn scenes_of_one_name_with_other_references_are_other_scenes() {
+        let of = |folder: &str, spp: u32| Row {
+            reference: Path::new(folder).join("a_ref.exr"),
+            ..row("a", spp, "noisy", Some(0.1))
+        };
+        let samples = Samples::new(&[of("A", 4), of("A", 16), of("B", 4)], &["noisy".into()]).unwrap();
+        assert_eq!(samples.scenes, 1, "B has one count alone");
+        let samples =
+            Samples::new(&[of("A", 4), of("A", 16), of("B", 4), of("B", 16)], &["noisy".into()]).unwrap();
+        assert_eq!(samples.scenes, 2);
     }
 
     #[test]

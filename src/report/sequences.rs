@@ -2,9 +2,12 @@
 //!
 //! A slice is the same row of pixels of all frames, one below the other. Things that move make slanted lines
 //! in it, things that stand still vertical lines, and flicker breaks the lines up. In: the images of sheets.
-//! Out: `frames/<pair>/<method>.png`, and `slices/<scene>_<spp>spp.png`.
+//! Out: `frames/<pair>/<method>.png`, and `slices/<scene>_<spp>spp.png`; pairs are called as their sheets are.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
 
 use image::{RgbImage, imageops};
 use maud::{Markup, html};
@@ -14,9 +17,10 @@ use super::{
     followed::is_next,
     page::picture_of,
     picture,
+    run::sheet_name,
     sheet::{BACKGROUND, Shown, TEXT},
 };
-use crate::{Result, frame::prepare_folder, planes::Planes, testset::Pair};
+use crate::{Error, Result, frame::prepare_folder, planes::Planes, testset::Pair};
 
 /// Name of the reference among the methods.
 const REFERENCE: &str = "reference";
@@ -33,6 +37,8 @@ const MOST_BYTES: usize = 6_000_000;
 pub struct Sequence<'a> {
     /// The frames, two at least.
     pub pairs: Vec<&'a Pair>,
+    /// The test set.
+    all: &'a [Pair],
 }
 
 /// The sequences of a test set.
@@ -44,31 +50,39 @@ pub fn sequences(pairs: &[Pair]) -> Vec<Sequence<'_>> {
         };
         match found.iter_mut().find(goes_on) {
             Some(sequence) => sequence.pairs.push(pair),
-            None => found.push(Sequence { pairs: vec![pair] }),
+            None => found.push(Sequence { pairs: vec![pair], all: pairs }),
         }
     }
     found.retain(|sequence| sequence.pairs.len() > 1);
     found
 }
 
-/// The file that shows a method's result on the frame of a pair.
-fn file(out: &Path, pair: &Pair, method: &str) -> PathBuf {
-    let safe = |name: &str| name.replace(['/', '\\', ':'], "_");
-    out.join("frames").join(safe(&pair.id())).join(format!("{}.png", safe(method)))
+/// The folder with the results on a frame, by the name of its sheet.
+fn folder(out: &Path, sheet: &str) -> PathBuf {
+    out.join("frames").join(sheet.trim_end_matches(".png").replace(':', "_"))
 }
 
-/// Stores each method's result on a frame, as its sheet shows it, and the reference.
+/// The file that shows a method's result.
+fn file(folder: &Path, method: &str) -> PathBuf {
+    folder.join(format!("{}.png", method.replace(['/', '\\', ':'], "_")))
+}
+
+/// Stores each method's result on a frame, as the sheet of that name shows it, and the reference. Those of
+/// earlier runs go.
 ///
 /// # Errors
 /// A file cannot be written.
-pub fn store(out: &Path, pair: &Pair, images: &[Shown], reference: &Planes) -> Result<()> {
-    let reference = Shown::new(REFERENCE, reference, reference);
-    for image in images.iter().chain([&reference]) {
-        let path = file(out, pair, image.name());
-        prepare_folder(path.parent().expect("it lies in a folder"))?;
-        write_png(&path, image.frame())?;
+pub fn store(out: &Path, sheet: &str, images: &[Shown], reference: &Planes) -> Result<()> {
+    let folder = folder(out, sheet);
+    if folder.exists() {
+        fs::remove_dir_all(&folder).map_err(Error::io("remove", &folder))?;
     }
-    Ok(())
+    prepare_folder(&folder)?;
+    let reference = Shown::new(REFERENCE, reference, reference);
+    images
+        .iter()
+        .chain([&reference])
+        .try_for_each(|image| write_png(&file(&folder, image.name()), image.frame()))
 }
 
 impl Sequence<'_> {
@@ -81,10 +95,15 @@ impl Sequence<'_> {
         format!("{}, {} samples per pixel", self.first().scene, self.first().spp)
     }
 
+    /// The file that shows a method's result on a frame.
+    fn file(&self, out: &Path, pair: &Pair, method: &str) -> PathBuf {
+        file(&folder(out, &sheet_name(self.all, pair)), method)
+    }
+
     /// Those of the methods whose results on all frames are stored, and the reference last.
     fn shown<'m>(&self, out: &Path, methods: &'m [String]) -> Vec<&'m str> {
         let names = methods.iter().map(String::as_str).chain([REFERENCE]);
-        names.filter(|name| self.pairs.iter().all(|pair| file(out, pair, name).is_file())).collect()
+        names.filter(|name| self.pairs.iter().all(|pair| self.file(out, pair, name).is_file())).collect()
     }
 
     /// Writes the slice through the middle row; returns its path, or none where no frames are stored or their
@@ -92,14 +111,16 @@ impl Sequence<'_> {
     fn slice(&self, out: &Path, methods: &[&str]) -> Result<Option<PathBuf>> {
         let mut strips = Vec::new();
         for method in methods {
-            let frames = self.pairs.iter().map(|pair| read(&file(out, pair, method)));
+            let frames = self.pairs.iter().map(|pair| read(&self.file(out, pair, method)));
             strips.push((*method, frames.collect::<Result<Vec<RgbImage>>>()?));
         }
         let sizes = || strips.iter().flat_map(|(_, frames)| frames).map(RgbImage::dimensions);
         let Some(size) = sizes().next().filter(|size| sizes().all(|other| other == *size)) else {
             return Ok(None);
         };
-        let path = out.join("slices").join(format!("{}_{:04}spp.png", self.first().scene, self.first().spp));
+        // The name of the first frame's sheet, without the frame.
+        let frame = self.first().frame.as_ref().map(|frame| format!(".{frame}")).unwrap_or_default();
+        let path = out.join("slices").join(sheet_name(self.all, self.first()).replacen(&frame, "", 1));
         prepare_folder(path.parent().expect("it lies in a folder"))?;
         write_png(&path, &stack(&strips, size)?)?;
         Ok(Some(path))
@@ -146,11 +167,11 @@ pub fn section(out: &Path, pairs: &[Pair], methods: &[String]) -> Result<Option<
     for sequence in sequences(pairs) {
         let shown = sequence.shown(out, methods);
         let Some(slice) = sequence.slice(out, &shown)? else { continue };
-        let picture = picture_of(&slice, 1, &format!("{}: the middle row over time", sequence.label()))?;
+        let picture = picture_of(&slice, 1, &format!("{}: the middle row of every frame", sequence.label()))?;
         let mut frames = Vec::new();
         for (f, pair) in sequence.pairs.iter().enumerate() {
             for method in &shown {
-                let image = picture::small(&file(out, pair, method))?;
+                let image = picture::small(&sequence.file(out, pair, method))?;
                 bytes += image.address.len();
                 frames.push((f, *method, image.address));
             }
@@ -232,14 +253,40 @@ mod tests {
     }
 
     #[test]
+    fn shots_of_one_name_in_two_folders_have_pictures_of_their_own() {
+        let out = tempfile::tempdir().unwrap();
+        let of = |folder: &str, frame: &str| {
+            let pair = pair("beauty", 4, Some(frame));
+            Pair {
+                noisy: Path::new(folder).join(&pair.noisy),
+                reference: Path::new(folder).join(&pair.reference),
+                ..pair
+            }
+        };
+        let pairs = [of("A", "0001"), of("A", "0002"), of("B", "0001"), of("B", "0002")];
+        assert_eq!(sequences(&pairs).len(), 2);
+        let picture = |light: f32| Planes::from_rows(3, (40, 20), |_, _, row| row.fill(light));
+        for (pair, light) in pairs.iter().zip([0.1, 0.1, 0.8, 0.8]) {
+            let image = Shown::new("m", &picture(light), &picture(light));
+            store(out.path(), &sheet_name(&pairs, pair), &[image], &picture(light)).unwrap();
+        }
+        section(out.path(), &pairs, &["m".to_owned()]).unwrap().unwrap();
+        let files = |folder: &str| fs::read_dir(out.path().join(folder)).unwrap().count();
+        assert_eq!((files("frames"), files("slices")), (4, 2));
+    }
+
+    #[test]
     fn a_slice_holds_the_middle_row_of_each_frame() {
         let out = tempfile::tempdir().unwrap();
         let pairs = [pair("pan", 4, Some("0001")), pair("pan", 4, Some("0002"))];
         let picture = |light: f32| Planes::from_rows(3, (40, 20), |_, _, row| row.fill(light));
         let reference = picture(0.5);
         for (pair, light) in pairs.iter().zip([0.0, 0.5]) {
+            let sheet = sheet_name(&pairs, pair);
+            let earlier = Shown::new("absent", &picture(light), &reference);
+            store(out.path(), &sheet, &[earlier], &reference).unwrap();
             let image = Shown::new("a:b", &picture(light), &reference);
-            store(out.path(), pair, &[image], &reference).unwrap();
+            store(out.path(), &sheet, &[image], &reference).unwrap();
         }
         let methods = ["a:b".to_owned(), "absent".to_owned()];
         let page = section(out.path(), &pairs, &methods).unwrap().unwrap().into_string();

@@ -117,6 +117,13 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
             let of = by_model.get(model.as_str()).unwrap_or(&nothing);
             let common: Vec<_> = common.iter().filter(|&&pair| valid(of, pair)).collect();
             let statistics = METRICS.map(|(_, metric)| {
+                // Every method that has a metric at all is compared over the same pairs.
+                let has =
+                    |of: &RowsOfMethod, pair: &Files| of.get(pair).is_some_and(|row| metric(row).is_some());
+                let limits = scoring.values().filter(|of| common.iter().any(|pair| has(of, pair)));
+                let limits: Vec<_> = limits.collect();
+                let common: Vec<_> =
+                    common.iter().filter(|pair| limits.iter().all(|of| has(of, pair))).copied().collect();
                 let values: Vec<f64> = common.iter().filter_map(|pair| metric(of[*pair])).collect();
                 // There is no ratio to a baseline that is exact.
                 let ratio = |pair: &&&Files| {
@@ -222,6 +229,22 @@ mod tests {
         ];
         let summary = summarise(&rows, &models(&["x", "base"]), "base");
         close(summary[0].of("relmse").ratio, 0.5);
+    }
+
+    #[test]
+    fn a_metric_that_some_rows_lack_is_compared_over_the_others() {
+        let mut rows: Vec<Row> = ["a", "b"]
+            .iter()
+            .flat_map(|scene| ["x", "y"].map(|model| row(scene, model, 4, Some(1.0))))
+            .collect();
+        for (row, flicker) in rows.iter_mut().zip([None, Some(9.0), Some(2.0), Some(4.0)]) {
+            row.flicker = flicker;
+        }
+        let found = summarise(&rows, &models(&["x", "y"]), "x");
+        close(found[1].of("flicker").mean, 4.0);
+        close(found[1].of("flicker").ratio, 2.0);
+        close(found[1].of("relmse").mean, 1.0);
+        assert_eq!(found[1].scenes, 2);
     }
 
     #[test]

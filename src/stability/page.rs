@@ -8,7 +8,7 @@ use maud::{PreEscaped, html};
 use super::content::Case;
 use crate::{
     Result,
-    report::{document, picture_of, sheet_name, write_file},
+    report::{document, picture_of, sheet_name, sheet_text, write_file},
     testset::Pair,
 };
 
@@ -23,7 +23,7 @@ pub fn write(out: &Path, maps: &[(&str, String)], cases: &[Case], worst: &[Pair]
     for pair in worst {
         let sheet = out.join("worst/sheets").join(sheet_name(worst, pair));
         if sheet.is_file() {
-            pictures.push((pair, picture_of(&sheet, worst.len(), &pair.label())?));
+            pictures.push((pair, picture_of(&sheet, worst.len(), &sheet_text(pair))?));
         }
     }
     let body = html! {

@@ -69,7 +69,7 @@ pub fn document(title: &str, body: &Markup) -> Markup {
     }
 }
 
-/// A comparison sheet as part of a page of `count` of them.
+/// A picture, one of `count` of its kind, as part of a page; `what` it shows.
 ///
 /// # Errors
 /// The file cannot be read.
@@ -77,8 +77,13 @@ pub fn picture_of(sheet: &Path, count: usize, what: &str) -> Result<Markup> {
     let Picture { address, size: (width, height) } = picture::embed(sheet, count)?;
     Ok(html! {
         img src=(address) width=(width) height=(height)
-            alt=(format!("{what}: every method, its error map and details"));
+            alt=(what);
     })
+}
+
+/// What a comparison sheet shows, in words.
+pub fn sheet_text(pair: &Pair) -> String {
+    format!("{}: every method, its error map and details", pair.label())
 }
 
 impl Page<'_> {
@@ -89,7 +94,8 @@ impl Page<'_> {
     pub fn write(&self) -> Result<()> {
         let count = self.scenes.iter().filter(|(_, sheet)| sheet.is_some()).count();
         let scenes = self.scenes.par_iter().enumerate().map(|(index, (pair, sheet))| {
-            let picture = sheet.as_ref().map(|path| picture_of(path, count, &pair.label())).transpose()?;
+            let picture =
+                sheet.as_ref().map(|path| picture_of(path, count, &sheet_text(pair))).transpose()?;
             Ok(self.scene(index, pair, sheet.as_deref(), picture))
         });
         let scenes: Vec<Markup> = scenes.collect::<Result<_>>()?;
