@@ -442,6 +442,23 @@ fn kpcn_filters_diffuse_and_specular_apart_where_blender_wrote_light_passes() {
 }
 
 #[test]
+fn a_run_without_its_checkpoint_does_not_begin_anew() {
+    let out = tempfile::tempdir().unwrap();
+    let run = out.path().join("run");
+    assert!(train_with("lbf", "64", &run, 2).status().unwrap().success());
+    let last = fs::read(run.join("last.safetensors")).unwrap();
+    fs::remove_file(run.join("checkpoint.safetensors")).unwrap();
+    let refused =
+        Command::new(cargo_bin("demc")).args(["train", "--resume", "--out"]).arg(&run).output().unwrap();
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(
+        refused.status.code() == Some(1) && said.contains("checkpoint.safetensors: is missing"),
+        "{said}"
+    );
+    assert_eq!(fs::read(run.join("last.safetensors")).unwrap(), last);
+}
+
+#[test]
 fn a_method_without_weights_says_how_to_get_them() {
     let input = format!("{}/tests/data/s0010_outdoor_0004spp.exr", env!("CARGO_MANIFEST_DIR"));
     let mut denoise = Command::new(cargo_bin("demc"));

@@ -62,6 +62,9 @@ class Ledger:
         """Compares the files with their hashes; prints a line for each that is missing or differs, and
         returns how many those are."""
         rows, bad = self.rows(), 0
+        if not rows:
+            print(f"{self.path}: is missing or empty, so nothing tells what the folder should hold")
+            return 1
         for name, row in rows.items():
             path = os.path.join(self.folder, name)
             wrong = (

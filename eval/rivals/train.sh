@@ -15,6 +15,7 @@ demc=${DEMC:-demc}
 # shellcheck disable=SC2086 # the methods are words
 [ $# -gt 0 ] || set -- $methods
 mkdir -p "$out"
+failed=0
 
 for name in "$@"; do
     recipe "$name"
@@ -38,8 +39,16 @@ for name in "$@"; do
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
         if [ -n "$time" ]; then used=$((spent + time)); fi
         echo "$used" >"$out/$name.seconds"
-        if [ "$used" -ge "$seconds" ]; then kill -INT $pid 2>/dev/null || true; wait $pid || true; break; fi
+        if [ "$used" -ge "$seconds" ]; then kill -INT $pid 2>/dev/null || true; break; fi
     done
-    wait $pid 2>/dev/null || true
+    status=0
+    wait $pid 2>/dev/null || status=$?
+    # 130: it was interrupted when its time was over.
+    if [ $status -ne 0 ] && [ $status -ne 130 ]; then
+        echo "$name failed: $(tail -n 1 "$out/$name.log")" >&2
+        failed=1
+        continue
+    fi
     echo "$name: $used s of processor time; $(tail -n 1 "$out/$name/log.csv")"
 done
+exit $failed

@@ -34,7 +34,9 @@ def pairs(folder):
         # Half buffers and further noise seeds of a still are among its noisy frames.
         ending = f"*{glob.escape(frame)}.exr" if frame else "*.exr"
         noisy = glob.glob(os.path.join(folder, glob.escape(scene) + "_[0-9]*spp" + ending))
-        yield scene + frame, reference, sorted(noisy)
+        # A scene whose name goes on, such as kitchen_2 beside kitchen, is another one.
+        own = re.compile(re.escape(scene) + r"_\d+spp(_\w+)?(\.-?\d+)?\.exr")
+        yield scene + frame, reference, sorted(file for file in noisy if own.fullmatch(os.path.basename(file)))
 
 
 def planes(channels, ending, letters):

@@ -75,6 +75,8 @@ def read(folders):
         log = lambda planes: torch.log(planes + TINY)
         features = torch.from_numpy(tensors["features"])[:, :height // SQUARE, :width // SQUARE]
         features = torch.cat([features, log(changed), log(around(changed))])
+        # Crops and seeds of a scene are held out together.
+        scene = re.sub(r"(_c\d+)?(_n\d+|_mean)?$", "", scene)
         frames.append((features.float(), means(error).mean(0, keepdim=True).float(), scene, samples))
     return frames
 

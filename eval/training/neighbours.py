@@ -2,7 +2,7 @@
 results (src/filters/temporal/likeness.rs).
 
     python blender_scripts/generate_scenes.py --out SEQUENCES --seeds 520000:521000 --assets ASSETS --sequence 5 \\
-        --size 160 --spp 1,4,4,16 --draw-spp 1 --ref-spp 192 --denoise-references
+        --size 160 --spp 1,4,16 --draw-spp 1 --ref-spp 192 --denoise-references
     cargo run --release --example neighbour_features -- demc-m SEQUENCES/manifest.csv FEATURES
     python eval/training/neighbours.py render FEATURES --out src/filters/agreement.safetensors
     cargo run --release --example neighbour_features -- demc-m SEQUENCES/manifest.csv FEATURES
@@ -171,10 +171,13 @@ def main():
     seen = load([path for path in paths if not (options.hold_out and held_out(path))])
     model, standard = train(seen, options.steps, options.seed, options.kernel)
     report(seen, model, standard)
-    if options.hold_out:
-        report(load([path for path in paths if held_out(path)]), model, standard)
     if options.out:
         perceptron.save(model, standard, options.out)
+    kept = [path for path in paths if held_out(path)] if options.hold_out else []
+    if kept:
+        report(load(kept), model, standard)
+    elif options.hold_out:
+        print(f"no sequence of {len(paths)} is held out: nothing to report on")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ Needs a Python that has Blender as a module (`pip install bpy==5.0.1`), and the 
 
 import argparse
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -77,10 +78,15 @@ def train(options, name, data, steps, settings):
     """Trains, or goes on training; returns the weights after the last step, which are averaged."""
     out = os.path.join(options.out, name)
     steps = max(round(steps * options.scale), LEAST_STEPS)
-    if os.path.exists(os.path.join(out, "config.json")):
+    config = os.path.join(out, "config.json")
+    if os.path.exists(config):
+        with open(config, encoding="utf-8") as file:
+            begun = json.load(file)["steps"]
+        if begun != steps:
+            sys.exit(f"recipe.py: {out} is a run of {begun} steps, not of {steps}: name another --out, or delete it")
         command = [options.demc, "train", "--resume", "--out", out]
     else:
-        command = [options.demc, "train", "--data", data, "--out", out, "--patch", "128", "--batch", "4", *settings.split()]
+        command = [options.demc, "train", "--data", data, "--out", out, "--patch", "128", "--batch", "4", *settings]
         command += ["--steps", str(steps), "--every", str(max(steps // 20, 100)), "--average", f"{1 - 20 / steps:.6f}"]
     subprocess.run(command, check=True)
     return os.path.join(out, "last.safetensors")
@@ -114,10 +120,10 @@ def main():
     parser.add_argument("--demc", default="demc", help="the program demc")
     options = parser.parse_args()
     training, test = rendered(options)
-    settings = f"{PREFILTER} --widths {PREFILTER_WIDTHS[options.model]}"
-    prefilter = train(options, "prefilter", training, PREFILTER_STEPS, settings)
-    settings = f"{NETWORK} --model {options.model} --prefilter {prefilter}"
-    weights = train(options, "network", training, NETWORK_STEPS, settings)
+    settings = [*PREFILTER.split(), "--widths", PREFILTER_WIDTHS[options.model]]
+    prefilter = train(options, f"prefilter-of-{options.model}", training, PREFILTER_STEPS, settings)
+    settings = [*NETWORK.split(), "--model", options.model, "--prefilter", prefilter]
+    weights = train(options, options.model, training, NETWORK_STEPS, settings)
     reached = score(options, test, weights)
     bounds = BOUNDS.get((options.scale, options.model))
     if bounds is None:

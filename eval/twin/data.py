@@ -1,5 +1,6 @@
 """Packs in memory, and the crops drawn from them, as src/train/dataset.rs and src/augment.rs draw theirs."""
 
+import hashlib
 import random
 
 import torch
@@ -32,6 +33,10 @@ class Frames:
                 self.views.append(view)
                 self.pairs += [(len(self.views) - 1, i) for i in range(len(view["spp"]))]
         self.sizes = [self.views[view]["parts"]["reference"][0].numel() for view, _ in self.pairs]
+
+    def references(self):
+        """A hash of each view's reference."""
+        return {hashlib.sha256(view["parts"]["reference"].cpu().numpy().tobytes()).digest() for view in self.views}
 
     def __len__(self):
         return len(self.pairs)

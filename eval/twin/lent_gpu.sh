@@ -6,7 +6,7 @@
 #
 # PREFILTER=weights takes a prefilter that is trained already. Packs named val*.pack are validated on.
 set -euo pipefail
-cd "$(dirname "$0")"
+here=$(dirname "$0")
 : "${PACKS:?a folder of packs}" "${OUT:?a folder for the results}"
 model=${MODEL:-demc-m} prefilter=${PREFILTER:-}
 export PYTHONUNBUFFERED=1
@@ -14,9 +14,9 @@ mapfile -t val < <(find "$PACKS" -name 'val*.pack' | sort)
 mapfile -t data < <(find "$PACKS" -name '*.pack' ! -name 'val*' | sort)
 common=(--data "${data[@]}" --val "${val[@]}" --every 45 --resume --batch "${BATCH:-48}")
 if [ -z "$prefilter" ]; then
-    python3 train.py --model prefilter --size-of "$model" --loss geomean --minutes "${PREFILTER_MINUTES:-2}" \
+    python3 "$here/train.py" --model prefilter --size-of "$model" --loss geomean --minutes "${PREFILTER_MINUTES:-2}" \
         --lr 2e-3:1e-6 --weight-decay 0.1 --out "$OUT/prefilter" "${common[@]}"
     prefilter=$OUT/prefilter/last.safetensors
 fi
-python3 train.py --model "$model" --prefilter "$prefilter" --raw-references --guide-dropout "${GUIDE_DROPOUT:-0.15}" \
+python3 "$here/train.py" --model "$model" --prefilter "$prefilter" --raw-references --guide-dropout "${GUIDE_DROPOUT:-0.15}" \
     --minutes "${MINUTES:-7}" --lr 3e-3:1e-6 --weight-decay 0.2 --out "$OUT/$model" "${common[@]}"

@@ -1,7 +1,7 @@
 """Trains a built-in network, or its prefilter, with PyTorch, on a GPU that is lent for minutes or on a CPU.
 
-    python train.py --model prefilter --data *.pack --val dev.pack --minutes 3 --out prefilter
-    python train.py --model demc-m --prefilter prefilter/last.safetensors --data *.pack --val dev.pack \\
+    python train.py --model prefilter --data train*.pack --val dev.pack --minutes 3 --out prefilter
+    python train.py --model demc-m --prefilter prefilter/last.safetensors --data train*.pack --val dev.pack \\
         --minutes 10 --out run
 
 The folder holds last.safetensors (averaged weights, which the crate reads), log.csv, and checkpoint.pt, from
@@ -26,6 +26,8 @@ from data import LEAST, Frames
 from optimizer import Optimizer
 
 _WARM_UP = 100
+# Validation errors below this count as this: a black frame that is exact would outweigh all others.
+_LEAST_RELMSE = 1e-6
 
 
 def parse():
@@ -92,7 +94,7 @@ def validate(net, frames, options):
         frame = frames.whole(index)
         image, exposed = net(frame["noisy"], options.learn_guides)
         image, reference = image / exposed, net.target(frame["reference"], frame.get("guides"))
-        error = losses.relmse(image, reference).clamp(min=1e-12).log().item()
+        error = losses.relmse(image, reference).clamp(min=_LEAST_RELMSE).log().item()
         ssim = losses.displayed_ssim(image, reference).item() if net.makes_radiance else float("nan")
         found.setdefault(frame["spp"], []).append((error, ssim))
 
@@ -139,6 +141,8 @@ def main():
     if not len(frames):
         what = " whose references keep their guides" if needs_guides else ""
         sys.exit(f"train.py: no pair of {options.patch}x{options.patch} pixels or more{what}; pack others")
+    if shared := validation.references() & frames.references():
+        sys.exit(f"train.py: {len(shared)} views of --val are among those of --data: pack others, or name packs apart")
     rng, step, before, pixels = random.Random(options.seed), 0, 0.0, 0
     checkpoint = os.path.join(options.out, "checkpoint.pt")
     if options.resume and os.path.exists(checkpoint):
@@ -172,7 +176,7 @@ def main():
         os.replace(f"{checkpoint}.tmp", checkpoint)
         saved, total, counted = time.time(), 0.0, 0
 
-    lr = options.lr[0]
+    lr, began = options.lr[0], step
     while True:
         elapsed = before + time.time() - start
         done = max(
@@ -200,7 +204,8 @@ def main():
         total, counted = total + loss.item(), counted + 1
         if time.time() - saved > options.every:
             save()
-    save()
+    if step > began or step == 0:
+        save()
     print(f"{pixels / 1e6 / max(before + time.time() - start, 1e-9):.3f} Mpx/s")
 
 

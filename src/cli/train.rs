@@ -174,26 +174,39 @@ fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether a pair is held out: decided by its reference's file name without the numbers of frame and crop, so
-/// that every sample count, seed, frame and crop of a view goes the same way. (FNV-1a, Fowler, Noll, Vo.)
+/// Whether a pair is held out: decided by its view, so that every sample count, seed, frame and crop of a view
+/// goes the same way. (FNV-1a, Fowler, Noll, Vo.)
 fn held_out(pair: &Pair) -> bool {
+    let hash = format!("{}_ref.exr", view(pair))
+        .bytes()
+        .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
+    // The low bits of this hash depend on few bits of the name.
+    (hash >> 32) % HOLD_OUT == 0
+}
+
+/// The view that a pair shows, as its reference's file is called before `_ref`, or else the scene, without the
+/// numbers of frame, seed and crop.
+fn view(pair: &Pair) -> String {
     let mut name = pair.reference.file_name().unwrap_or_default().to_string_lossy().into_owned();
     if let Some(frame) = &pair.frame
         && let Some(at) = name.rfind(&format!(".{frame}."))
     {
         name.replace_range(at..=at + frame.len(), "");
     }
-    if let Some((view, crop)) = name.strip_suffix("_ref.exr").and_then(|stem| stem.rsplit_once("_c"))
-        && !crop.is_empty()
-        && crop.bytes().all(|c| c.is_ascii_digit())
-    {
-        name = format!("{view}_ref.exr");
+    if let Some(stem) = name.strip_suffix("_ref.exr") {
+        return without_number(stem, "_c").into();
     }
-    let hash = name
-        .bytes()
-        .fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3));
-    // The low bits of this hash depend on few bits of the name.
-    (hash >> 32) % HOLD_OUT == 0
+    let scene = without_number(&pair.scene, ".");
+    let scene = scene.strip_suffix("_mean").unwrap_or(without_number(scene, "_n"));
+    without_number(scene, "_c").into()
+}
+
+/// A name without a number at its end, with what stands before the number.
+fn without_number<'a>(name: &'a str, mark: &str) -> &'a str {
+    match name.rsplit_once(mark) {
+        Some((stem, number)) if !number.is_empty() && number.bytes().all(|c| c.is_ascii_digit()) => stem,
+        _ => name,
+    }
 }
 
 /// Pairs with absolute paths, since a run may be resumed from another folder.
@@ -250,6 +263,11 @@ impl Args {
             return Err(usage(
                 "nothing left to train on once one scene in ten is held out; add pairs or --val",
             ));
+        }
+        if validation.is_empty() && training.len() > 1 {
+            warn_line(
+                "note: no scene is held out, so nothing tells the best weights from the last: name some with --val",
+            );
         }
         if network.architecture == Architecture::Kpcn && !has_light_passes(&training[0])? {
             warn_line(&format!(
@@ -393,6 +411,18 @@ mod tests {
             let counts = ["out", "threads"].iter().any(|name| argument.get_id() == name);
             assert_eq!(refused.contains(&argument), !counts, "{argument}");
         }
+    }
+
+    #[test]
+    fn scenes_of_other_layouts_are_held_out_as_a_whole() {
+        let of = |scene: &str, reference: &str| Pair { scene: scene.into(), ..pair(reference.into(), None) };
+        for name in ["shot/gt.exr", "gt/shot.0001.exr", "gt/shot.0002.exr"] {
+            for scene in ["shot", "shot_n3", "shot_mean", "shot_c1", "shot_c1_n2", "shot.0007"] {
+                assert_eq!(view(&of(scene, name)), "shot", "{scene}");
+            }
+        }
+        let held = (0..200).filter(|i| held_out(&of(&format!("scene{i}"), "x/ref.exr"))).count();
+        assert!((8..40).contains(&held), "{held} of 200");
     }
 
     #[test]

@@ -54,6 +54,9 @@ const MOST_SKIPPED: usize = 10;
 /// Seconds between checkpoints, which is about the most that is lost when a run is killed.
 const CHECKPOINT_SECONDS: f64 = 60.0;
 
+/// Validation errors below this count as this.
+const LEAST_RELMSE: f64 = 1e-6;
+
 /// Trains into `out` until the last step, or until `stop` is set; then the state is saved and
 /// [`Error::Interrupted`] returned. With `resume`, goes on from the last checkpoint. No checkpoint is written
 /// after a skipped step unless it is the last: where all steps are skipped, the weights of the checkpoint
@@ -70,8 +73,11 @@ pub fn run(
 ) -> Result<()> {
     prepare_folder(out)?;
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join(CHECKPOINT));
-    let resume = resume && checkpoint_path.exists();
     if resume {
+        if !checkpoint_path.exists() {
+            let why = "is missing, and without it a run cannot go on; begin another one, with --init last.safetensors";
+            return Err(Error::invalid(&checkpoint_path, why));
+        }
         checkpoint::check_size(&checkpoint_path, &options.network)?;
     }
     let mut network = match &options.init {
@@ -304,7 +310,8 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
         if image.non_finite() > 0 {
             return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
         }
-        logs.push(metrics::error::relmse(image, reference).max(f64::MIN_POSITIVE).ln());
+        // A black frame that is exact would outweigh all others.
+        logs.push(metrics::error::relmse(image, reference).max(LEAST_RELMSE).ln());
         if network.makes_radiance()
             && let Some(exposure) = metrics::display::exposure(reference)
         {
