@@ -18,7 +18,7 @@ pub enum Kind {
     /// again, so that texture stays sharp, but gets none of the gains by which light is corrected.
     Colour,
     /// A share, such as alpha: an average by the beauty's kernels alone, so that it stays between the least
-    /// and the most of what was rendered.
+    /// and the most of what was rendered. What of it is kept is judged by itself (`filters::coverage`).
     Share,
 }
 
@@ -29,7 +29,7 @@ pub struct Companion {
     pub kind: Kind,
     /// Noisy before, denoised after: (3, H, W), or (1, H, W).
     pub planes: Planes,
-    /// What it was before, once it is denoised.
+    /// What it was before, while a network denoises it.
     pub rendered: Planes,
 }
 

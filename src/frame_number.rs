@@ -13,9 +13,10 @@ pub fn frame_number(file: &Path) -> Option<i64> {
 pub fn split(stem: &str) -> Option<(&str, i64)> {
     let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
     let number: i64 = stem[head.len()..].parse().ok()?;
-    // A minus is the number's where it stands for nothing else: at the beginning or after a dot.
+    // A minus is the number's where it stands for nothing else: at the beginning, or after a dot or a `_`, as in
+    // Blender's `shot_-0003.exr`.
     Some(match head.strip_suffix('-') {
-        Some(rest) if rest.is_empty() || rest.ends_with('.') => (rest, -number),
+        Some(rest) if rest.is_empty() || rest.ends_with(['.', '_']) => (rest, -number),
         _ => (head, number),
     })
 }
@@ -39,6 +40,7 @@ mod tests {
             ("shot0017.exr", Some(17)),
             ("a-3/shot-0017.exr", Some(17)),
             ("shot.-0003.exr", Some(-3)),
+            ("shot_-0003.exr", Some(-3)),
             ("0001.exr", Some(1)),
             ("shot_0004spp.exr", None),
             ("shot.exr", None),

@@ -115,12 +115,17 @@ fn has_cycles_normal(layer: &Layer) -> bool {
 fn guide(frame: &Frame, of: &Layer, pass: Pass, set: &PassSet) -> Result<(Layer, Planes)> {
     let mut layers = passes::layers_of(frame, pass);
     let own_view = layers.iter().position(|layer| layer.view == of.view).unwrap_or(0);
+    // A file with guides of several view layers has those of the one that is denoised, by its name.
+    let own = layers
+        .iter()
+        .position(|layer| (&layer.name, &layer.view) == (&of.name, &of.view))
+        .unwrap_or(own_view);
     if layers.is_empty() {
         let why =
             format!("holds no {pass} and no picture to take for it; `demc inspect` lists what it holds");
         return Err(Error::invalid(frame.path(), why));
     }
-    let layer = layers.swap_remove(own_view);
+    let layer = layers.swap_remove(own);
     let mut found = passes::read_layer(frame, &layer, &[pass])?;
     set.check_same_pixels(&found, &format!("its {pass} in"))?;
     let planes = found.remove(pass).expect("the layer holds it");

@@ -127,6 +127,27 @@ fn light_passes_are_replaced_where_the_beauty_is() {
 }
 
 #[test]
+fn layers_go_along_around_the_seam_of_a_panorama() {
+    let out = tempfile::tempdir().unwrap();
+    for (name, how) in [
+        ("sky.exr", "--model demc-s --passes"),
+        ("film.exr", "--model demc-s"),
+        ("film.exr", "--model demc-l --passes"),
+    ] {
+        let done = denoise(name, out.path(), &format!("{how} --wrap x --overwrite"));
+        let beauty = layer(&done, "Denoised");
+        assert!(beauty.iter().all(|v| v.is_finite()));
+        if name == "sky.exr" {
+            assert_adds_up(
+                &sum_of_passes(name, |pass| layer(&done, &format!("{pass}.Denoised"))),
+                &beauty,
+                "around the seam",
+            );
+        }
+    }
+}
+
+#[test]
 fn a_result_without_light_passes_is_not_taken_for_one_with_them() {
     let out = tempfile::tempdir().unwrap();
     denoise("sky.exr", out.path(), "--model demc-s");

@@ -272,6 +272,21 @@ fn guides_come_from_files_of_their_own() {
 }
 
 #[test]
+fn guides_of_a_file_are_those_of_the_view_layer_that_is_denoised() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("two.exr");
+    std::fs::copy(data("blender4_two_layers.exr"), &file).unwrap();
+    for layer in ["ViewLayer", "Second.Layer"] {
+        let arguments = ["--view-layer", layer];
+        let red = |more: &[&str]| {
+            let done = denoise(&file, &[&arguments[..], more].concat());
+            values(&read_exr(done), &format!("{layer}.Denoised.R"))
+        };
+        assert_eq!(red(&[]), red(&["--albedo", file.to_str().unwrap()]), "{layer}");
+    }
+}
+
+#[test]
 fn names_of_parts_mean_nothing_where_channels_say_it() {
     let dir = tempfile::tempdir().unwrap();
     let expected = expected(dir.path());

@@ -114,6 +114,15 @@ impl Along {
     }
 
     fn take_lights(&mut self, shot: &mut Shot, notes: &mut Vec<String>) {
+        let below = shot.passes.get(Pass::Combined).map_or(0, |beauty| {
+            let is_below = |pixel: &usize| (0..beauty.channels).any(|c| beauty.channel(c)[*pixel] < 0.0);
+            (0..beauty.pixels()).filter(is_below).count()
+        });
+        if below > 0 {
+            notes.push(format!(
+                "Combined is below zero in {below} pixels, and is denoised to zero there: the light passes do not add up to it"
+            ));
+        }
         for (lights, colour) in LIT {
             let held = lights.map(|light| shot.passes.get(light).is_some());
             let Some(colours) = shot.passes.remove(colour) else {

@@ -52,8 +52,10 @@ pub(super) fn joined(
         companion.planes = widen(&companion.planes);
     }
     let (radiance, error) = run(&wide, companions)?;
-    for Companion { planes, rendered, .. } in companions {
-        [planes, rendered].into_iter().for_each(|planes| *planes = narrow(planes));
+    for companion in companions {
+        companion.planes = narrow(&companion.planes);
+        // It was of use to the model alone, which may have dropped it.
+        companion.rendered = Planes::default();
     }
     Ok((narrow(&radiance), error.map(|error| error.without_margins(MARGIN))))
 }

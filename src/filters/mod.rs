@@ -3,7 +3,7 @@
 //! [`nl_means`] holds the patch weights and the filter that averages by them. [`regression`] holds weighted
 //! first-order fits over whole windows, and [`refit`] fits that correct a denoised frame, whose sums are
 //! gathered in [`squares`]; [`solve`] solves the small symmetric systems of both. [`variance`] estimates the
-//! noise, and [`shrinkage`] takes back what was changed beyond the noise. Work is cut into tiles of the
+//! noise, and [`shrinkage`] takes back what was changed beyond the noise, [`coverage`] the same of alpha. Work is cut into tiles of the
 //! frame, one a thread; inner loops run over consecutive pixels so that the compiler can vectorise them.
 //! Results do not depend on the number of threads.
 //!
@@ -13,6 +13,7 @@
 pub mod agreement;
 pub mod blocks;
 mod box_mean;
+pub mod coverage;
 pub mod motion;
 pub mod nl_means;
 mod padded;

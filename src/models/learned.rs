@@ -14,7 +14,10 @@ use crate::{
     companion::{Companion, Kind},
     error::remedy,
     features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
-    filters::shrinkage::{Render, Shrinkage, take_back},
+    filters::{
+        coverage,
+        shrinkage::{Render, Shrinkage, take_back},
+    },
     nn::Precision,
     passes::{Pass, PassSet},
     planes::Planes,
@@ -267,7 +270,13 @@ impl Learned {
             None
         };
         for (companion, shares) in companions.iter_mut().zip(shares.iter().cycle()) {
-            take_back(&mut companion.planes, &std::mem::take(&mut companion.rendered), shares);
+            let rendered = std::mem::take(&mut companion.rendered);
+            match companion.kind {
+                Kind::Light | Kind::Colour => take_back(&mut companion.planes, &rendered, shares),
+                Kind::Share => {
+                    coverage::take_back(&mut companion.planes, &rendered, render.samples_or_guess())
+                }
+            }
         }
         Ok((image, error))
     }

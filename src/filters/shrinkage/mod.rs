@@ -98,7 +98,7 @@ pub struct Render<'a> {
 
 impl Render<'_> {
     /// Samples of a pixel, [`UNKNOWN_SAMPLES`] where the file does not tell.
-    fn samples_or_guess(&self) -> f32 {
+    pub fn samples_or_guess(&self) -> f32 {
         self.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32
     }
 }
