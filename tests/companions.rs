@@ -14,12 +14,18 @@ use demc::passes::{self, Pass, PassSet};
 use predicates::str::contains;
 use tempfile::TempDir;
 
-/// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4 and of 256
+/// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4, 64 and 256
 /// samples.
 static RENDERS: LazyLock<TempDir> = LazyLock::new(|| {
     let folder = tempfile::tempdir().unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data/light_passes.py");
-    for (name, options) in [("sky", &["4"][..]), ("film", &["4", "film"]), ("clean", &["256", "film"])] {
+    let all = [
+        ("sky", &["4"][..]),
+        ("film", &["4", "film"]),
+        ("many", &["64", "film"]),
+        ("clean", &["256", "film"]),
+    ];
+    for (name, options) in all {
         let path = folder.path().join(format!("{name}.exr"));
         run(Command::new(python::python()).arg(&script).arg(path).args(options));
     }
@@ -200,6 +206,19 @@ fn alpha_is_denoised_with_the_beauty_and_fits_it_over_any_background() {
             truth[..10 * clean.width].iter().all(|v| *v == 0.0) && above.iter().all(|v| *v < 1e-3),
             "{model}"
         );
+    }
+}
+
+#[test]
+fn alpha_of_many_samples_is_not_blurred() {
+    let out = tempfile::tempdir().unwrap();
+    let alpha = |path: &Path| passes::load(path, None).unwrap().get(Pass::Alpha).unwrap().data.to_vec();
+    let [noisy, truth] = ["many.exr", "clean.exr"].map(|name| alpha(&render(name)));
+    let error = |of: &[f32]| of.iter().zip(&truth).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+    for model in ["demc-s", "demc-m", "demc-l"] {
+        let done = alpha(&denoise("many.exr", out.path(), &format!("--model {model} --overwrite --replace")));
+        let [before, after] = [&noisy, &done].map(|alpha| error(alpha));
+        assert!(after < before, "{model}: alpha is off by {after}, as rendered by {before}");
     }
 }
 
