@@ -31,7 +31,9 @@ const GUIDES: [Pass; 2] = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
 /// # Errors
 /// The pattern wants a number, and the frame has none.
 pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
-    let Some((head, width, tail)) = placeholder(pattern) else { return Ok(pattern.into()) };
+    let Some(Numbered { folder, head, width, tail, rest }) = numbered(pattern) else {
+        return Ok(pattern.into());
+    };
     let Some(number) = frame_number(frame) else {
         let pattern = pattern.display();
         let why = format!("its name ends in no number to put into {pattern}; rename it, or name one file");
@@ -39,32 +41,53 @@ pub fn beside(frame: &Path, pattern: &Path) -> Result<PathBuf> {
     };
     // As Blender writes it: the width is that of the digits, whatever the sign.
     let sign = if number < 0 { "-" } else { "" };
-    Ok(pattern.with_file_name(format!("{head}{sign}{:0width$}{tail}", number.unsigned_abs())))
+    let part = folder.join(format!("{head}{sign}{:0width$}{tail}", number.unsigned_abs()));
+    // An empty rest would add a slash.
+    Ok(if rest.as_os_str().is_empty() { part } else { part.join(rest) })
 }
 
 /// Whether a pattern names another file for each frame.
 pub fn has_number(pattern: &Path) -> bool {
-    placeholder(pattern).is_some()
+    numbered(pattern).is_some()
 }
 
-/// What stands in a pattern's last part before the place of the number, its least width, and what stands behind;
-/// none where a file has the pattern for its name.
-fn placeholder(pattern: &Path) -> Option<(String, usize, String)> {
-    let name = pattern.file_name()?.to_string_lossy();
-    let (head, width, tail) = match name.rfind('#') {
-        Some(last) => {
-            let head = name[..=last].trim_end_matches('#');
-            (head, last + 1 - head.len(), &name[last + 1..])
+/// A pattern that names another file for each frame.
+struct Numbered {
+    folder: PathBuf,
+    /// What stands before the place of the number, its least width, and what stands behind, in one part of the
+    /// path.
+    head: String,
+    width: usize,
+    tail: String,
+    /// The parts that come after it.
+    rest: PathBuf,
+}
+
+/// Where the number has its place: in the last part of a pattern that has one and no file or folder for its
+/// name.
+fn numbered(pattern: &Path) -> Option<Numbered> {
+    pattern.ancestors().find_map(|part| {
+        let name = part.file_name()?.to_string_lossy();
+        let (head, width, tail) = place(&name)?;
+        if part.exists() {
+            return None;
         }
-        None => {
-            let (head, rest) = name.rsplit_once('%')?;
-            let (width, tail) = rest.split_once('d')?;
-            let width =
-                if width.is_empty() { Some(1) } else { width.parse().ok().filter(|width| *width < 20) };
-            (head, width?, tail)
-        }
-    };
-    (!pattern.is_file()).then(|| (head.into(), width, tail.into()))
+        let rest = pattern.strip_prefix(part).expect("it begins so").to_owned();
+        let folder = part.parent().unwrap_or(Path::new("")).to_owned();
+        Some(Numbered { folder, head: head.into(), width, tail: tail.into(), rest })
+    })
+}
+
+/// What stands in a name before the place of the number, the number's least width, and what stands behind.
+fn place(name: &str) -> Option<(&str, usize, &str)> {
+    if let Some(last) = name.rfind('#') {
+        let head = name[..=last].trim_end_matches('#');
+        return Some((head, last + 1 - head.len(), &name[last + 1..]));
+    }
+    let (head, rest) = name.rsplit_once('%')?;
+    let (width, tail) = rest.split_once('d')?;
+    let width = if width.is_empty() { Some(1) } else { width.parse().ok().filter(|width| *width < 20) };
+    Some((head, width?, tail))
 }
 
 impl Sources {
@@ -150,10 +173,14 @@ mod tests {
         assert_eq!(named("rgb.exr", "albedo.exr").unwrap(), "albedo.exr");
         assert_eq!(named("rgb.exr", "100%.exr").unwrap(), "100%.exr");
         assert_eq!(named("rgb.17.exr", "cut#3/50%done/albedo.#.exr").unwrap(), "cut#3/50%done/albedo.17.exr");
+        assert_eq!(named("rgb.17.exr", "takes/####/albedo.exr").unwrap(), "takes/0017/albedo.exr");
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("take#2.exr");
         std::fs::write(&path, "").unwrap();
         assert!(beside(Path::new("rgb.17.exr"), &path).unwrap() == path && !has_number(&path));
+        let inside = folder.path().join("50%done/albedo.exr");
+        std::fs::create_dir(folder.path().join("50%done")).unwrap();
+        assert!(beside(Path::new("rgb.17.exr"), &inside).unwrap() == inside);
         assert!(named("rgb.exr", "albedo.####.exr").unwrap_err().to_string().contains("no number"));
         assert!(has_number(Path::new("a.#.exr")) && !has_number(Path::new("a.exr")));
     }

@@ -245,10 +245,17 @@ fn files_are_the_same_by_another_path_and_go_by_their_new_names() {
         fs::copy(data(&format!("s0000_room_{kind}.exr")), set.path().join(format!("room_{kind}.exr")))
             .unwrap();
     }
-    let run = |test_set: &Path| eval(test_set, out.path(), &["--models", "noisy", "--no-sheets"]).success();
-    run(set.path());
+    let run =
+        |test_set: &Path| eval(test_set, out.path(), &["--models", "noisy,nfor", "--no-sheets"]).success();
+    eval(set.path(), out.path(), &["--models", "noisy", "--no-sheets"]).success();
     run(&set.path().join("."));
-    assert_eq!(table(&out.path().join("scores.csv")).len(), 1);
+    assert_eq!(table(&out.path().join("scores.csv")).len(), 2);
+    let summary = table(&out.path().join("summary.csv"));
+    assert!(
+        summary.iter().all(|line| line["scenes"] == "1" && !line["relmse_mean"].is_empty()),
+        "{summary:?}"
+    );
+    run(&set.path().join(".")).stderr(predicate::str::contains("2 of 2 rows are there already"));
     let manifest = set.path().join("manifest.csv");
     for (scene, spp) in [("room", 4), ("kitchen", 16)] {
         fs::write(
@@ -258,8 +265,23 @@ fn files_are_the_same_by_another_path_and_go_by_their_new_names() {
         .unwrap();
         run(&manifest);
         let rows = table(&out.path().join("scores.csv"));
-        assert_eq!((rows.len(), &*rows[0]["scene"], &*rows[0]["spp"]), (1, scene, &*spp.to_string()));
+        assert_eq!((rows.len(), &*rows[0]["scene"], &*rows[0]["spp"]), (2, scene, &*spp.to_string()));
     }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_frame_that_is_held_is_a_frame_of_its_own() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for kind in ["0004spp", "ref"] {
+        let of = |frame: u32| set.path().join(format!("shot_{kind}.{frame:04}.exr"));
+        fs::copy(data(&format!("s0000_room_{kind}.exr")), of(1)).unwrap();
+        std::os::unix::fs::symlink(of(1), of(2)).unwrap();
+    }
+    eval(set.path(), out.path(), &["--models", "noisy", "--no-sheets"]).success();
+    let scenes: Vec<String> =
+        table(&out.path().join("scores.csv")).iter().map(|row| row["scene"].clone()).collect();
+    assert_eq!(scenes, ["shot.0001", "shot.0002"]);
 }
 
 #[test]

@@ -57,6 +57,33 @@ fn a_result_does_not_take_the_place_of_another_input() {
 }
 
 #[test]
+fn nor_does_one_that_comes_in_later() {
+    let folder = folder_with(&["b/x.exr"]);
+    fs::create_dir(folder.path().join("a")).unwrap();
+    let before = fs::read(folder.path().join("b/x.exr")).unwrap();
+    let mut watch = std::process::Command::new(assert_cmd::cargo::cargo_bin("demc"));
+    watch
+        .current_dir(folder.path())
+        .args("denoise a b --recursive --out . --overwrite --watch 4 --model noisy".split(' '));
+    let watch = watch.stderr(std::process::Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(2500));
+    fs::create_dir(folder.path().join("a/b")).unwrap();
+    fs::copy(folder.path().join("b/x.exr"), folder.path().join("a/b/x.exr")).unwrap();
+    let ended = watch.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.code() == Some(1) && said.contains("would overwrite the input b/x.exr"), "{said}");
+    assert_eq!(fs::read(folder.path().join("b/x.exr")).unwrap(), before);
+}
+
+#[test]
+fn a_result_beside_other_inputs_can_be_denoised_again() {
+    let folder = folder_with(&["in/a.exr", "in/b.exr"]);
+    denoise(folder.path(), "in/a.exr --out first").success();
+    fs::rename(folder.path().join("first/a.exr"), folder.path().join("in/a.exr")).unwrap();
+    denoise(folder.path(), "in --out .").success().stdout(contains("2 denoised"));
+}
+
+#[test]
 fn results_are_no_inputs_the_second_time() {
     let folder = folder_with(&["renders/one/a.exr", "renders/two/b.exr", "flat/c.exr"]);
     let pattern = "renders/*/*.exr --out renders/clean";

@@ -46,11 +46,12 @@ for name in "$@"; do
             used=$time
             sleep 1
         done
-        # A trial that diverges has no scores; the others go on.
         if wait $pid; then
             error=$(tail -n 1 "$run/log.csv" | cut -d, -f5,6)
         else
             echo "$name, $trial: $(tail -n 1 "$run.log")" >&2
+            # A trial that diverges has no scores, and the others go on.
+            grep -q "finite" "$run.log" || exit 1
             error=,
         fi
         echo "$name,$trial,$lr,$patch,$batch,$tint,$steps,$used,$error" >>"$table"

@@ -50,21 +50,28 @@ fn to_python(failure: Failure) -> PyErr {
     }
 }
 
-/// The threads of calls that name no number. A process that was forked from another, as Python's
-/// `multiprocessing` does on Linux, has none of its threads and would wait for them for ever: it gets its own.
-fn shared_pool() -> Result<Arc<ThreadPool>, ThreadPoolBuildError> {
+/// The threads of calls that name no number in a process that was forked from another, as Python's
+/// `multiprocessing` does on Linux: it has none of rayon's threads, and would wait for them for ever. None in the
+/// process that loaded this module.
+fn forked_pool() -> Result<Option<Arc<ThreadPool>>, ThreadPoolBuildError> {
+    if process::id() == *LOADED_IN {
+        return Ok(None);
+    }
     static POOL: Mutex<Option<(u32, Arc<ThreadPool>)>> = Mutex::new(None);
     let mut pool = POOL.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some((of, pool)) = &*pool
         && *of == process::id()
     {
-        return Ok(Arc::clone(pool));
+        return Ok(Some(Arc::clone(pool)));
     }
     let own = Arc::new(ThreadPoolBuilder::new().build()?);
     // Dropped here, the other process's pool would wait for its threads.
     mem::forget(pool.replace((process::id(), Arc::clone(&own))));
-    Ok(own)
+    Ok(Some(own))
 }
+
+/// The process that loaded this module.
+static LOADED_IN: LazyLock<u32> = LazyLock::new(process::id);
 
 /// Runs `work` on a thread of its own, with so many threads if that is said; Ctrl-C ends the wait, and tells
 /// `work`.
@@ -74,15 +81,21 @@ fn detached<T: Send + 'static>(
     work: impl FnOnce(&AtomicBool) -> demc::Result<T> + Send + 'static,
 ) -> PyResult<T> {
     let pool = match threads {
-        Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(Arc::new),
-        None => shared_pool(),
+        Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool))),
+        None => forked_pool(),
     };
     let pool = pool.map_err(|e| exceptions::PyValueError::new_err(format!("threads: {e}")))?;
     let stopped = Arc::new(AtomicBool::new(false));
     let (done, result) = channel();
     let asked = Arc::clone(&stopped);
     thread::spawn(move || {
-        let guarded = AssertUnwindSafe(|| pool.install(|| work(&asked)));
+        let guarded = AssertUnwindSafe(|| match &pool {
+            Some(pool) => {
+                // Not from within: the closure must be handed over whole.
+                pool.install(|| work(&asked))
+            }
+            None => work(&asked),
+        });
         let outcome = catch_unwind(guarded)
             .unwrap_or_else(|_| Err(Failure::Internal("its message is on standard error".into())));
         let _ = done.send(outcome);
@@ -239,6 +252,7 @@ fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
 
 #[pymodule]
 fn _demc(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    LazyLock::force(&LOADED_IN);
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("Error", module.py().get_type::<Error>())?;
     module.add_function(wrap_pyfunction!(denoise_arrays, module)?)?;

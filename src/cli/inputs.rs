@@ -1,7 +1,8 @@
 //! What the user named (files, directories, quoted globs) as a list of EXR files.
 
 use std::{
-    collections::HashSet,
+    collections::{HashMap, HashSet},
+    ffi::OsStr,
     fs,
     path::{Path, PathBuf},
 };
@@ -25,8 +26,8 @@ pub struct Search {
     /// Whether the directories in them are searched too, at any depth. Links to directories are not followed,
     /// since the same files would be found twice.
     pub recursive: bool,
-    /// The directory where results are written: it is no part of a search, and those that are in it are no
-    /// inputs, as long as there are others.
+    /// The directory where results are written: it is no part of a search, and results that are in it already are
+    /// no inputs beside those that they are of.
     pub except: Option<PathBuf>,
 }
 
@@ -92,18 +93,33 @@ pub fn find(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
     Ok(all)
 }
 
-/// Leaves out what demc wrote below the folder of the results, where there are other inputs: `renders/*/*.exr`
-/// names the results in `renders/clean` too, the second time.
+/// Leaves out what demc wrote for another of the inputs: `renders/*/*.exr` names the results in `renders/clean`
+/// too, the second time.
 fn leave_out_results(files: &mut Vec<Input>, out: &Path) {
-    let is_below = |file: &Path| {
-        let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        fs::canonicalize(folder).is_ok_and(|folder| folder.starts_with(out))
+    let mut folders: HashMap<PathBuf, Option<PathBuf>> = HashMap::new();
+    let mut place = |folder: &Path, name: &OsStr| {
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+        let found = folders.entry(folder.to_owned()).or_insert_with(|| fs::canonicalize(folder).ok());
+        found.as_ref().map(|folder| folder.join(name))
     };
-    let is_result = |input: &Input| {
-        is_below(&input.file) && Frame::read_headers(&input.file).is_ok_and(|file| file.is_result())
-    };
-    let (results, others): (Vec<Input>, Vec<Input>) = std::mem::take(files).into_iter().partition(is_result);
-    *files = if others.is_empty() { results } else { others };
+    let mut results: HashSet<PathBuf> = HashSet::new();
+    let places: Vec<Option<PathBuf>> = files
+        .iter()
+        .map(|Input { file, below }| {
+            let (folder, name) = (file.parent()?, file.file_name()?);
+            let own = place(folder, name)?;
+            // Its result may have the place of another input, but not its own.
+            if let Some(result) = place(&out.join(below), name).filter(|result| *result != own) {
+                results.insert(result);
+            }
+            Some(own)
+        })
+        .collect();
+    let mut places = places.into_iter();
+    files.retain(|input| {
+        let is_of_another = places.next().flatten().is_some_and(|place| results.contains(&place));
+        !(is_of_another && Frame::read_headers(&input.file).is_ok_and(|file| file.is_result()))
+    });
 }
 
 /// Whether a path that was found is to be read: a file that is not hidden, or a link whose target is missing,

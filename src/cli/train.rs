@@ -1,7 +1,7 @@
 //! `demc train`: fits a network to pairs of noisy and reference frames.
 
 use std::{
-    collections::HashSet,
+    collections::{HashMap, HashSet},
     fs,
     io::IsTerminal,
     path::{Path, PathBuf},
@@ -246,7 +246,11 @@ impl Args {
         }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
-            pairs.into_iter().partition(held_out)
+            // Pairs that share a reference go the same way, whatever their scenes are called.
+            let mut by_reference = HashMap::new();
+            pairs.into_iter().partition(|pair| {
+                *by_reference.entry(pair.reference.clone()).or_insert_with(|| held_out(pair))
+            })
         } else {
             (all_pairs(&self.val)?, pairs)
         };

@@ -35,21 +35,8 @@ pub fn plan(files: Vec<PathBuf>, out: &Path) -> Result<Vec<Job>> {
 /// As [`plan`]; or a result would have the path of another input.
 pub fn plan_tree(inputs: impl IntoIterator<Item = Input>, out: &Path) -> Result<Vec<Job>> {
     let inputs: Vec<Input> = inputs.into_iter().collect();
-    let sources: HashMap<Place, PathBuf> =
-        inputs.iter().filter_map(|input| Some((place(&input.file)?, input.file.clone()))).collect();
-    let mut plan = Plan::new(out);
-    let place_one = |input| {
-        let job = plan.place(input)?;
-        match place(&job.output).and_then(|place| sources.get(&place)) {
-            None => Ok(job),
-            Some(other) => Err(Error::Usage(format!(
-                "{}: the result would overwrite the input {}; choose another --out",
-                job.input.display(),
-                other.display()
-            ))),
-        }
-    };
-    inputs.into_iter().map(place_one).collect()
+    let mut plan = Plan::new(out, &inputs);
+    inputs.into_iter().map(|input| plan.place(input)).collect()
 }
 
 /// The results that have been given a path so far.
@@ -57,18 +44,22 @@ pub struct Plan {
     out: PathBuf,
     /// The input of each result.
     placed: HashMap<PathBuf, PathBuf>,
+    /// The inputs that exist, by their places.
+    sources: HashMap<Place, PathBuf>,
 }
 
 impl Plan {
-    /// A plan without results, for the folder `out`.
-    pub fn new(out: &Path) -> Self {
-        Self { out: out.into(), placed: HashMap::new() }
+    /// A plan without results, for the folder `out` and these inputs.
+    pub fn new(out: &Path, inputs: &[Input]) -> Self {
+        let sources =
+            inputs.iter().filter_map(|input| Some((place(&input.file)?, input.file.clone()))).collect();
+        Self { out: out.into(), placed: HashMap::new(), sources }
     }
 
     /// The job that writes a file's result.
     ///
     /// # Errors
-    /// The result of another file, or the input itself, has the same path.
+    /// The result of another file, or an input, has the same path.
     pub fn place(&mut self, Input { file: input, below }: Input) -> Result<Job> {
         let Some(name) = input.file_name() else {
             return Err(Error::Usage(format!("{}: names no file", input.display())));
@@ -83,10 +74,19 @@ impl Plan {
                 output.display()
             )));
         }
-        if place(&output).is_some_and(|existing| place(&input) == Some(existing)) {
+        let existing = place(&output);
+        let overwritten = existing.as_ref().and_then(|place| self.sources.get(place));
+        if existing.is_some() && existing == place(&input) {
             return Err(Error::Usage(format!(
                 "{}: the result would overwrite its input; choose another --out",
                 input.display()
+            )));
+        }
+        if let Some(other) = overwritten {
+            return Err(Error::Usage(format!(
+                "{}: the result would overwrite the input {}; choose another --out",
+                input.display(),
+                other.display()
             )));
         }
         Ok(Job { input, output })

@@ -2,8 +2,8 @@
 //!
 //! A process that is killed leaves its temporary file behind. It holds a lock on it as long as it lives, so
 //! that the next one in that folder tells leftovers, which it removes, from what others are writing there at
-//! the same time. Other machines do not see the lock on every network drive: their files count as leftovers
-//! after a day.
+//! the same time. Other machines do not see the lock on every network drive: on Linux, their files count as
+//! leftovers after a day.
 
 use std::{
     fs::{self, File},
@@ -19,7 +19,8 @@ use crate::{Error, Result};
 const PREFIX: &str = ".demc-";
 const SUFFIX: &str = ".tmp";
 
-/// [`PREFIX`] and a name of this machine since it was started, where the system tells one (Linux does).
+/// [`PREFIX`] and a name of this machine since it was started, where the system tells one: Linux does. Elsewhere
+/// every unlocked file counts as this machine's.
 static OWN_PREFIX: LazyLock<String> = LazyLock::new(|| {
     let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     format!("{PREFIX}{}", id.chars().filter(char::is_ascii_alphanumeric).take(12).collect::<String>())

@@ -113,6 +113,13 @@ impl Row {
         }
     }
 
+    /// Calls the scene and the files as a pair does that has the same files: a manifest may have changed since the
+    /// row was made, and the files may be reached by another path.
+    pub fn rename(&mut self, pair: &Pair) {
+        let Self { scene, spp, noisy, reference, .. } = Self::new(pair, &self.model);
+        (self.scene, self.spp, self.noisy, self.reference) = (scene, spp, noisy, reference);
+    }
+
     /// The row as it was read, without numbers that are not finite. If there was one, `reason` tells so, and
     /// the row is measured again.
     fn checked(mut self) -> Self {
@@ -144,9 +151,17 @@ impl Row {
         (noisy, reference, self.model.clone())
     }
 
-    /// The noisy and the reference file, by whatever path they are reached.
+    /// The noisy and the reference file, by whatever path their folders are reached. (A frame that is held may be a
+    /// link to another.)
     pub fn files(&self) -> (PathBuf, PathBuf) {
-        let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        let place = |path: &Path| {
+            let folder =
+                path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            match (fs::canonicalize(folder), path.file_name()) {
+                (Ok(folder), Some(name)) => folder.join(name),
+                _ => path.to_owned(),
+            }
+        };
         (place(&self.noisy), place(&self.reference))
     }
 

@@ -81,11 +81,11 @@ pub fn evaluate(
         Err(_) if options.overwrite => Vec::new(),
         rows => rows?,
     };
+    let by_key: HashMap<(PathBuf, PathBuf), &Pair> =
+        pairs.iter().map(|pair| (Row::new(pair, NOISY).files(), pair)).collect();
     let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
         rows.into_iter().partition(|row| asked.contains(&row.key()));
     // A row that failed is tried again, and one without flicker, if the test set now holds the frame before.
-    let by_key: HashMap<(PathBuf, PathBuf), &Pair> =
-        pairs.iter().map(|pair| (Row::new(pair, NOISY).files(), pair)).collect();
     let wants_flicker = |row: &Row, pair: &Pair| {
         row.flicker.is_none()
             && !row.note.contains(NO_FLICKER)
@@ -93,14 +93,19 @@ pub fn evaluate(
     };
     kept.retain_mut(|row| {
         let pair = by_key[&row.files()];
-        // A manifest may call the same files otherwise by now.
-        (row.scene, row.spp) = (pair.label(), pair.spp);
         let is_whole = row.reason.is_empty() && !wants_flicker(row, pair);
-        !options.overwrite && is_whole && before.still_holds(row, &now)
+        let holds = !options.overwrite && is_whole && before.still_holds(row, &now);
+        row.rename(pair);
+        holds
     });
     let count = others.len();
     others.retain(|row| before.still_holds(row, &now));
     others.iter().for_each(|row| now.keep(row, &before));
+    others.iter_mut().for_each(|row| {
+        if let Some(pair) = by_key.get(&row.files()) {
+            row.rename(pair);
+        }
+    });
     if others.len() < count {
         on(EvalEvent::Note(&format!(
             "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor or files \
@@ -332,7 +337,8 @@ fn run_pair(
         }
         if !finished && let (Some(image), Some(before)) = (&image, before.as_mut()) {
             match before.flicker(method, image, &loaded) {
-                Ok(flicker) => row.flicker = flicker,
+                Ok(Some(flicker)) => row.flicker = Some(flicker),
+                Ok(None) => row.say(&format!("{NO_FLICKER}: no pixel can be followed from the frame before")),
                 Err(why) => row.say(&why),
             }
         }

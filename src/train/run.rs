@@ -75,7 +75,8 @@ pub fn run(
     let (log_path, checkpoint_path) = (out.join("log.csv"), out.join(CHECKPOINT));
     if resume {
         if !checkpoint_path.exists() {
-            let why = "is missing, and without it a run cannot go on; begin another one, with --init last.safetensors";
+            let why = "is missing, and without it a run cannot go on; begin another one in another --out, with the weights \
+                       of this one for --init";
             return Err(Error::invalid(&checkpoint_path, why));
         }
         checkpoint::check_size(&checkpoint_path, &options.network)?;

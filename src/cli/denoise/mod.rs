@@ -186,7 +186,10 @@ pub fn run(args: Args) -> Result<ExitCode> {
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
     // Beside a single frame, those around it are read where they make it steadier.
-    let is_one = args.temporal.is_none() && matches!(&work, Work::List { jobs, .. } if jobs.len() == 1);
+    let stands_alone = |job: &Job| {
+        args.temporal.is_none_or(|reach| denoise::neighbours(&job.input, reach.into()).is_empty())
+    };
+    let is_one = matches!(&work, Work::List { jobs, .. } if jobs.len() == 1 && stands_alone(&jobs[0]));
     let sources = args.guides.sources(&args.names, is_one)?;
     let model = models::open(&args.model)?;
     if args.report.is_some() {
@@ -322,8 +325,9 @@ fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
             }
         };
         look.failures = found.unusable;
-        let mut plan = Plan::new(&out);
-        for input in found.files.into_iter().filter(&is_wanted) {
+        let files: Vec<denoise::Input> = found.files.into_iter().filter(&is_wanted).collect();
+        let mut plan = Plan::new(&out, &files);
+        for input in files {
             let file = input.file.clone();
             let placed = plan.place(input).and_then(|job| {
                 let folder = job.output.parent().unwrap_or(&out).to_owned();
