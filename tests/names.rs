@@ -287,6 +287,28 @@ fn guides_of_a_file_are_those_of_the_view_layer_that_is_denoised() {
 }
 
 #[test]
+fn a_picture_that_a_file_holds_twice_is_read_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let render = Render::new();
+    let expected = expected(folder.path());
+    let guides = [("albedo.R", 3), ("albedo.G", 4), ("albedo.B", 5), ("N.X", 6), ("N.Y", 7), ("N.Z", 8)];
+    for (name, other) in
+        [("upper", ["Beauty.R", "Beauty.G", "Beauty.B"]), ("lower", ["rgb.R", "rgb.G", "rgb.B"])]
+    {
+        // The other picture is the albedo, which would show.
+        let path = folder.path().join(format!("{name}.exr"));
+        let bare = [("R", 0), ("G", 1), ("B", 2)];
+        let twice: Vec<(&str, usize)> = other.iter().zip(3..).map(|(name, plane)| (*name, plane)).collect();
+        render.write(&path, &[&bare[..], &twice, &guides].concat());
+        assert!(layer(&denoise(&path, &[]), "Denoised") == expected, "{name}");
+        // The layer can be asked for.
+        let (layer_name, _) = other[0].split_once('.').unwrap();
+        let mapped = layer(&denoise(&path, &["--map", &format!("beauty={layer_name}")]), "Denoised");
+        assert!(mapped != expected, "{name}");
+    }
+}
+
+#[test]
 fn names_of_parts_mean_nothing_where_channels_say_it() {
     let dir = tempfile::tempdir().unwrap();
     let expected = expected(dir.path());

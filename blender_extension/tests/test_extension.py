@@ -292,4 +292,9 @@ class Extension(unittest.TestCase):
 
 
 if __name__ == "__main__":
-    unittest.main(verbosity=2)
+    ended = unittest.main(verbosity=2, exit=False)
+    _home.cleanup()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # bpy 4.5 does not always come to its own end after many renders.
+    os._exit(0 if ended.result.wasSuccessful() else 1)

@@ -16,7 +16,7 @@ use crate::{
     companion::Companion,
     frame::{Frame, NewChannel, Recoded, SampleKind},
     models::{Denoiser, ExpectedError, check_expects},
-    passes::{self, COMBINED, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
+    passes::{self, COMBINED, COMPOSITE, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
     shot::{self, Shot},
     sources::Sources,
@@ -159,6 +159,9 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     if options.view_layer.is_none() {
         report.notes.extend(note_other_layers(&layers, chosen));
     }
+    if options.layer.is_none() {
+        report.notes.extend(note_other_pictures(&layers, chosen));
+    }
     let added = [options.layer.clone(), options.confidence.then(|| error_layer(options))];
     for added in added.into_iter().flatten() {
         let name = layer_name(&chosen.name, &added);
@@ -241,6 +244,21 @@ fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
     (!others.is_empty()).then(|| {
         format!("denoised view layer '{}'; --view-layer chooses another: {}", chosen.name, others.join(", "))
     })
+}
+
+/// Where the beauty is replaced, pictures in the file that were made of the noisy one are told.
+fn note_other_pictures(layers: &[Layer], chosen: &Layer) -> Option<String> {
+    let is_picture = |layer: &&Layer| {
+        let is_shown = layer.name == COMPOSITE || (layer.name.is_empty() && !chosen.name.is_empty());
+        is_shown && layer.name != chosen.name && layer.passes.contains_key(&Pass::Combined)
+    };
+    let shown = layers.iter().find(is_picture)?;
+    let what =
+        if shown.name.is_empty() { "R, G, B without a layer".into() } else { format!("'{}'", shown.name) };
+    Some(format!(
+        "{what}, which other programs show first, was made of the noisy picture and stays as it is: render without \
+         compositing, or composite again from the result"
+    ))
 }
 
 /// Denoised radiance, and what goes with it.

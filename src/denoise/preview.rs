@@ -1,4 +1,5 @@
-//! A PNG of the denoised frame, exposed and encoded like the display image on which SSIM is measured.
+//! A PNG of the denoised frame, encoded like the display image on which SSIM is measured, and exposed like it by all
+//! that is not black.
 
 use std::{
     io::{BufWriter, Write},
@@ -9,7 +10,7 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 
 use crate::{
     Error, Result, frame,
-    metrics::display::{display, exposure},
+    metrics::display::{display, exposure_of_lit},
     planes::Planes,
 };
 
@@ -19,7 +20,7 @@ use crate::{
 /// The file cannot be written.
 pub fn write(path: &Path, radiance: &Planes) -> Result<()> {
     // A black frame has no exposure, and any exposure shows it black.
-    let image = display(radiance, exposure(radiance).unwrap_or(1.0));
+    let image = display(radiance, exposure_of_lit(radiance).unwrap_or(1.0));
     let (r, g, b) = (image.channel(0), image.channel(1), image.channel(2));
     let to_byte = |v: f32| (v * 255.0).round() as u8;
     let pixels: Vec<u8> = (0..image.pixels()).flat_map(|i| [r[i], g[i], b[i]].map(to_byte)).collect();

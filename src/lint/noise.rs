@@ -45,8 +45,8 @@ pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<F
                 "looks-denoised",
                 "the beauty has no noise of single pixels anywhere on lit surfaces: it looks denoised or filtered already, and \
                  is only blurred by another pass",
-                "turn off Render Properties > Sampling > Render > Denoise, or turn on Denoising Data, with which Blender keeps \
-                 the render as Noisy Image",
+                "turn off Render Properties > Sampling > Render > Denoise, or keep the pass Noisy Image, in which Blender \
+                 stores the render beside it",
             )
         } else {
             Finding::new(
@@ -116,6 +116,9 @@ const ALONE: f32 = 2.0;
 /// Pixels that a class needs.
 const CLAMPED_PIXELS: f32 = 30.0;
 
+/// More pixels than this that are just as bright as the brightest were clipped.
+const CLIPPED: usize = 20;
+
 /// Finds samples that were clamped. Cycles scales a sample whose channels add up to more than three times the
 /// clamp down to that sum. In a pixel of N samples one such sample adds three times the clamp, divided by N,
 /// so that many pixels stand out from those around them by just that.
@@ -123,7 +126,12 @@ const CLAMPED_PIXELS: f32 = 30.0;
 /// This comes last: values that are cut off at 1 were encoded for a display, which is another fault.
 pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
     let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
-    if findings.iter().any(|finding| finding.code == "display-pixels") {
+    if findings.iter().any(|finding| ["display-pixels", "eight-bit-pixels"].contains(&finding.code)) {
+        return;
+    }
+    // What was clipped at white stands out by as much everywhere, too.
+    let most = light.iter().copied().fold(0.0, f32::max);
+    if most <= 1.0 && light.iter().filter(|v| **v == most).count() > CLIPPED {
         return;
     }
     let (w, h) = (set.width, set.height);

@@ -22,7 +22,23 @@ const GAMMA: f64 = 2.2;
 /// If `reference` is not (3, H, W) with at least one pixel.
 pub fn exposure(reference: &Planes) -> Option<f64> {
     assert!(reference.channels == 3 && reference.pixels() > 0, "exposure is defined on RGB");
-    let mut luminance = luminance(reference);
+    exposure_of(luminance(reference))
+}
+
+/// [`exposure`] of the pixels that are not black alone, for pictures to look at: a small thing before nothing would be
+/// white all over. None where all is black.
+///
+/// # Panics
+/// As [`exposure`].
+pub fn exposure_of_lit(image: &Planes) -> Option<f64> {
+    assert!(image.channels == 3, "exposure is defined on RGB");
+    exposure_of(luminance(image).into_iter().filter(|y| *y > 0.0).collect())
+}
+
+fn exposure_of(mut luminance: Vec<f64>) -> Option<f64> {
+    if luminance.is_empty() {
+        return None;
+    }
     luminance.par_sort_unstable_by(f64::total_cmp);
     let cap = percentile(&luminance, CAP_PERCENTILE);
     let mean = luminance.iter().map(|y| y.min(cap)).sum::<f64>() / luminance.len() as f64;
@@ -95,6 +111,11 @@ mod tests {
         }
         assert!((exposure(&sun).unwrap() - 0.5).abs() < 1e-6, "one pixel in a hundred is above P98");
         assert_eq!(exposure(&Planes::new(3, 4, 4)), None, "black");
+        let mut small = Planes::new(3, 10, 10);
+        (0..3).for_each(|c| small.channel_mut(c)[..4].fill(0.7));
+        assert!((exposure_of_lit(&small).unwrap() - 0.5).abs() < 1e-6);
+        assert_eq!(exposure_of_lit(&grey), exposure(&grey));
+        assert_eq!(exposure_of_lit(&Planes::new(3, 4, 4)), None);
     }
 
     #[test]

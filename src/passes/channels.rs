@@ -25,6 +25,13 @@ pub struct Place {
     pub full_name: String,
 }
 
+impl Place {
+    /// The name of the layer that the channel is in, as it is stored; empty where it is in none.
+    pub fn prefix(&self) -> &str {
+        self.full_name.rsplit_once('.').map_or("", |(prefix, _)| prefix)
+    }
+}
+
 /// A view layer's name and stereo view.
 pub type LayerKey = (String, Option<String>);
 

@@ -6,8 +6,8 @@ use super::{
     Mapping, Pass, PassSet,
     channels::{ByPass, LayerKey, Place, by_pass, is_component},
     names::{
-        BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_common, light_group,
-        plain,
+        BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_bare, is_common,
+        light_group, plain,
     },
 };
 use crate::{
@@ -51,7 +51,7 @@ pub struct PassChannels {
 }
 
 /// What Blender calls the layer that its compositor made.
-const COMPOSITE: &str = "Composite";
+pub const COMPOSITE: &str = "Composite";
 
 /// The view layers of a frame, in file order, once for each stereo view.
 pub fn layers(frame: &Frame) -> Vec<Layer> {
@@ -192,18 +192,44 @@ impl<'a> Index<'a> {
 
     /// The channels of a pass of exactly that name, or else of one with the same [`plain`] form.
     fn find(&self, name: &str, pass: Pass) -> Option<PassChannels> {
-        let name = if self.channels.contains_key(name) { name } else { self.alike.get(&plain(name))? };
-        find_components(name, &self.channels[name], pass)
+        let known =
+            if self.channels.contains_key(name) { Some(name) } else { self.alike.get(&plain(name)).copied() };
+        if let Some(known) = known {
+            return find_components(known, &self.channels[known], pass);
+        }
+        // `beauty`, `rgba` and their like are Combined here.
+        let places = self.channels.get(COMBINED).filter(|_| is_bare(name))?;
+        in_one_layer(name, places, pass, |prefix| prefix.eq_ignore_ascii_case(name))
     }
 }
 
-/// The channels that make up a pass, all in the part of the first.
+/// The channels that make up a pass, all of one layer and in one part.
 fn find_components(name: &str, places: &[Place], pass: Pass) -> Option<PassChannels> {
+    // A file may hold the picture in bare channels and once more in a layer. The bare ones are what programs
+    // show.
+    let mut prefixes: Vec<&str> = Vec::new();
+    for place in places {
+        if !prefixes.contains(&place.prefix()) {
+            prefixes.push(place.prefix());
+        }
+    }
+    prefixes.sort_by_key(|prefix| !prefix.is_empty()); // keeps the order of the others
+    prefixes.into_iter().find_map(|of| in_one_layer(name, places, pass, |prefix| prefix == of))
+}
+
+/// The channels that make up a pass, all in the part of the first, of those whose layer `is_it`.
+fn in_one_layer(
+    name: &str,
+    places: &[Place],
+    pass: Pass,
+    is_it: impl Fn(&str) -> bool,
+) -> Option<PassChannels> {
     components(pass).iter().find_map(|wanted| {
         // The exact spelling comes first, since files may hold `R` of the picture beside `r` of something
         // else.
         let of = |wanted: &str, part: Option<usize>| {
-            let mut in_part = places.iter().filter(|place| part.is_none_or(|part| place.part == part));
+            let is_in = |place: &&Place| is_it(place.prefix()) && part.is_none_or(|part| place.part == part);
+            let mut in_part = places.iter().filter(is_in);
             let exact = in_part.clone().find(|place| place.component == wanted);
             exact.or_else(|| in_part.find(|place| is_component(&place.component, wanted)))
         };

@@ -19,7 +19,7 @@ use std::{
 };
 
 pub use layers::{
-    Layer, PassChannels, choose, choose_like, layers, layers_by, layers_of, read, read_layer,
+    COMPOSITE, Layer, PassChannels, choose, choose_like, layers, layers_by, layers_of, read, read_layer,
     read_light_groups, rgb_layers,
 };
 pub use mapping::Mapping;
