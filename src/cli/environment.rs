@@ -1,6 +1,8 @@
 //! Checks environment variables before anything is done, so that a typing error is reported and does not pass
 //! for a variable that is not set.
 
+use clap::builder::RangedI64ValueParser;
+
 use crate::{
     Error, Result,
     kernels::{
@@ -10,7 +12,12 @@ use crate::{
 };
 
 /// The most threads that may be asked for; more than this cannot be started, and nobody means it.
-pub const MOST_THREADS: u16 = 4096;
+const MOST_THREADS: u16 = 4096;
+
+/// Takes the value of `--threads`.
+pub fn threads() -> RangedI64ValueParser<u16> {
+    clap::value_parser!(u16).range(1..=MOST_THREADS.into())
+}
 
 /// Refuses settings that mean nothing.
 ///

@@ -7,7 +7,7 @@ use std::{
 
 use clap::Args as ClapArgs;
 
-use super::environment::MOST_THREADS;
+use super::environment;
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::peak_memory;
 use crate::{
@@ -28,7 +28,7 @@ pub struct Args {
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_value = "demc-m")]
     pub models: Vec<String>,
     /// Threads for every method [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
+    #[arg(long, value_name = "N", value_parser = environment::threads())]
     threads: Option<u16>,
     /// View layer to read [default: the one with the most passes]
     #[arg(long, value_name = "NAME")]
@@ -46,6 +46,13 @@ impl Args {
             .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
     }
 
+    /// What was asked for, each once, and the noisy input first.
+    fn asked(&self) -> Vec<&str> {
+        let asked = self.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
+        let mut seen = HashSet::new();
+        std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect()
+    }
+
     /// The methods asked for, the noisy input first, each under a name of its own.
     ///
     /// # Errors
@@ -54,9 +61,7 @@ impl Args {
         let threads = self.threads();
         // Built-in methods change with the program.
         let program = super::program().map_or("unknown".into(), |path| report::file_stamp(&path));
-        let asked = self.models.iter().map(|m| m.trim()).filter(|m| !m.is_empty() && *m != NOISY);
-        let mut seen = HashSet::new();
-        let asked: Vec<&str> = std::iter::once(NOISY).chain(asked).filter(|m| seen.insert(*m)).collect();
+        let asked = self.asked();
         let mut methods = Vec::new();
         for name in &asked {
             let (denoiser, file): (Box<dyn Denoiser>, Option<PathBuf>) =
@@ -90,8 +95,7 @@ impl Args {
     /// # Errors
     /// As [`Args::methods`].
     pub fn temporal(&self, methods: &[Contender], reach: usize) -> Result<Vec<Contender>> {
-        let mut seen = HashSet::new();
-        let asked: Vec<&str> = self.models.iter().map(|m| m.trim()).filter(|m| seen.insert(*m)).collect();
+        let asked = self.asked();
         let mut added = Vec::new();
         for name in &asked {
             let short = short_name(name, &asked);

@@ -10,7 +10,7 @@ use std::{
 
 use clap::Args as ClapArgs;
 
-use super::environment::MOST_THREADS;
+use super::environment;
 use super::lines::{ExitCode, print_line};
 use crate::{Error, Result, models, shot};
 
@@ -32,7 +32,7 @@ pub struct Args {
     #[arg(long, value_name = "NAME")]
     view_layer: Option<String>,
     /// Threads to use [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
+    #[arg(long, value_name = "N", value_parser = environment::threads())]
     threads: Option<u16>,
 }
 

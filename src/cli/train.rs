@@ -13,7 +13,7 @@ use std::{
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::environment::MOST_THREADS;
+use super::environment;
 use super::lines::{ExitCode, warn_line};
 use crate::{
     Error, Result,
@@ -116,7 +116,7 @@ pub struct Args {
     ])]
     resume: bool,
     /// Threads to use; all processors without it
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
+    #[arg(long, value_name = "N", value_parser = environment::threads())]
     threads: Option<u16>,
 }
 

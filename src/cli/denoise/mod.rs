@@ -16,7 +16,7 @@ use clap::{Args as ClapArgs, ValueEnum};
 use frames::Frames;
 use progress::{Progress, Style};
 
-use super::environment::MOST_THREADS;
+use super::environment;
 use super::lines::{ExitCode, SOME_FAILED, warn_line};
 use super::{
     inputs::{self, Inputs, Search},
@@ -69,7 +69,7 @@ pub struct Args {
     overwrite: bool,
 
     /// Threads to use [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS.into()))]
+    #[arg(long, value_name = "N", value_parser = environment::threads())]
     threads: Option<u16>,
 
     /// Denoise N frames at once, each with its share of the threads: the same results, sooner where frames
