@@ -17,7 +17,7 @@ use crate::{
 pub struct Augment {
     /// Left and right change places (first).
     pub flip: bool,
-    /// Counter-clockwise quarter turns (second).
+    /// Counter-clockwise quarter turns (second), 0 to 3.
     pub turns: usize,
     /// Which old colour channel each new one takes.
     pub rgb: [usize; 3],

@@ -6,7 +6,7 @@ use std::path::Path;
 
 /// The frame number that a file's name ends in; none where it ends in none.
 pub fn frame_number(file: &Path) -> Option<i64> {
-    split(file.file_stem()?.to_str()?).map(|(_, number)| number)
+    split(&file.file_stem()?.to_string_lossy()).map(|(_, number)| number)
 }
 
 /// What stands before the number at the end of a name without its extension, and the number.
@@ -23,7 +23,8 @@ pub fn split(stem: &str) -> Option<(&str, i64)> {
 
 /// The samples per pixel in a name: those of `shot_0004spp.0017.exr`, `shot_0004spp_a.exr`.
 pub fn samples(file: &Path) -> Option<u32> {
-    let (head, rest) = file.file_stem()?.to_str()?.rsplit_once("spp")?;
+    let stem = file.file_stem()?.to_string_lossy();
+    let (head, rest) = stem.rsplit_once("spp")?;
     let is_end = rest.is_empty() || rest.starts_with(['.', '_']);
     let (_, digits) = head.rsplit_once('_').filter(|_| is_end)?;
     digits.parse().ok().filter(|_| digits.bytes().all(|b| b.is_ascii_digit()))

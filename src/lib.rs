@@ -21,7 +21,7 @@
 //! The features `cli`, `report` and `train` (all on by default) add the program `demc`, reports over test
 //! sets, and training.
 //!
-//! Modules point downwards only:
+//! Modules point downwards only, but that flicker is measured along motion as [`filters`] follow it:
 //! `cli` dispatches; `stability` changes inputs and `report` scores methods over a test set; `train` fits
 //! weights; [`denoise`] takes files through a method; [`models`] holds every denoising method behind one
 //! trait; [`augment`] turns a frame into another that serves training as well; [`features`] turns passes into

@@ -48,7 +48,19 @@ pub struct Shot {
 /// # Errors
 /// The file is unusable, or has no such view layer.
 pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot> {
-    passes::load(path, view_layer).map(Shot::new)
+    let mut set = passes::load(path, view_layer)?;
+    stand_in(&mut set);
+    Ok(Shot::new(set))
+}
+
+/// Where a file has no Normal, which is in world space, methods that read it are given Denoising Normal, which
+/// is in camera space.
+fn stand_in(set: &mut PassSet) {
+    if set.get(Pass::Normal).is_none()
+        && let Some(normals) = set.get(Pass::DenoisingNormal).cloned()
+    {
+        set.insert(Pass::Normal, normals);
+    }
 }
 
 /// As [`prepare`], but reads only the `wanted` passes of one view layer in one stereo view. Passes that lie
@@ -57,8 +69,16 @@ pub fn prepare(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<Shot>
 /// # Errors
 /// Pixels cannot be decoded, or a pass is not where it is said to be.
 pub fn prepare_layer(frame: &Frame, layer: &Layer, wanted: &[Pass], sources: &Sources) -> Result<Shot> {
-    let mut set = passes::read_layer(frame, layer, &[wanted, &[Pass::NoisyImage]].concat())?;
-    let normals = sources.complete(frame, layer, wanted, &mut set)?;
+    let mut read = [wanted, &[Pass::NoisyImage]].concat();
+    let has_stand_in = wanted.contains(&Pass::Normal) && !layer.passes.contains_key(&Pass::Normal);
+    if has_stand_in {
+        read.push(Pass::DenoisingNormal);
+    }
+    let mut set = passes::read_layer(frame, layer, &read)?;
+    let normals = sources.complete(frame, layer, &read, &mut set)?;
+    if has_stand_in {
+        stand_in(&mut set);
+    }
     // Nobody asks such a shot for the render before it was repaired, so that is dropped.
     Ok(Shot { normals, unrepaired: None, ..Shot::new(set) })
 }

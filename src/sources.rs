@@ -91,6 +91,14 @@ fn place(name: &str) -> Option<(&str, usize, &str)> {
 }
 
 impl Sources {
+    /// The files that hold guides of a frame.
+    ///
+    /// # Errors
+    /// A pattern wants a number, and the frame has none.
+    pub fn guides(&self, frame: &Path) -> Result<Vec<PathBuf>> {
+        [&self.albedo, &self.normal].into_iter().flatten().map(|pattern| beside(frame, pattern)).collect()
+    }
+
     /// Adds the guides that lie in other files, and makes normals those of Cycles unless Blender wrote them.
     /// Returns what the user should know.
     ///

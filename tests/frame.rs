@@ -379,3 +379,23 @@ fn nothing_is_left_behind_where_the_target_cannot_be_written() {
     frame.write(dir.path().join("out.exr")).unwrap_err();
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
 }
+
+#[test]
+fn headers_alone_are_neither_written_nor_decoded_nor_added_to() {
+    let dir = tempfile::tempdir().unwrap();
+    let [path, copy] = ["in.exr", "copy.exr"].map(|name| dir.path().join(name));
+    single_part(&path, Encoding::SMALL_LOSSLESS, true);
+    let mut headers = Frame::read_headers(&path).unwrap();
+    let planes = ramp();
+    let added = rgba(&planes, SampleKind::Half);
+    let errors = [
+        headers.write(&copy).unwrap_err(),
+        headers.decode(0, &[&[0]]).unwrap_err(),
+        headers.set_layer(0, "ViewLayer.Denoised", None, &added).unwrap_err(),
+    ];
+    assert!(errors.iter().all(|error| error.to_string().contains("its pixels were not read")), "{errors:?}");
+    let mut frame = Frame::read(&path).unwrap();
+    let error = frame.set_layer(0, "ViewLayer.a\nb", None, &added).unwrap_err().to_string();
+    assert!(error.contains("in.exr") && error.contains("cannot be called"), "{error}");
+    assert!(!copy.exists());
+}

@@ -16,6 +16,7 @@ use demc::{
     passes::{Pass, PassSet},
     planes::Planes,
     shot::{self, Shot},
+    sources::Sources,
 };
 
 const FRAME: &str = "s0000_room_0004spp.exr";
@@ -122,6 +123,98 @@ fn each_file_of_a_batch_ends_once() {
     assert_eq!(run(&jobs), [(frame.clone(), "done"), (broken.clone(), "failed")]);
     assert_eq!(run(&jobs), [(broken, "failed"), (frame.clone(), "skipped")]);
     assert!(samples(&read_exr(frame.output), "ViewLayer.Clean.G").is_some());
+}
+
+/// Panics as soon as it is asked what it can make use of.
+struct Breaks;
+
+impl Denoiser for Breaks {
+    fn name(&self) -> &str {
+        "breaks"
+    }
+
+    fn passes(&self) -> &[Pass] {
+        &[Pass::Combined]
+    }
+
+    fn optional_passes(&self) -> &[Pass] {
+        panic!("on purpose")
+    }
+
+    fn denoise(&self, _: &Shot) -> Result<Planes> {
+        unreachable!()
+    }
+}
+
+#[test]
+fn frames_that_a_defect_took_with_it_are_told_as_failed() {
+    let out = tempfile::tempdir().unwrap();
+    let job = |name: &str| {
+        let input = out.path().join("in").join(name);
+        fs::create_dir_all(input.parent().unwrap()).unwrap();
+        fs::copy(data(FRAME), &input).unwrap();
+        Job { input, output: out.path().join(name) }
+    };
+    let jobs = ["a.0001.exr", "a.0002.exr", "a.0003.exr"].map(job);
+    let (breaks, noisy): (Arc<dyn Denoiser>, _) = (Arc::new(Breaks), models::open("noisy").unwrap().into());
+    for (model, reach, why) in [
+        (breaks.clone(), None, "internal error"),
+        (breaks, Some(1), "internal error"),
+        (noisy, Some(usize::MAX), "at most 255"),
+    ] {
+        let options = Options { temporal: reach, ..Options::default() };
+        let mut ended = Vec::new();
+        let end = Batch::new(jobs.to_vec(), model, options).run(|job, outcome| {
+            assert!(matches!(outcome, Outcome::Failed(error) if error.to_string().contains(why)));
+            ended.push(job.input.clone());
+        });
+        assert_eq!(end, End::Complete);
+        ended.sort();
+        assert_eq!(ended, jobs.clone().map(|job| job.input));
+    }
+}
+
+#[test]
+fn storing_takes_no_layer_that_loading_would_refuse_and_overwrites_no_guide() {
+    let out = tempfile::tempdir().unwrap();
+    let model = models::open("noisy").unwrap();
+    let guide = out.path().join("albedo.exr");
+    fs::copy(data(FRAME), &guide).unwrap();
+    let of_guide = Sources { albedo: Some(guide.clone()), ..Sources::default() };
+    let layer = |name: &str| Options { layer: Some(name.into()), ..Options::default() };
+    for (options, why) in [
+        (layer("Combined"), "is a pass of the renderer"),
+        (layer("a.b"), "without a dot"),
+        (Options { sources: of_guide, ..Options::default() }, "is a guide of this frame"),
+    ] {
+        let loaded = denoise::load(&data(FRAME), &*model, &Options::default()).unwrap();
+        let denoised = denoise::denoise(loaded, &*model, &Options::default()).unwrap();
+        let error = denoise::store(denoised, &guide, &options).err().unwrap();
+        assert!(error.to_string().contains(why), "{error}");
+    }
+    assert_eq!(fs::read(guide).unwrap(), fs::read(data(FRAME)).unwrap());
+}
+
+#[test]
+fn what_has_no_pixels_and_tiles_of_none_are_errors() {
+    let shot = |w, h| {
+        let mut passes = PassSet::new("x.exr", "ViewLayer", w, h);
+        passes.insert(Pass::Combined, Planes::new(3, w, h));
+        Shot::new(passes)
+    };
+    let model = models::open("demc-s").unwrap();
+    for (w, h) in [(0, 0), (0, 5), (5, 0)] {
+        let error = denoise::shot(&shot(w, h), &*model, &Options::default()).unwrap_err();
+        assert!(error.to_string().contains("has no pixels"), "{error}");
+    }
+    let options = Options { tile: Some(0), ..Options::default() };
+    assert!(matches!(denoise::shot(&shot(8, 8), &*model, &options), Err(Error::Usage(_))));
+    for spec in ["nfor:int8", "noisy:f32", "noisy:bf16:unrestrained"] {
+        assert!(
+            matches!(models::open(spec), Err(Error::Usage(why)) if why.contains("is no network")),
+            "{spec}"
+        );
+    }
 }
 
 /// Turned about half, a panorama gives the same picture turned about half: its seam is nowhere.

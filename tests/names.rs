@@ -9,7 +9,9 @@ use common::{
     demc,
     files::{data, read_exr, values, with_attributes},
 };
+use demc::passes::Pass;
 use exr::prelude::*;
+use predicates::prelude::*;
 
 const SIDE: usize = 128;
 
@@ -384,4 +386,36 @@ fn views_are_told_by_openexrs_rules() {
             );
         }
     }
+}
+
+#[test]
+fn denoising_normal_takes_the_place_of_a_normal_that_is_missing() {
+    let dir = tempfile::tempdir().unwrap();
+    let [path, out] = ["in.exr", "out"].map(|name| dir.path().join(name));
+    let mut render = read_exr(data("s0000_room_0004spp.exr"));
+    let is_normal = |part: &Layer<AnyChannels<FlatSamples>>| {
+        part.attributes.layer_name.as_ref().is_some_and(|name| name.eq("ViewLayer.Normal"))
+    };
+    let count = render.layer_data.len();
+    render.layer_data.retain(|part| !is_normal(part));
+    assert_eq!(render.layer_data.len(), count - 1);
+    render.write().to_file(&path).unwrap();
+
+    let passes = demc::shot::prepare(&path, None).unwrap().passes;
+    assert!(
+        passes.get(Pass::Normal).is_some() && passes.get(Pass::Normal) == passes.get(Pass::DenoisingNormal)
+    );
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/rivals/weights/demc.safetensors");
+    let note = "Normal is missing; Denoising Normal, of camera space, took its place";
+    for (model, is_told) in [(weights.to_str().unwrap(), true), ("demc-s", false)] {
+        let mut command = demc();
+        command.args(["denoise", "--overwrite", "--model", model]).arg(&path).arg("--out").arg(&out);
+        command.assert().success().stderr(predicate::str::contains(note).count(usize::from(is_told)));
+    }
+    demc()
+        .arg("inspect")
+        .arg(&path)
+        .assert()
+        .success()
+        .stdout(predicate::str::contains("ready for demc-s, demc-m, demc-l, demc, "));
 }

@@ -20,7 +20,8 @@ recipe() {
 options() {
     awk -v name="$1" -v steps="$2" -v tint="$tint" -v loss="$loss" -v lr="$lr" -v patch="$patch" -v batch="$batch" \
         'BEGIN {
-            printf "--model %s --steps %d --average %g --lr %g:%g ", name, steps, 1 - 20 / steps, lr, lr / 100
+            average = steps > 20 ? 1 - 20 / steps : 0
+            printf "--model %s --steps %d --average %g --lr %g:%g ", name, steps, average, lr, lr / 100
             printf "--loss %s --patch %d --batch %d --tint %g ", loss, patch, batch, tint
             print "--optimizer muon --weight-decay 0.1 --seed 1 --threads 1"
         }'

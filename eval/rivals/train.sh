@@ -45,7 +45,7 @@ for name in "$@"; do
     wait $pid 2>/dev/null || status=$?
     # 130: it was interrupted when its time was over.
     if [ $status -ne 0 ] && [ $status -ne 130 ]; then
-        echo "$name failed: $(tail -n 1 "$out/$name.log")" >&2
+        echo "$name failed: $(grep -m 1 -E '^(error|demc):' "$out/$name.log")" >&2
         failed=1
         continue
     fi

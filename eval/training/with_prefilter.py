@@ -16,6 +16,8 @@ def main():
     network, prefilter, target = sys.argv[1:]
     facts, tensors = weights.read(network)
     own_facts, own = weights.read(prefilter)
+    if own_facts["network"]["architecture"] != "prefilter":
+        sys.exit(f"{prefilter}: is no prefilter alone; `prefilter.py` takes one out of a network's weights")
     facts["network"]["prefilter"] = own_facts["network"]["widths"]
     ranges = {name: r for name, r in facts.get("ranges", {}).items() if not name.startswith(PREFILTER)}
     facts["ranges"] = ranges | {PREFILTER + name: r for name, r in own_facts.get("ranges", {}).items()}

@@ -30,12 +30,12 @@ def _image(name, image, shape=None):
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
-def _count(name, value):
+def _count(name, value, most):
     if value is None:
         return None
-    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= value < 2**16:
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= value <= most:
         return int(value)
-    raise ValueError(f"{name} is {value!r}; give a number from 1 to 65535, or None")
+    raise ValueError(f"{name} is {value!r}; give a number from 1 to {most}, or None")
 
 
 def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, threads=None):
@@ -60,7 +60,7 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
         None if guide is None else _image(name, guide, color.shape)
         for name, guide in [("albedo", albedo), ("normal", normal)]
     ]
-    counts = _count("samples", samples), _count("threads", threads)
+    counts = _count("samples", samples, 65535), _count("threads", threads, _demc.MOST_THREADS)
     result = _demc.denoise_arrays(radiance, *guides, os.fspath(model), *counts).reshape(color.shape)
     if color.dtype == np.float16:
         result = result.clip(-_HALF_MAX, _HALF_MAX).astype(np.float16)
@@ -91,11 +91,12 @@ def denoise_file(
     """
     source, out = os.fspath(source), os.fspath(out)
     if os.path.exists(out):
-        if os.path.exists(source) and os.path.samefile(source, out):
-            raise ValueError(f"{source}: the result would overwrite its input; choose another out")
+        read = [source, *(os.fspath(path) for path in (albedo, normal) if path is not None)]
+        if any(os.path.exists(path) and os.path.samefile(path, out) for path in read):
+            raise ValueError(f"{out}: the result would overwrite what it is made of; choose another out")
         if not overwrite:
             raise Error(f"{out}: exists; overwrite=True replaces it, or choose another out")
-    threads = _count("threads", threads)
+    threads = _count("threads", threads, _demc.MOST_THREADS)
     guides = tuple(None if path is None else os.fspath(path) for path in (albedo, normal))
     lines = [f"{word}={name}" for word, name in (names or {}).items()]
     values = _demc.denoise_path(source, out, os.fspath(model), view_layer, guides, lines, threads)

@@ -80,21 +80,20 @@ fn detached<T: Send + 'static>(
     threads: Option<usize>,
     work: impl FnOnce(&AtomicBool) -> demc::Result<T> + Send + 'static,
 ) -> PyResult<T> {
-    let pool = match threads {
-        Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool))),
-        None => forked_pool(),
-    };
-    let pool = pool.map_err(|e| exceptions::PyValueError::new_err(format!("threads: {e}")))?;
     let stopped = Arc::new(AtomicBool::new(false));
     let (done, result) = channel();
     let asked = Arc::clone(&stopped);
     thread::spawn(move || {
-        let guarded = AssertUnwindSafe(|| match &pool {
-            Some(pool) => {
-                // Not from within: the closure must be handed over whole.
-                pool.install(|| work(&asked))
+        // Starting many threads takes long too, so that is done here.
+        let guarded = AssertUnwindSafe(|| {
+            let pool = match threads {
+                Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool))),
+                None => forked_pool(),
+            };
+            match pool.map_err(|error| Failure::Usage(format!("threads: {error}")))? {
+                Some(pool) => pool.install(|| work(&asked)),
+                None => work(&asked),
             }
-            None => work(&asked),
         });
         let outcome = catch_unwind(guarded)
             .unwrap_or_else(|_| Err(Failure::Internal("its message is on standard error".into())));
@@ -115,10 +114,12 @@ fn detached<T: Send + 'static>(
     }
 }
 
-/// A model by name or file. Built-in ones are kept: unpacking their weights takes longer than a small frame.
+/// A model by name or file. Built-in ones are kept: unpacking their weights takes longer than a small frame. Files may
+/// change, so others are opened anew.
 fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
     static OPENED: LazyLock<Mutex<HashMap<String, Arc<dyn Denoiser>>>> = LazyLock::new(Mutex::default);
-    if name.contains(".safetensors") {
+    let plain = models::split_precision(name.strip_suffix(models::UNRESTRAINED).unwrap_or(name)).0;
+    if models::catalogue::find(plain).is_none_or(|method| method.built_in().is_none()) {
         return Ok(models::open(name)?.into());
     }
     if let Some(model) = OPENED.lock().unwrap_or_else(PoisonError::into_inner).get(name) {
@@ -254,6 +255,7 @@ fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
 fn _demc(module: &Bound<'_, PyModule>) -> PyResult<()> {
     LazyLock::force(&LOADED_IN);
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("MOST_THREADS", demc::cli::MOST_THREADS)?;
     module.add("Error", module.py().get_type::<Error>())?;
     module.add_function(wrap_pyfunction!(denoise_arrays, module)?)?;
     module.add_function(wrap_pyfunction!(denoise_path, module)?)?;

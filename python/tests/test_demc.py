@@ -110,8 +110,12 @@ class Package(unittest.TestCase):
             demc.denoise_file(ROOM, out)
         demc.denoise_file(ROOM, out, model="demc-s", overwrite=True)
         self.assertNotEqual(out.read_bytes(), (self.folder / ROOM.name).read_bytes())
-        with self.assertRaisesRegex(ValueError, "overwrite its input"):
+        with self.assertRaisesRegex(ValueError, "overwrite what it is made of"):
             demc.denoise_file(out, out, overwrite=True)
+        with self.assertRaisesRegex(ValueError, "overwrite what it is made of"):
+            demc.denoise_file(ROOM, out, albedo=out, overwrite=True)
+        with self.assertRaisesRegex(ValueError, "from 1 to 4096"):
+            demc.denoise_file(ROOM, out, overwrite=True, threads=4097)
 
     def test_inspect_and_compare_say_what_the_command_says(self):
         self.assertEqual(demc.inspect(ROOM), json.loads(command("inspect", "--json", ROOM).stdout))

@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// The most threads that may be asked for; more than this cannot be started, and nobody means it.
-const MOST_THREADS: u16 = 4096;
+pub const MOST_THREADS: u16 = 4096;
 
 /// Takes the value of `--threads`.
 pub fn threads() -> RangedI64ValueParser<u16> {

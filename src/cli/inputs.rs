@@ -166,8 +166,11 @@ fn directory(named: &Path, search: &Search, all: &mut Inputs) {
 }
 
 fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
-    let text = path.to_string_lossy();
-    let matches = glob::glob(&text)
+    let Some(text) = path.to_str() else {
+        let why = "a pattern that is not UTF-8 finds nothing; rename the files, or name their folder";
+        return Err(Error::Usage(format!("{}: {why}", path.display())));
+    };
+    let matches = glob::glob(text)
         .map_err(|e| Error::Usage(format!("{text}: not a valid glob ({}); quote or escape it", e.msg)))?;
     for found in matches {
         match found {
@@ -179,13 +182,37 @@ fn pattern(path: &Path, all: &mut Inputs) -> Result<()> {
             }
         }
     }
+    not_utf8(path, all);
     Ok(())
+}
+
+/// Adds the files whose names match the last part of a pattern but for bytes that are not UTF-8, as names from
+/// old systems have: `glob` passes them over.
+fn not_utf8(path: &Path, all: &mut Inputs) {
+    let parts = (path.parent(), path.file_name().and_then(OsStr::to_str));
+    let (Some(parent), Some(name)) = parts else { return };
+    let Ok(name) = glob::Pattern::new(name) else { return };
+    let folders: Vec<PathBuf> = match parent.to_str() {
+        Some("") => vec![".".into()],
+        Some(text) if has_wildcard(parent) => glob::glob(text).into_iter().flatten().flatten().collect(),
+        _ => vec![parent.into()],
+    };
+    for folder in folders {
+        let entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+        let names = entries.map(|entry| entry.file_name()).filter(|found| found.to_str().is_none());
+        let matching = names.filter(|found| name.matches(&found.to_string_lossy()));
+        let mut files: Vec<PathBuf> =
+            matching.map(|name| folder.join(name)).filter(|file| is_input(file)).collect();
+        files.sort();
+        all.files.extend(files.into_iter().map(|file| Input { file, below: PathBuf::new() }));
+    }
 }
 
 fn has_wildcard(path: &Path) -> bool {
     path.to_string_lossy().contains(['*', '?', '['])
 }
 
-fn is_exr(path: &Path) -> bool {
+/// Whether a name is that of an EXR file.
+pub fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
 }

@@ -32,6 +32,7 @@ use std::{
 
 use clap::{CommandFactory, Parser, Subcommand};
 
+pub use environment::MOST_THREADS;
 use lines::{ExitCode, SOME_FAILED, USAGE, warn_line};
 
 use crate::{

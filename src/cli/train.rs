@@ -52,7 +52,8 @@ pub struct Args {
     /// Crops a step; more where they are smaller than --patch says, so that they have as many pixels
     #[arg(long, default_value_t = 8)]
     batch: usize,
-    /// Rows and columns of a crop, a multiple of 32; of a step's crops fewer, if the frame drawn first has
+    /// Rows and columns of a crop: a multiple of 16, for the paper's networks of 32, any number for kpcn and lbf; of a
+    /// step's crops fewer, if the frame drawn first has
     /// not as many
     #[arg(long, default_value_t = 128)]
     patch: usize,

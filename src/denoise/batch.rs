@@ -5,10 +5,10 @@
 //! All threads report to the caller's thread, which alone talks to the user.
 
 use std::{
-    collections::VecDeque,
-    path::{Path, PathBuf},
+    collections::{HashMap, VecDeque},
+    path::PathBuf,
     sync::{
-        Arc, Mutex, PoisonError, RwLock,
+        Arc, Mutex, MutexGuard, PoisonError, RwLock,
         atomic::{AtomicBool, Ordering},
         mpsc::{Receiver, Sender, channel},
     },
@@ -68,6 +68,9 @@ pub(super) struct Shared {
     /// for such files.
     writing: RwLock<()>,
     is_stopped: AtomicBool,
+    /// How many times each job is still to end. A stage that panics takes its lane's jobs with it, and those must
+    /// not pass for done.
+    unended: Mutex<HashMap<Job, usize>>,
 }
 
 /// Where the work comes from.
@@ -106,13 +109,15 @@ impl Stopper {
 impl Batch {
     /// A batch that waits to be [run](Batch::run).
     pub fn new(jobs: Vec<Job>, model: Arc<dyn Denoiser>, options: Options) -> Self {
+        let mut unended = HashMap::new();
+        jobs.iter().for_each(|job| *unended.entry(job.clone()).or_default() += 1);
         let (mut frames, mut sequences) = (VecDeque::new(), VecDeque::new());
         match options.temporal {
             Some(_) => sequences = sequence::group(jobs).into(),
             None => frames = jobs.into(),
         }
         let list = List { frames, sequences, stretches: VecDeque::new() };
-        Self::of(Source::List(Mutex::new(list)), model, options)
+        Self::of(Source::List(Mutex::new(list)), unended, model, options)
     }
 
     /// A batch of files that are still coming in.
@@ -125,13 +130,14 @@ impl Batch {
                        them, or run --temporal when the rendering has ended";
             return Err(Error::Usage(why.into()));
         }
-        Ok(Self::of(Source::Watch(watch), model, options))
+        Ok(Self::of(Source::Watch(watch), HashMap::new(), model, options))
     }
 
-    fn of(source: Source, model: Arc<dyn Denoiser>, options: Options) -> Self {
+    fn of(source: Source, unended: HashMap<Job, usize>, model: Arc<dyn Denoiser>, options: Options) -> Self {
         let (to_batch, messages) = channel();
         let (writing, is_stopped) = (RwLock::new(()), AtomicBool::new(false));
-        let shared = Arc::new(Shared { source, model, options, writing, is_stopped });
+        let unended = Mutex::new(unended);
+        let shared = Arc::new(Shared { source, model, options, writing, is_stopped, unended });
         Self { shared, lanes: 1, messages, to_batch }
     }
 
@@ -154,6 +160,10 @@ impl Batch {
     /// threads that these compute with.
     pub fn run(self, mut report: impl FnMut(&Job, &Outcome)) -> End {
         let Self { shared, lanes, messages, to_batch } = self;
+        let mut report = |job: &Job, outcome: &Outcome| {
+            shared.ends(job);
+            report(job, outcome);
+        };
         for lane in 0..lanes {
             Lane::start(&shared, (lane, lanes), &to_batch);
         }
@@ -177,7 +187,8 @@ impl Batch {
                 }
             }
         }
-        shared.tell_leftovers(End::Complete, report);
+        shared.tell_leftovers(End::Complete, &mut report);
+        shared.tell_lost(report);
         End::Complete
     }
 }
@@ -203,7 +214,10 @@ impl Shared {
             }
             Source::Watch(watch) => loop {
                 match watch.next(|| self.is_stopped()) {
-                    Next::Job(job) => return Some(Work::Frame(job)),
+                    Next::Job(job) => {
+                        *self.unended().entry(job.clone()).or_default() += 1;
+                        return Some(Work::Frame(job));
+                    }
                     Next::Failure(input, error) => {
                         let job = Job { input, output: PathBuf::new() };
                         let _ = ended.send(Message::Ended(job, Box::new(Outcome::Failed(error))));
@@ -219,6 +233,32 @@ impl Shared {
         if let Source::Watch(watch) = &self.source {
             for (job, error) in watch.leftovers(end) {
                 report(&job, &Outcome::Failed(error));
+            }
+        }
+    }
+
+    fn unended(&self) -> MutexGuard<'_, HashMap<Job, usize>> {
+        self.unended.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes that a job has ended.
+    fn ends(&self, job: &Job) {
+        let mut unended = self.unended();
+        if let Some(times) = unended.get_mut(job) {
+            *times -= 1;
+            if *times == 0 {
+                unended.remove(job);
+            }
+        }
+    }
+
+    /// Reports the jobs that no lane ended, though all lanes have.
+    fn tell_lost(&self, mut report: impl FnMut(&Job, &Outcome)) {
+        let lost: Vec<(Job, usize)> = self.unended().drain().collect();
+        for (job, times) in lost {
+            for _ in 0..times {
+                let why = "an internal error stopped the batch before this frame ended; please report it with the file";
+                report(&job, &Outcome::Failed(Error::invalid(&job.input, why)));
             }
         }
     }
@@ -246,11 +286,12 @@ impl Shared {
     }
 
     /// Reads a file; none if it is watched and not whole yet, in which case it is waited for.
-    pub fn read(&self, input: &Path) -> Option<Result<Frame>> {
-        let frame = attempt(input, || Frame::read(input));
+    pub fn read(&self, job: &Job) -> Option<Result<Frame>> {
+        let frame = attempt(&job.input, || Frame::read(&job.input));
         match (&self.source, frame) {
             (Source::Watch(watch), Err(error)) => {
-                watch.put_back(input, error);
+                watch.put_back(&job.input, error);
+                self.ends(job);
                 None
             }
             (_, frame) => Some(frame),

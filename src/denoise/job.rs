@@ -8,6 +8,7 @@ use std::{
 
 use super::{
     lights::{Along, Alpha, Source, denoised_lights, light_passes},
+    plan::are_same,
     window,
     wrap::{self, Wrap},
 };
@@ -23,7 +24,7 @@ use crate::{
 };
 
 /// One file to denoise.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Job {
     /// The render.
     pub input: PathBuf,
@@ -162,14 +163,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     if options.layer.is_none() {
         report.notes.extend(note_other_pictures(&layers, chosen));
     }
-    let added = [options.layer.clone(), options.confidence.then(|| error_layer(options))];
-    for added in added.into_iter().flatten() {
-        let name = layer_name(&chosen.name, &added);
-        if frame.has_foreign_layer(&name) {
-            let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
-            return Err(Error::invalid(input, why));
-        }
-    }
+    check_added(&frame, &chosen.name, options)?;
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
@@ -196,6 +190,9 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         }
         // Before any work: a missing pass is the user's commonest mistake.
         model.check(&shot.passes)?;
+        if needed.contains(&Pass::Normal) && !layer.passes.contains_key(&Pass::Normal) {
+            report.notes.push("Normal is missing; Denoising Normal, of camera space, took its place".into());
+        }
         if model.reads_halves() {
             shot.read_halves()?;
         }
@@ -212,11 +209,38 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     Ok(Views { frame, views, report })
 }
 
-/// Refuses options that the model cannot meet or that exclude each other, before anything is read.
-fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
+/// Refuses layers to add whose names are no layer's, or those of others.
+fn check_added(frame: &Frame, view_layer: &str, options: &Options) -> Result<()> {
+    check_name(options)?;
+    let added = [options.layer.clone(), options.confidence.then(|| error_layer(options))];
+    for added in added.into_iter().flatten() {
+        let name = layer_name(view_layer, &added);
+        if frame.has_foreign_layer(&name) {
+            let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
+            return Err(Error::invalid(frame.path(), why));
+        }
+    }
+    Ok(())
+}
+
+fn check_name(options: &Options) -> Result<()> {
+    let Some(name) = options.layer.as_deref() else { return Ok(()) };
+    check_layer_name(name).map_err(|why| Error::Usage(format!("layer '{name}': {why}")))
+}
+
+/// Refuses options that the model cannot meet or that exclude each other, before anything is read. Loading a
+/// frame does the same.
+///
+/// # Errors
+/// Which they are.
+pub fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
     let wrong = |why: String| Err(Error::Usage(why));
-    if let Some((name, Err(why))) = options.layer.as_deref().map(|name| (name, check_layer_name(name))) {
-        return wrong(format!("layer '{name}': {why}"));
+    check_name(options)?;
+    if options.tile == Some(0) {
+        return wrong("tiles of no pixels; give their side, or leave it out".into());
+    }
+    if options.temporal.is_some_and(|reach| reach > u8::MAX.into()) {
+        return wrong("frames on each side: at most 255".into());
     }
     if options.passes && !model.takes_companions() {
         let name = model.name();
@@ -298,6 +322,10 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
 /// A pass is missing, or the model cannot denoise the frame.
 pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Planes> {
     model.check(&shot.passes)?;
+    check_options(model, options)?;
+    if shot.passes.width * shot.passes.height == 0 {
+        return Err(Error::invalid(&shot.passes.path, "has no pixels"));
+    }
     let mut report = Report::default();
     rayon::scope(|_| {
         let radiance = run(shot, model, options, &mut report)?;
@@ -442,6 +470,15 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
 /// As [`store`].
 pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<(Frame, Report)> {
     let Views { mut frame, views, mut report } = denoised;
+    for (layer, _) in &views {
+        check_added(&frame, &layer.name, options)?;
+    }
+    if let Some(guide) =
+        options.sources.guides(frame.path())?.into_iter().find(|guide| are_same(guide, output))
+    {
+        let why = "is a guide of this frame, which the result would overwrite; choose another --out";
+        return Err(Error::invalid(guide, why));
+    }
     let errors: Vec<f64> = views.iter().filter_map(|(_, view)| Some(view.error.as_ref()?.mean())).collect();
     report.expected_error = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
     for (layer, Denoised { radiance, alpha, lights, error }) in &views {

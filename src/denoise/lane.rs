@@ -114,7 +114,7 @@ impl Lane {
 
     /// Reads a job's file; none where its result exists already, or the file is not whole yet.
     fn read_new(&self, job: &Job) -> Option<Result<Frame>> {
-        if self.shared.take_up_existing(job, &self.ended) { None } else { self.shared.read(&job.input) }
+        if self.shared.take_up_existing(job, &self.ended) { None } else { self.shared.read(job) }
     }
 
     /// Decodes the passes that are needed from a file that was read.
@@ -140,7 +140,7 @@ impl Lane {
             return Some(());
         }
         next.send(Loaded::Begin).ok()?;
-        let reach = self.reach() as i64;
+        let reach = i64::try_from(self.reach()).unwrap_or(i64::MAX);
         let written: Vec<i64> = jobs.iter().map(|(_, number)| *number).collect();
         let mut unread = i64::MIN;
         for (job, number) in jobs {
@@ -183,7 +183,13 @@ impl Lane {
                 }
                 Loaded::Neighbour { number, file, read, is_written } => {
                     let loaded = self.take_apart(&file, read);
-                    self.on_own_threads(|| window.enter(number, loaded, is_written, model));
+                    let entered = attempt(&file, || {
+                        self.on_own_threads(|| window.enter(number, loaded, is_written, model));
+                        Ok(())
+                    });
+                    if let Err(error) = entered {
+                        window.enter(number, Err(error), is_written, model);
+                    }
                     continue;
                 }
                 Loaded::Complete { job, number } => {

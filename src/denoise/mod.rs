@@ -22,7 +22,9 @@ mod wrap;
 use std::path::Path;
 
 pub use batch::{Batch, End, Outcome, Stopper};
-pub use job::{Denoised, Job, Options, Report, Views, check_layer_name, denoise, load, shot, store};
+pub use job::{
+    Denoised, Job, Options, Report, Views, check_layer_name, check_options, denoise, load, shot, store,
+};
 pub use lights::Alpha;
 pub use plan::{Input, Plan, plan, plan_tree};
 pub use sequence::{follows, neighbours};

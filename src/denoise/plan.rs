@@ -4,13 +4,14 @@
 //! In: inputs. Out: jobs of which no two write the same file, and none overwrites its own input.
 
 use std::{
+    cell::OnceCell,
     collections::HashMap,
     fs,
     path::{Path, PathBuf},
 };
 
 use super::Job;
-use crate::{Error, Result};
+use crate::{Error, Result, frame::ignores_case};
 
 /// A file to denoise.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -42,8 +43,10 @@ pub fn plan_tree(inputs: impl IntoIterator<Item = Input>, out: &Path) -> Result<
 /// The results that have been given a path so far.
 pub struct Plan {
     out: PathBuf,
-    /// The input of each result.
-    placed: HashMap<PathBuf, PathBuf>,
+    /// Results and their inputs, by the result's path in small letters.
+    placed: HashMap<String, Vec<(PathBuf, PathBuf)>>,
+    /// Whether names that differ in small and capital letters are one file's, once that was asked.
+    ignores_case: OnceCell<bool>,
     /// The inputs that exist, by their places.
     sources: HashMap<Place, PathBuf>,
 }
@@ -53,7 +56,7 @@ impl Plan {
     pub fn new(out: &Path, inputs: &[Input]) -> Self {
         let sources =
             inputs.iter().filter_map(|input| Some((place(&input.file)?, input.file.clone()))).collect();
-        Self { out: out.into(), placed: HashMap::new(), sources }
+        Self { out: out.into(), placed: HashMap::new(), ignores_case: OnceCell::new(), sources }
     }
 
     /// The job that writes a file's result.
@@ -65,7 +68,12 @@ impl Plan {
             return Err(Error::Usage(format!("{}: names no file", input.display())));
         };
         let output = self.out.join(below).join(name);
-        if let Some(other) = self.placed.insert(output.clone(), input.clone()) {
+        let alike = self.placed.entry(output.to_string_lossy().to_lowercase()).or_default();
+        let is_same =
+            |path: &Path| path == output || *self.ignores_case.get_or_init(|| ignores_case(&self.out));
+        let other = alike.iter().find(|(path, _)| is_same(path)).map(|(_, input)| input.clone());
+        alike.push((output.clone(), input.clone()));
+        if let Some(other) = other {
             return Err(Error::Usage(format!(
                 "{} and {} would both be written to {}; give each its own --out, or name the folder that holds both and \
                  add --recursive",
@@ -99,6 +107,11 @@ type Place = (u64, u64);
 #[cfg(not(unix))]
 type Place = PathBuf;
 
+/// Whether two paths lead to one file that exists.
+pub(super) fn are_same(one: &Path, other: &Path) -> bool {
+    place(one).is_some_and(|one| place(other) == Some(one))
+}
+
 /// The place of a file, if it exists.
 #[cfg(unix)]
 fn place(path: &Path) -> Option<Place> {
@@ -109,4 +122,26 @@ fn place(path: &Path) -> Option<Place> {
 #[cfg(not(unix))]
 fn place(path: &Path) -> Option<Place> {
     fs::canonicalize(path).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_differ_in_case_are_one_file_only_where_the_folder_takes_them_for_one() {
+        let out = tempfile::tempdir().unwrap();
+        let inputs = ["x/a.exr", "y/A.exr"].map(|file| Input { file: file.into(), below: PathBuf::new() });
+        for (ignores_case, is_refused) in [(false, false), (true, true)] {
+            let mut plan = Plan::new(out.path(), &inputs);
+            plan.ignores_case = OnceCell::from(ignores_case);
+            let [first, second] = inputs.clone().map(|input| plan.place(input));
+            assert!(first.is_ok());
+            assert_eq!(
+                second.is_err_and(|error| error.to_string().contains("would both be written")),
+                is_refused
+            );
+        }
+        assert_eq!(ignores_case(&out.path().join("not/there/yet")), cfg!(any(windows, target_os = "macos")));
+    }
 }

@@ -19,8 +19,9 @@ use crate::frame_number::split;
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Key {
     folder: PathBuf,
-    before: String,
-    after: String,
+    // Bytes, since a name need not be UTF-8.
+    before: Vec<u8>,
+    after: Vec<u8>,
 }
 
 /// A frame's place in its sequence.
@@ -32,10 +33,13 @@ struct Place {
 impl Place {
     /// The place of a file; none where its name does not end in a number.
     fn of(file: &Path) -> Option<Self> {
-        let name = file.file_name()?.to_str()?;
-        let stem = file.file_stem()?.to_str()?;
-        let (head, number) = split(stem)?;
-        let (before, after) = (head.to_owned(), name[stem.len()..].to_owned());
+        let (name, stem) = (file.file_name()?, file.file_stem()?);
+        let readable = stem.to_string_lossy();
+        let (head, number) = split(&readable)?;
+        // The number has as many bytes in the name itself.
+        let (stem, name) = (stem.as_encoded_bytes(), name.as_encoded_bytes());
+        let before = stem[..stem.len() - (readable.len() - head.len())].to_vec();
+        let after = name[stem.len()..].to_vec();
         Some(Self { key: Key { folder: file.parent()?.to_owned(), before, after }, number })
     }
 
@@ -135,7 +139,7 @@ mod tests {
     use super::*;
 
     fn place(file: &str) -> Option<(String, i64)> {
-        Place::of(Path::new(file)).map(|place| (place.key.before, place.number))
+        Place::of(Path::new(file)).map(|place| (String::from_utf8(place.key.before).unwrap(), place.number))
     }
 
     #[test]

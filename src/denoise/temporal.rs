@@ -34,7 +34,7 @@ impl Temporal {
     /// A window around a frame with the neighbours that the shot has.
     fn window(&self, shot: &Shot) -> Window {
         let mut window = Window::new(self.reach);
-        let reach = self.reach as i32;
+        let reach = i32::try_from(self.reach).unwrap_or(i32::MAX);
         for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
             window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
         }

@@ -223,6 +223,28 @@ impl Look {
         })
     }
 
+    /// The mean of weights, (1, H, W), where each square of pixels counts by how much normals and relative
+    /// albedo differ in it and around it (their standard deviation). None where nothing does.
+    ///
+    /// # Panics
+    /// If the size of the weights differs.
+    pub fn mean_at_detail(&self, weights: &Planes) -> Option<f32> {
+        assert!(self.size == (weights.width, weights.height), "weights of the frame's size");
+        let (mut sum, mut counted) = (0.0, 0.0);
+        for row in 0..self.squares.height {
+            let line = |line: usize| row_of(&self.squares, line, row);
+            let weights = row_of(weights, 0, row * SQUARE);
+            for column in 0..self.squares.width {
+                let squared: f32 = (ALBEDO..ALBEDO + 3).map(|c| line(c)[column].powi(2)).sum();
+                let of_albedo = line(SPREAD_OF_ALBEDO)[column] / (squared + DARK);
+                let detail = f64::from((line(SPREAD_OF_NORMAL)[column] + of_albedo).sqrt());
+                sum += detail * f64::from(weights[column * SQUARE]);
+                counted += detail;
+            }
+        }
+        (counted > 0.0).then(|| (sum / counted) as f32)
+    }
+
     /// The [`FEATURES`] lines of a row of pixels.
     fn features_of_row(
         &self,
@@ -606,6 +628,28 @@ mod tests {
         flow.step(&vectors, Direction::Back);
         let weights = agreement(&frame(1, |_| 1.0), &frame(2, |_| 1.0), &flow);
         assert!(mean(&weights, 0..38) > AGREED && mean(&weights, 41..SIZE.0) == 0.0);
+    }
+
+    #[test]
+    fn a_camera_that_moves_shows_where_there_is_detail() {
+        let still = Flow::still(SIZE.0, SIZE.1);
+        // A sky, and below it a wall of narrow stripes, which the camera has moved along.
+        let shot = |seed: u64, moved: usize| {
+            let mut frame = frame(seed, |_| 1.0);
+            for (i, v) in frame[1].data.iter_mut().enumerate() {
+                let (x, y) = (i % SIZE.0, i / SIZE.0 % SIZE.1);
+                *v = if y >= 36 && (x + moved) % 6 < 3 { 0.2 } else { *v };
+            }
+            frame
+        };
+        let (here, same, there) = (shot(1, 0), shot(2, 0), shot(3, 3));
+        let look = Look::of(&here[0], &guides(&here));
+        let detail = |weights: &Planes| look.mean_at_detail(weights).unwrap();
+        let (same, moved) = (agreement(&here, &same, &still), agreement(&here, &there, &still));
+        assert!(mean(&moved, 0..SIZE.0) > AGREED, "{}", mean(&moved, 0..SIZE.0));
+        assert!(detail(&same) > 0.3 && detail(&moved) < 0.3, "{} {}", detail(&same), detail(&moved));
+        let flat = frame(4, |_| 1.0);
+        assert_eq!(Look::of(&flat[0], &guides(&flat)).mean_at_detail(&moved), None);
     }
 
     #[test]

@@ -75,6 +75,18 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Whether a folder, or if it is not there yet the one that it will lie in, takes capital letters for small ones,
+/// as on Windows, on macOS and on shares from there.
+pub fn ignores_case(folder: &Path) -> bool {
+    let existing = folder.ancestors().find(|path| path.is_dir());
+    let existing = existing.unwrap_or(Path::new("."));
+    // Where no file can be made, none is lost either.
+    temporary(existing).is_ok_and(|file| {
+        let name = file.path().file_name().expect("it has a name").to_string_lossy().to_uppercase();
+        existing.join(name).exists()
+    })
+}
+
 /// A new file with a unique name, locked.
 fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();

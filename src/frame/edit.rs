@@ -95,10 +95,10 @@ impl Frame {
     /// (`ViewLayer.Denoised-left`), or in the channels' (`ViewLayer.Denoised.left.R`).
     ///
     /// # Errors
-    /// The part cannot be decoded or encoded.
+    /// The part cannot be decoded or encoded, or a name has control characters.
     ///
     /// # Panics
-    /// If a channel has not as many values as the part has pixels.
+    /// If there are no channels, two of one name, or one that has not as many values as the part has pixels.
     pub fn set_layer(
         &mut self,
         beside: usize,
@@ -107,8 +107,15 @@ impl Frame {
         channels: &[NewChannel<'_>],
     ) -> Result<Option<Recoded>> {
         let area = self.layout(beside)?.layer_size.area();
-        for channel in channels {
+        assert!(!channels.is_empty(), "a layer has channels");
+        for (i, channel) in channels.iter().enumerate() {
             assert_eq!(channel.values.len(), area, "one value for each pixel");
+            let is_twice = channels[..i].iter().any(|other| other.component == channel.component);
+            assert!(!is_twice, "two channels '{}'", channel.component);
+        }
+        let names = channels.iter().map(|channel| channel.component).chain([name]).chain(view);
+        if let Some(name) = names.into_iter().find(|name| name.contains(char::is_control)) {
+            return Err(Error::invalid(&self.path, format!("a layer or channel cannot be called {name:?}")));
         }
         let own_part = self.is_part_per_pass(beside);
         let (part_name, prefix) = match view {
@@ -212,7 +219,7 @@ impl Frame {
     /// The part cannot be decoded or encoded.
     ///
     /// # Panics
-    /// If a channel has not as many values as the part has pixels.
+    /// If there is no such channel, or one has not as many values as the part has pixels.
     pub fn replace(
         &mut self,
         part: usize,

@@ -27,7 +27,7 @@ use exr::{
     meta::{BlockDescription, attribute::SampleType, header::Header},
 };
 
-pub use atomic::{atomically, prepare_folder};
+pub use atomic::{atomically, ignores_case, prepare_folder};
 pub use chroma::to_rgb;
 pub use edit::{HALF_MAX, NewChannel, Recoded};
 
@@ -179,6 +179,9 @@ impl Frame {
 
     /// The weights of red, green and blue in the luminance of a part, by its primaries, or those of Rec. 709
     /// where it names none.
+    ///
+    /// # Panics
+    /// If there is no such part.
     pub fn luminance_weights(&self, part: usize) -> [f32; 3] {
         let primaries = self.stored[part].attributes.chromaticities();
         primaries.and_then(chroma::weights).unwrap_or(LUMINANCE.map(|weight| weight as f32))
@@ -226,8 +229,19 @@ impl Frame {
         }
     }
 
+    /// Refuses what needs pixels where only headers were read: every part has a block at least.
+    fn refuse_headers_alone(&self) -> Result<()> {
+        match self.chunks.is_empty() {
+            true => {
+                Err(Error::invalid(&self.path, "is known by its headers alone; its pixels were not read"))
+            }
+            false => Ok(()),
+        }
+    }
+
     /// The part at `index`, or an error naming the file.
     fn layout(&self, part: usize) -> Result<&Header> {
+        self.refuse_headers_alone()?;
         let stored = self.stored.get(part);
         stored
             .map(|stored| &stored.layout)

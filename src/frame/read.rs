@@ -46,7 +46,7 @@ impl Frame {
         Ok(frame)
     }
 
-    /// Reads a file's headers alone: what it holds, none of its pixels.
+    /// Reads a file's headers alone: what it holds, none of its pixels, which it then neither decodes nor writes.
     ///
     /// # Errors
     /// As [`Frame::read`], except that damaged pixels are not noticed, and deep data is taken.

@@ -17,6 +17,7 @@ impl Frame {
     /// The directory or the file cannot be written; nothing is left behind.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
+        self.refuse_headers_alone()?;
         atomically(path, |file| {
             let mut buffered = BufWriter::with_capacity(1 << 20, file);
             let failed = |error| Error::io("write", path)(error);

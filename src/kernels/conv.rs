@@ -117,9 +117,13 @@ fn signed(v: usize) -> isize {
 }
 
 /// Blocks that packed weights take.
+///
+/// # Panics
+/// If there are more than memory could hold.
 pub fn packed_len(inputs: &[usize], outputs: usize, geometry: Geometry) -> usize {
     let planes: usize = inputs.iter().map(|c| c.div_ceil(LANES)).sum();
-    outputs.div_ceil(LANES) * planes * geometry.taps() * LANES
+    let pairs = outputs.div_ceil(LANES).checked_mul(planes);
+    pairs.and_then(|pairs| pairs.checked_mul(geometry.taps() * LANES)).expect("weights fit into memory")
 }
 
 /// Which way weights are used.

@@ -441,7 +441,7 @@ impl Vectorised for Quads<'_> {
 ///
 /// # Panics
 /// As [`reduce`].
-#[allow(clippy::too_many_arguments)]
+#[expect(clippy::too_many_arguments, reason = "planes and their gradients, each under its own name")]
 pub fn reduce_gradient(
     size: Size,
     image: &[f32],

@@ -56,8 +56,11 @@ pub fn weight_gradient(
     let pairs = g.planes().div_ceil(2) * s.planes();
     let rows = s.n * s.h;
     let parts = if pairs >= TASKS { 1 } else { (rows / PART_ROWS).clamp(1, TASKS) };
-    let slabs = g.planes() * s.planes() * taps * LANES;
-    let mut partial = SLABS.take(slabs * parts, Block::default());
+    let slabs = g.planes().checked_mul(s.planes()).and_then(|pairs| pairs.checked_mul(taps * LANES));
+    let (slabs, all) = slabs
+        .and_then(|slabs| Some((slabs, slabs.checked_mul(parts)?)))
+        .expect("sums of gradients fit into memory");
+    let mut partial = SLABS.take(all, Block::default());
     partial.fill(Block::default());
     let pointer = Shared(partial.as_mut_ptr());
     (0..parts * pairs).into_par_iter().for_each(|task| {
@@ -201,7 +204,7 @@ impl Pair<'_> {
     /// `slab[lane] += sum over pixels of input[lane] * gradient`, for `CHUNK` lanes and one tap;
     /// `STEP` gradient pixels an input pixel.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
+    #[expect(clippy::too_many_arguments, reason = "the inner loop, whose values stay in registers")]
     unsafe fn accumulate<S: Simd, const OUT: usize, const CHUNK: usize, const STEP: usize>(
         &self,
         simd: S,

@@ -50,6 +50,8 @@ pub struct About {
     pub half: BTreeSet<Pass>,
     /// Whether Position is a mean over samples, and not Cycles' own pass, which holds the first sample.
     pub position_averaged: bool,
+    /// Whether the file says that demc denoised this view layer.
+    pub denoised_by_demc: bool,
     /// The colour space that the file names, as OpenEXR, Blender or OpenImageIO write it.
     pub colour_space: Option<String>,
     /// The passes that are missing for the model that is used by default.
@@ -70,7 +72,7 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     }
     let Some(render) = render(set) else { return findings };
     let light = light::sums(render);
-    noise::check(set, render, &light, &mut findings);
+    noise::check(set, about, render, &light, &mut findings);
     // Shifted guides tell nothing of the beauty's edges.
     let is_shifted = shift::check(set, &light, &mut findings);
     edges::check(set, render, (!is_shifted).then_some(&light), &mut findings);

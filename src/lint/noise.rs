@@ -8,7 +8,7 @@
 use rayon::prelude::*;
 
 use super::{
-    Finding,
+    About, Finding,
     light::{lit_surfaces, median, quantile, usual_logarithms},
 };
 use crate::{passes::PassSet, planes::Planes};
@@ -37,7 +37,7 @@ const ALIKE: f32 = 0.88;
 const REMOVED: f32 = 0.015;
 
 /// Finds noise that was removed or spread. `light` is [`sums`](super::light::sums) of the render.
-pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<Finding>) {
+pub fn check(set: &PassSet, about: &About, render: &Planes, light: &[f32], findings: &mut Vec<Finding>) {
     if let Some((ratio, amplitude)) = likeness(set, render, light).filter(|(ratio, _)| *ratio < ALIKE) {
         // Where Blender kept the noisy render beside Combined, that render is judged here.
         findings.push(if amplitude < REMOVED {
@@ -45,8 +45,13 @@ pub fn check(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<F
                 "looks-denoised",
                 "the beauty has no noise of single pixels anywhere on lit surfaces: it looks denoised or filtered already, and \
                  is only blurred by another pass",
-                "turn off Render Properties > Sampling > Render > Denoise, or keep the pass Noisy Image, in which Blender \
-                 stores the render beside it",
+                match about.denoised_by_demc {
+                    true => "demc denoised it, in place of the render (--replace): take the render itself",
+                    false => {
+                        "turn off Render Properties > Sampling > Render > Denoise, or keep the pass Noisy Image, in which \
+                         Blender stores the render beside it"
+                    }
+                },
             )
         } else {
             Finding::new(

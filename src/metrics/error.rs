@@ -5,10 +5,12 @@
 //! project's own, leaves out the worst 0.1% of pixels, so that a handful of fireflies in image or reference
 //! does not decide it. RMSE and maximum error: as OpenImageIO's `idiff` prints them. SMAPE: Vogels et al.,
 //! "Denoising with Kernel Prediction and Asymmetric Loss Functions" (2018), section 4.
+//!
+//! All of them panic if the images differ in size or channels, or have no pixel.
 
 use rayon::prelude::*;
 
-use super::mean;
+use super::{assert_alike, mean};
 use crate::planes::Planes;
 
 /// Added to the squared reference in RelMSE's denominator, so that the error of black pixels is finite.
@@ -37,6 +39,7 @@ pub fn rmse(image: &Planes, reference: &Planes) -> f64 {
 
 /// The largest `|x - r|` of any pixel and channel.
 pub fn max_error(image: &Planes, reference: &Planes) -> f64 {
+    assert_alike(image, reference);
     image
         .data
         .par_iter()
@@ -53,6 +56,7 @@ pub fn smape(image: &Planes, reference: &Planes) -> f64 {
 /// The sum of all values divided by that of the reference: how much of the light is kept. None where the
 /// reference's sum is not positive.
 pub fn energy(image: &Planes, reference: &Planes) -> Option<f64> {
+    assert_alike(image, reference);
     let sum = |planes: &Planes| planes.data.iter().map(|v| f64::from(*v)).sum::<f64>();
     let whole = sum(reference);
     (whole > 0.0).then(|| sum(image) / whole)
@@ -60,6 +64,7 @@ pub fn energy(image: &Planes, reference: &Planes) -> Option<f64> {
 
 /// RelMSE of each pixel (the mean of its channels), row-major: the error map of a report.
 pub fn relmse_map(image: &Planes, reference: &Planes) -> Vec<f64> {
+    assert_alike(image, reference);
     (0..image.pixels())
         .into_par_iter()
         .map(|i| {
@@ -99,6 +104,19 @@ mod tests {
         assert_eq!(max_error(&x, &r), 1.0);
         let expected = (1.0 / 3.01 + 0.0 + 0.5 / 0.51) / 3.0;
         assert!((smape(&x, &r) - expected).abs() < 1e-12);
+    }
+
+    #[test]
+    fn images_of_other_sizes_and_of_none_are_refused() {
+        let (one, none) = (rgb(1, &[1.0; 3]), Planes::new(3, 0, 0));
+        let two = rgb(2, &[1.0; 6]);
+        let metrics: [fn(&Planes, &Planes) -> f64; 5] = [relmse, rmse, max_error, smape, relmse_trimmed];
+        for (image, reference) in [(&one, &two), (&two, &one), (&none, &none)] {
+            for metric in metrics {
+                assert!(std::panic::catch_unwind(|| metric(image, reference)).is_err());
+            }
+            assert!(std::panic::catch_unwind(|| energy(image, reference)).is_err());
+        }
     }
 
     #[test]

@@ -132,8 +132,17 @@ pub fn score(image: &Planes, reference: &Planes) -> Result<Scores, Incomparable>
     })
 }
 
+/// # Panics
+/// If sizes or channels differ, or there is no pixel.
+fn assert_alike(image: &Planes, reference: &Planes) {
+    let size = |p: &Planes| (p.channels, p.width, p.height);
+    assert_eq!(size(image), size(reference), "images of one size");
+    assert!(!image.data.is_empty(), "images with pixels");
+}
+
 /// The mean of `value(x, r)` over all values of two images of one size.
 fn mean(image: &Planes, reference: &Planes, value: impl Fn(f64, f64) -> f64 + Sync) -> f64 {
+    assert_alike(image, reference);
     let sums: Vec<f64> = image
         .data
         .par_chunks(image.width)

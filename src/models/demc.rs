@@ -242,7 +242,7 @@ impl Demc {
     }
 
     /// The detail map, and each encoder's skips and latent.
-    #[allow(clippy::type_complexity)]
+    #[expect(clippy::type_complexity, reason = "a triple that one function returns and one takes apart")]
     fn encode<T: Tape<f32, Cpu> + Merge<T>>(
         &self,
         batch: &Batch,

@@ -81,6 +81,9 @@ pub trait Denoiser: Send + Sync {
     ///
     /// # Errors
     /// As [`Denoiser::denoise`], or there are companions and the method takes none.
+    ///
+    /// # Panics
+    /// If a companion is not of the frame's size.
     fn denoise_along(
         &self,
         shot: &Shot,

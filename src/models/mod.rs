@@ -49,7 +49,14 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
     let restrained = name_or_file.strip_suffix(UNRESTRAINED);
     let (plain, precision) = split_precision(restrained.unwrap_or(name_or_file));
     let mut model = match catalogue::find(plain) {
-        Some(catalogue::Method { kind: catalogue::Kind::Fixed(make), .. }) => return Ok(make()),
+        Some(catalogue::Method { kind: catalogue::Kind::Fixed(make), .. }) if plain == name_or_file => {
+            return Ok(make());
+        }
+        Some(catalogue::Method { kind: catalogue::Kind::Fixed(_), .. }) => {
+            return Err(Error::Usage(format!(
+                "{name_or_file}: {plain} is no network; leave out what follows its name"
+            )));
+        }
         Some(method) => method.learned()?,
         None if Path::new(plain).extension().is_some_and(|e| e == "safetensors") => {
             learned::Learned::from_file(Path::new(plain))?

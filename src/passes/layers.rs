@@ -240,6 +240,13 @@ fn in_one_layer(
 }
 
 impl Layer {
+    /// Whether a method finds what it reads in this pass: the pass itself, or of Normal, which is in world
+    /// space, Denoising Normal, which is in camera space.
+    pub fn tells(&self, pass: Pass) -> bool {
+        let has = |pass| self.passes.contains_key(&pass);
+        has(pass) || (pass == Pass::Normal && has(Pass::DenoisingNormal))
+    }
+
     fn empty(name: String, view: Option<String>) -> Self {
         let (passes, light_groups, unrecognised) = Default::default();
         let (position_averaged, motion, renderer) = (false, None, &BLENDER);

@@ -3,8 +3,8 @@
 //!
 //! In: the rows of [`super::run`]. Renders of one scene at one sample count count as its noise seeds. Two
 //! bounds apply. The result has at most the input's RelMSE, since a denoiser that makes a frame worse had
-//! better be off; where the input is exact, at most [`HARMLESS`]. And the sum of its light is within 2% of the reference's, about the least difference in
-//! brightness that an eye sees (Weber's fraction). This tolerance grows by as much as the input's own sum is
+//! better be off; where the input is exact, at most a RelMSE of 0.0001. And the sum of
+//! its light is within 2% of the reference's, about the least difference in brightness that an eye sees (Weber's fraction). This tolerance grows by as much as the input's own sum is
 //! off, since the input may have fireflies or lack light that only few paths find.
 
 use std::{

@@ -223,6 +223,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
             WrapChoice::None => Wrap::None,
         },
     };
+    denoise::check_options(&*model, &options)?;
     let style = match (args.json, args.quiet) {
         (true, _) => Style::Json,
         (_, true) => Style::Quiet,

@@ -232,7 +232,7 @@ fn examine_layer(
     passes.extend(others.into_iter().map(describe));
     let has_beauty = decodable.contains(&Pass::Combined);
     let models = methods.iter().filter(|_| has_beauty).map(|method| {
-        let missing = method.passes.iter().filter(|pass| !layer.passes.contains_key(pass));
+        let missing = method.passes.iter().filter(|pass| !layer.tells(**pass));
         let described = |p: &Pass| Missing { pass: p.to_string(), remedy: layer.renderer.setting(*p) };
         ModelReport {
             model: method.name.clone(),
@@ -265,6 +265,7 @@ fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
     About {
         half: layer.passes.keys().copied().filter(is_half).collect(),
         position_averaged: layer.position_averaged,
+        denoised_by_demc: frame.expected_errors().iter().any(|(name, _)| *name == layer.name),
         colour_space: ["colorInteropID", "oiio:ColorSpace"]
             .iter()
             .find_map(|name| frame.text_attribute(name)),

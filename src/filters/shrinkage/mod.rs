@@ -97,7 +97,7 @@ pub struct Render<'a> {
 }
 
 impl Render<'_> {
-    /// Samples of a pixel, [`UNKNOWN_SAMPLES`] where the file does not tell.
+    /// Samples of a pixel, 16 where the file does not tell.
     pub fn samples_or_guess(&self) -> f32 {
         self.samples.unwrap_or(UNKNOWN_SAMPLES).max(1) as f32
     }

@@ -340,7 +340,9 @@ pub fn convolve(
     assert!(grid.pad >= geometry.reach(), "border too small for {geometry:?}");
     for (_, format) in &weights.inputs {
         if let Format::Int8(steps) = format {
-            let fit = weights.fit_16_bits || !engine.adds_in_16_bits(geometry);
+            // Weights that were not made for Winograd's cells go tap by tap.
+            let by_taps = weights.parts.is_empty() && engine.prefers_winograd(geometry);
+            let fit = weights.fit_16_bits || !(by_taps || engine.adds_in_16_bits(geometry));
             assert!(fit, "weights are rounded for an engine with longer sums");
             assert!(steps.zero == 0 || !epilogue.accumulate, "no bias makes up for what is zero");
         }

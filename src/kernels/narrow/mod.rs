@@ -232,7 +232,10 @@ impl Operand {
 
     fn allocate(shape: Shape, grid: Grid, format: Format) -> Self {
         let planes = shape.c.div_ceil(format.channels()) * grid.phases();
-        Self { data: allocate(shape.n * planes * grid.positions() + grid.slack()), grid, shape, format }
+        let body = shape.n.checked_mul(planes).and_then(|planes| planes.checked_mul(grid.positions()));
+        let values = body.and_then(|body| body.checked_add(grid.slack()));
+        let data = allocate(values.expect("an activation fits into memory"));
+        Self { data, grid, shape, format }
     }
 
     /// An activation rounded to bfloat16. `geometry` is that of the convolution that reads it.
