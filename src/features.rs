@@ -438,6 +438,9 @@ pub fn albedo_exposure(albedo: &Planes) -> f32 {
     log_average_exposure(albedo, divisor)
 }
 
+/// The largest exposure. In the light of denormal numbers the one that is wanted would be infinite.
+const MOST_EXPOSURE: f64 = 1e37;
+
 /// The [`exposure`] of planes whose values are `of(value)`.
 fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 {
     let (w, h) = (planes.width, planes.height);
@@ -461,7 +464,7 @@ fn log_average_exposure(planes: &Planes, of: impl Fn(f32) -> f32 + Sync) -> f32 
     let rows: Vec<(f64, usize)> =
         (0..h.div_ceil(EXPOSURE_SQUARE)).into_par_iter().map(|y| row(y * EXPOSURE_SQUARE)).collect();
     let (sum, count) = rows.into_iter().fold((0.0, 0), |(s, n), (sum, count)| (s + sum, n + count));
-    if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()) as f32 }
+    if count == 0 { 1.0 } else { (MIDDLE_GREY / (sum / count as f64).exp()).min(MOST_EXPOSURE) as f32 }
 }
 
 /// Sums the luminance of `of(value)` over some rows, for each column.

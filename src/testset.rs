@@ -283,7 +283,8 @@ fn manifest(path: &Path) -> Result<TestSet> {
             .and_then(|n| n.frame.map(str::to_string));
         let (noisy, reference) = (directory.join(&row.noisy), directory.join(&row.reference));
         let said = (row.scene.clone(), row.spp);
-        if let Some((before, spp)) = seen.insert((noisy.clone(), reference.clone()), said) {
+        let place = |file: &Path| std::fs::canonicalize(file).unwrap_or_else(|_| file.to_owned());
+        if let Some((before, spp)) = seen.insert((place(&noisy), place(&reference)), said) {
             if (before.as_str(), spp) == (row.scene.as_str(), row.spp) {
                 continue;
             }

@@ -225,3 +225,54 @@ proptest! {
         prop_assert!(consume(&bytes).is_err());
     }
 }
+
+/// Weights are read from files alone, and of no more bytes than weights have.
+#[test]
+#[cfg(unix)]
+fn weights_that_would_never_end_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let [pipe, device, hole] =
+        ["pipe", "device", "hole"].map(|name| dir.path().join(format!("{name}.safetensors")));
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    std::os::unix::fs::symlink("/dev/zero", &device).unwrap();
+    fs::File::create(&hole).unwrap().set_len(20 << 30).unwrap();
+    for (path, why) in
+        [(&pipe, "no file on a disk"), (&device, "no file on a disk"), (&hole, "larger than any weights")]
+    {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["denoise", "--model"]).arg(path).arg(data("s0000_room_0004spp.exr"));
+        command.arg("--out").arg(dir.path().join("out")).timeout(std::time::Duration::from_secs(20));
+        let run = command.assert().failure();
+        let message = String::from_utf8(run.get_output().stderr.clone()).unwrap();
+        assert!(
+            message.contains(name) && message.contains(why) && message.contains("demc train"),
+            "{message}"
+        );
+    }
+}
+
+/// Light too faint for the reciprocal of its exposure to be a number.
+#[test]
+fn frames_of_denormal_numbers_are_denoised() {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, factor) in [("dim", 1e-38), ("dark", 1e-42), ("faint", 1e-44)] {
+        let path = dir.path().join(format!("{name}.exr"));
+        write_float(&path, |i| ((i * 31 % 97) as f32 * factor as f32) / 97.0);
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["denoise", "--model", "demc-s"]).arg(&path).arg("--out").arg(dir.path().join("out"));
+        command.assert().success();
+    }
+}
+
+/// A float beauty of 40x30 pixels.
+fn write_float(path: &Path, value: impl Fn(usize) -> f32) {
+    use exr::prelude::*;
+    let list = ["R", "G", "B"].map(|c| {
+        let values = (0..40 * 30).map(&value).collect();
+        AnyChannel::new(format!("ViewLayer.Combined.{c}").as_str(), FlatSamples::F32(values))
+    });
+    let channels = AnyChannels::sort(list.into_iter().collect());
+    let layer = Layer::new((40, 30), LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}

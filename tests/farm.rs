@@ -294,9 +294,15 @@ fn the_open_job_description_runs_in_chunks_and_reports() {
     made.retain(|name, _| name.ends_with(".exr"));
     assert_eq!(made, expected);
 
-    // A job with a frame that cannot be denoised fails.
-    fs::write(folder.path().join("renders/shot_0004spp.0004.exr"), "broken").unwrap();
-    assert!(!job("4-6", "broken").status.success());
+    // A job with a frame that cannot be denoised fails, lists it, and does all others. A quote in a path is no shell's.
+    fs::write(folder.path().join("renders/shot_0004spp.0002.exr"), "broken").unwrap();
+    let broken = job("1-9", "it's");
+    let said = String::from_utf8_lossy(&broken.stdout);
+    assert!(
+        !broken.status.success() && said.contains("8 denoised in ") && said.contains("0002.exr"),
+        "{said}"
+    );
+    assert_eq!(results(&folder.path().join("it's")).keys().filter(|name| name.ends_with(".exr")).count(), 8);
 }
 
 #[test]
@@ -348,6 +354,19 @@ fn training_data_of_two_tasks_is_joined_into_one_set() {
         let name = pair.noisy.file_name().unwrap();
         assert_eq!(fs::read(&pair.noisy).unwrap(), fs::read(whole.join(name)).unwrap(), "{name:?}");
     }
+
+    // A task that has not come to its first row yet, or was killed within it, is left out.
+    for (part, text) in [("0003", ""), ("0004", "scene,noi")] {
+        fs::create_dir(set.join(part)).unwrap();
+        fs::write(set.join(part).join("manifest.csv"), text).unwrap();
+        let told = join();
+        let note = format!("{part}/manifest.csv holds nothing yet");
+        assert!(told.status.success() && String::from_utf8_lossy(&told.stderr).contains(&note));
+    }
+    let foreign = set.join("0004/manifest.csv");
+    fs::write(&foreign, "x,y\n1,2\n").unwrap();
+    assert!(String::from_utf8_lossy(&join().stderr).contains("0004/manifest.csv has no column noisy"));
+    fs::remove_file(foreign).unwrap();
 
     // The same again; and two tasks of one seed are refused, with the set left as it was.
     let before = fs::read(&manifest).unwrap();

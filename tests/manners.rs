@@ -250,14 +250,17 @@ fn a_report_over_many_tasks_lists_what_failed_in_the_end() {
         .code(1)
         .stdout(contains("missing: renders/shot_0004spp.0012.exr: no task tells of it"));
 
-    // The task is run again, and the last one is killed within a line.
+    // The task is run again, by another path to its folder, and the last one is killed within a line.
     fs::write(&broken, whole).unwrap();
-    assert_eq!(run("renders --frames 4-6", "1.jsonl"), Some(0));
+    assert_eq!(run("$PWD/renders --frames 4-6", "1.jsonl"), Some(0));
     assert_eq!(run("renders --frames 7-12", "2.jsonl"), Some(0));
     fs::write(log("3.jsonl"), r#"{"input":"renders/shot_00"#).unwrap();
     report("--of renders")
         .success()
         .stdout(contains("3 denoised in "))
         .stderr(contains("3.jsonl: 1 lines are none of `demc denoise --json`"));
+    fs::write(log("3.jsonl"), "bash: demc: command not found\n").unwrap();
+    let silent = shell(folder.path(), "demc report logs/3.jsonl").assert();
+    silent.code(1).stderr(contains("the logs hold no line of `demc denoise --json`"));
     demc().args(["report", "missing.jsonl"]).assert().code(1).stderr(contains("missing.jsonl: cannot read"));
 }

@@ -191,3 +191,107 @@ fn no_more_threads_than_anybody_means() {
         demc().args(arguments.split_whitespace()).assert().code(2).stderr(contains("4096"));
     }
 }
+
+#[test]
+fn a_result_that_was_cut_off_is_made_again() {
+    let folder = folder_with(&["in/shot.0001.exr"]);
+    denoise(folder.path(), "in --out out").success();
+    let path = folder.path().join("out/shot.0001.exr");
+    let whole = fs::read(&path).unwrap();
+    for length in [whole.len() - 1, whole.len() / 2, 0] {
+        fs::write(&path, &whole[..length]).unwrap();
+        denoise(folder.path(), "in --out out").success().stdout(contains("is there already").not());
+        assert!(fs::read(&path).unwrap() == whole, "cut at {length}");
+    }
+    // What somebody else's file was is not known.
+    let render = fs::read(folder.path().join("in/shot.0001.exr")).unwrap();
+    fs::write(&path, &render[..render.len() - 1]).unwrap();
+    denoise(folder.path(), "in --out out").code(1).stderr(contains("exists without"));
+}
+
+#[test]
+fn what_frames_leaves_out_is_told_where_it_is_no_file() {
+    let folder = folder_with(&["in/shot.0001.exr", "in/shot.0002.exr"]);
+    let missing = contains("sc010: cannot read");
+    denoise(folder.path(), "in sc010 --out out --frames 1")
+        .code(1)
+        .stderr(missing.clone())
+        .stdout(contains("1 denoised"));
+    denoise(folder.path(), "sc010 --out out --frames 1").code(1).stderr(missing.clone());
+    denoise(folder.path(), "sc010 --out out --frames 1 --watch 1").code(1).stderr(missing);
+    denoise(folder.path(), "none/*.exr --out out --watch 1")
+        .code(1)
+        .stderr(contains("none/*.exr: matches no file"));
+}
+
+#[test]
+fn options_that_exclude_each_other_are_wrong_usage_once() {
+    let folder = folder_with(&["in/shot.0001.exr", "in/shot.0002.exr"]);
+    for (options, why) in [
+        ("--model demc-s --temporal --passes", "work frame by frame"),
+        ("--model nfor --passes", "--passes takes"),
+        ("--model nfor --confidence", "--confidence"),
+    ] {
+        denoise(folder.path(), &format!("in --out out {options}")).code(2).stderr(contains(why).count(1));
+    }
+    assert!(!folder.path().join("out/shot.0001.exr").exists());
+}
+
+#[test]
+fn a_guide_is_not_overwritten() {
+    let folder = folder_with(&["in/shot.0001.exr", "guides/shot.0001.exr"]);
+    let before = fs::read(folder.path().join("guides/shot.0001.exr")).unwrap();
+    let command =
+        "in/shot.0001.exr --albedo guides/shot.####.exr --map albedo=Combined --out guides --overwrite";
+    denoise(folder.path(), command)
+        .code(1)
+        .stderr(contains("guides/shot.0001.exr: is a guide of this frame"));
+    assert!(fs::read(folder.path().join("guides/shot.0001.exr")).unwrap() == before);
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn names_that_are_not_utf8_are_names_like_any() {
+    use std::{ffi::OsStr, os::unix::ffi::OsStrExt};
+    let folder = folder_with(&["in/a.0001.exr"]);
+    let name = |number: u8| OsStr::from_bytes(&[b"k\xfcche.000", &[number][..], b".exr"].concat()).to_owned();
+    for number in [b'2', b'3'] {
+        fs::copy(folder.path().join("in/a.0001.exr"), folder.path().join("in").join(name(number))).unwrap();
+    }
+    let has = |number| folder.path().join("out").join(name(number)).exists();
+    denoise(folder.path(), "in --out out --frames 2").success();
+    assert!(has(b'2') && !has(b'3'));
+    denoise(folder.path(), "in/*.exr --out out").success().stdout(contains("2 denoised, 1 already there"));
+    assert!(has(b'3'));
+    // Without vectors the frames stay alone, but they know of each other.
+    denoise(folder.path(), "in --out out --overwrite --temporal 1")
+        .success()
+        .stderr(contains("frame 3 has no pass Vector"));
+}
+
+/// What the shell tells the program to ignore stays ignored, and a file that may not grow further fails alone.
+#[test]
+#[cfg(target_os = "linux")]
+fn nohup_outlives_its_terminal_and_a_file_limit_costs_its_frame() {
+    let folder = folder_with(&["in/b.0001.exr"]);
+    write_render(&folder.path().join("in/a.0001.exr"), 400, 300, |_, pixel| {
+        (pixel * 7919 % 65521) as f32 / 65521.0
+    });
+    let shell = |script: &str| {
+        let mut command = std::process::Command::new("bash");
+        let demc = assert_cmd::cargo::cargo_bin("demc");
+        command.args(["-c", script]).env("DEMC", demc).current_dir(folder.path());
+        command.output().unwrap()
+    };
+    let limited = shell("ulimit -f 60; \"$DEMC\" denoise in --model noisy --out out");
+    let said = String::from_utf8_lossy(&limited.stderr);
+    assert_eq!(limited.status.code(), Some(1), "{said}");
+    assert!(said.contains("a.0001.exr: cannot write: File too large"), "{said}");
+    assert!(folder.path().join("out/b.0001.exr").exists());
+    // A watch, so that the signal comes while it runs.
+    let script = "trap '' HUP; \"$DEMC\" denoise in --model noisy --out out2 --watch 3 & sleep 1.5; kill -HUP $!; wait $!";
+    let hung_up = shell(script);
+    assert_eq!(hung_up.status.code(), Some(0), "{}", String::from_utf8_lossy(&hung_up.stderr));
+    let script = "\"$DEMC\" denoise in --model noisy --out out3 --watch & sleep 1.5; kill -HUP $!; wait $!";
+    assert_eq!(shell(script).status.code(), Some(130));
+}

@@ -22,9 +22,13 @@ _TABLES = {
 
 
 def rows_of(path):
-    """The header and rows of a table; a row that was cut off by a kill is left out."""
+    """The header and rows of a table; what a kill cut off is left out, as is all of it where the header's line has
+    no end."""
     with open(path, encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
+        lines = file.read().splitlines(keepends=True)
+    if not lines or not lines[0].endswith("\n"):
+        return None, []
+    header, *rows = csv.reader(lines)
     return header, [dict(zip(header, row)) for row in rows if len(row) == len(header)]
 
 
@@ -35,6 +39,12 @@ def join(folder, name):
     for table in sorted(glob.glob(os.path.join(glob.escape(folder), "*", name))):
         part = os.path.basename(os.path.dirname(table))
         own, rows = rows_of(table)
+        if own is None:
+            print(f"note: {table} holds nothing yet; join again when its task has ended", file=sys.stderr)
+            continue
+        lacking = [column for column in (*paths, unique) if column not in own]
+        if lacking:
+            raise ValueError(f"{table} has no column {lacking[0]}: it is no table of generate_scenes.py")
         if header not in (None, own):
             raise ValueError(f"{table} has other columns than the rest: it is of another version of generate_scenes.py")
         header = own

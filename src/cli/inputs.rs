@@ -17,7 +17,7 @@ pub struct Inputs {
     /// Inputs, or paths that a glob came by, that name no file; each with the reason.
     pub unusable: Vec<(PathBuf, Error)>,
     /// Inputs that hold or match no file yet, each with the reason.
-    empty: Vec<(PathBuf, Error)>,
+    pub empty: Vec<(PathBuf, Error)>,
 }
 
 /// How directories are looked through.

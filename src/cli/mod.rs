@@ -120,6 +120,7 @@ pub fn compare_files(image: &Path, reference: &Path) -> Result<Scores> {
 
 fn main_with(Cli { command }: Cli) -> ExitCode {
     crate::kernels::heap::keep_freed();
+    stop::outlive_file_limits();
     // A defect is told in one line like any other failure, not by a trace of the program.
     if std::env::var_os("RUST_BACKTRACE").is_none() {
         set_hook(Box::new(|_| {}));

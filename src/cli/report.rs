@@ -68,6 +68,8 @@ enum Status {
 
 /// What became of a frame after all tries.
 struct Fate {
+    /// Its path, as it was told.
+    input: PathBuf,
     status: Status,
     error: String,
     /// The result's expected RelMSE, and the samples of its render.
@@ -80,13 +82,14 @@ struct Fate {
 /// A log cannot be read, or the inputs of `--of` name no file.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let mut frames: BTreeMap<PathBuf, Fate> = BTreeMap::new();
-    let mut seconds = 0.0;
+    let (mut seconds, mut lines) = (0.0, 0usize);
     for log in &args.logs {
         let mut unreadable = 0;
         for text in BufReader::new(File::open(log).map_err(Error::io("read", log))?).split(b'\n') {
             let text = text.map_err(Error::io("read", log))?;
             match serde_json::from_slice::<Line>(&text) {
                 Ok(line) => {
+                    lines += 1;
                     seconds += line.seconds.unwrap_or_default();
                     add(&mut frames, line);
                 }
@@ -101,9 +104,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     let missing = missing(&args.of, args.recursive, &frames)?;
     let count = |status| frames.values().filter(|frame| frame.status == status).count();
-    for (input, frame) in frames.iter().filter(|(_, frame)| frame.status == Status::Failed) {
+    for frame in frames.values().filter(|frame| frame.status == Status::Failed) {
         // Errors name their file already.
-        let error = &frame.error;
+        let Fate { input, error, .. } = frame;
         let named = error.contains(&*input.to_string_lossy());
         print_line(&if named {
             format!("failed: {error}")
@@ -126,14 +129,23 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     print_line(&totals);
     if let Some(wish) = args.by_error {
         let mut ranking = Ranking::new(wish);
-        for (input, frame) in &frames {
+        for frame in frames.values() {
             if let Some((error, samples)) = frame.expected {
-                ranking.add(input.display().to_string(), error, samples);
+                ranking.add(frame.input.display().to_string(), error, samples);
             }
         }
         ranking.print();
     }
-    Ok(if failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
+    let is_silent = lines == 0;
+    if is_silent {
+        warn_line("demc: the logs hold no line of `demc denoise --json`; see there why no task wrote one");
+    }
+    Ok(if is_silent || failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
+}
+
+/// What tells frames apart, since tasks may reach a folder by different paths.
+fn place(path: &Path) -> PathBuf {
+    fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
 }
 
 /// Adds a line. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap.
@@ -143,11 +155,12 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
         Status::Skipped => 1,
         Status::Done => 2,
     };
-    let known = frames.get(&line.input).map(|frame| rank(frame.status));
+    let place = place(&line.input);
+    let known = frames.get(&place).map(|frame| rank(frame.status));
     if known.is_none_or(|known| known <= rank(line.status)) {
         let error = line.error.unwrap_or_default();
         let expected = line.expected_error.map(|error| (error, line.samples));
-        frames.insert(line.input, Fate { status: line.status, error, expected });
+        frames.insert(place, Fate { input: line.input, status: line.status, error, expected });
     }
 }
 
@@ -155,11 +168,8 @@ fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) ->
     if of.is_empty() {
         return Ok(Vec::new());
     }
-    // Tasks may have reached the folder by another path.
-    let place = |path: &Path| fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
-    let told: Vec<PathBuf> = frames.keys().map(|input| place(input)).collect();
     let search = Search { recursive, ..Search::default() };
     let mut files = inputs::expand(of, &search)?.paths();
-    files.retain(|file| !told.contains(&place(file)));
+    files.retain(|file| !frames.contains_key(&place(file)));
     Ok(files)
 }

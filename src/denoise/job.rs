@@ -590,16 +590,18 @@ fn file_name(name: &str) -> String {
     name.chars().map(write).collect()
 }
 
-/// The headers of the EXR that exists at `output`, if there is one. It is whole, since results are written
-/// whole; what a full disk or a failed copy left is none.
+/// The EXR that exists at `output`, if there is one. Results are written whole: one of demc's that lacks blocks, as a
+/// full disk or a failed copy leaves it, is none. Of others, and of deep files, headers are enough to tell that they
+/// are there.
 ///
 /// # Errors
 /// The system does not let it be read, so nobody knows what would be lost.
 pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
-    match Frame::read_headers(output) {
-        Ok(headers) => Ok(Some(headers)),
-        Err(error @ Error::Io { .. }) if output.exists() => Err(error),
-        Err(_) => Ok(None),
+    let lost = |error: &Error| matches!(error, Error::Io { .. }) && output.exists();
+    match Frame::read(output) {
+        Ok(frame) => Ok(Some(frame)),
+        Err(error) if lost(&error) => Err(error),
+        Err(_) => Ok(Frame::read_headers(output).ok().filter(|headers| !headers.is_result())),
     }
 }
 
@@ -608,15 +610,15 @@ pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
 ///
 /// # Errors
 /// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
-pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
-    let output = headers.path();
-    let layers = passes::layers_by(headers, &options.sources.mapping);
-    let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
+pub(super) fn take_up(existing: &Frame, options: &Options) -> Result<()> {
+    let output = existing.path();
+    let layers = passes::layers_by(existing, &options.sources.mapping);
+    let layer = passes::choose(existing, &layers, options.view_layer.as_deref())?;
     let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
     let full_name = layer_name(chosen, name);
     let views = match &options.layer {
-        Some(added) => passes::rgb_layers(headers, Some(chosen), added),
+        Some(added) => passes::rgb_layers(existing, Some(chosen), added),
         // The beauty, whatever its renderer calls it.
         None => layers
             .iter()
@@ -630,18 +632,18 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
         );
         Err(Error::invalid(output, why))
     };
-    if views.is_empty() || !headers.is_own_layer(&full_name) {
+    if views.is_empty() || !existing.is_own_layer(&full_name) {
         return lacks(&format!("'{full_name}'"));
     }
     let is_own = |at: &PassChannels| match &options.layer {
-        Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
-        None => headers.is_own_layer(&layer_name(chosen, &at.name)),
+        Some(added) => existing.is_own_layer(&added_name(layer, &at.name, added)),
+        None => existing.is_own_layer(&layer_name(chosen, &at.name)),
     };
     let lights = denoised_lights(layer);
     if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
         return lacks("denoised light passes");
     }
-    if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
+    if options.confidence && !existing.is_own_layer(&layer_name(chosen, &error_layer(options))) {
         return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
     }
     let Some(write) = options.preview else { return Ok(()) };
@@ -650,9 +652,8 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     if missing.is_empty() {
         return Ok(());
     }
-    let frame = Frame::read(output)?;
     for (layer, path) in missing {
-        let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
+        let set = passes::read_layer(existing, layer, &[Pass::Combined])?;
         write(&path, set.require(Pass::Combined, "--preview")?)?;
     }
     Ok(())

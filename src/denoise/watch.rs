@@ -36,6 +36,8 @@ pub struct Look {
     pub jobs: Vec<Job>,
     /// Inputs that cannot be denoised, each with the reason; each is told once.
     pub failures: Vec<(PathBuf, Error)>,
+    /// Inputs that name no file yet, each with the reason, which is told in the end if none ever came.
+    pub empty: Vec<(PathBuf, Error)>,
 }
 
 /// Looks for files until none has come for a while.
@@ -55,6 +57,8 @@ struct State {
     /// told.
     told: Vec<PathBuf>,
     failures: Vec<(PathBuf, Error)>,
+    /// Inputs that have named no file in any look; none before the first.
+    empty: Option<Vec<(PathBuf, Error)>>,
     /// When a file was last new or had changed.
     changed: Instant,
 }
@@ -96,8 +100,8 @@ impl Watch {
     /// Looks for files by `look`, and ends when none was new for the time `idle`, or never without that time.
     /// If `again`, a file that was taken and has changed, as one that was rendered again, is taken again.
     pub fn new(look: impl FnMut() -> Look + Send + 'static, idle: Option<Duration>, again: bool) -> Self {
-        let (files, ready, told, failures) = Default::default();
-        let state = Mutex::new(State { files, ready, told, failures, changed: Instant::now() });
+        let (files, ready, told, failures, empty) = Default::default();
+        let state = Mutex::new(State { files, ready, told, failures, empty, changed: Instant::now() });
         Self { look: Mutex::new(Box::new(look)), idle, again, state }
     }
 
@@ -141,17 +145,22 @@ impl Watch {
         }
     }
 
-    /// The files that never became whole, each with the error of reading it. Those that were changing when the
-    /// watch was stopped do not count.
+    /// The files that never became whole, each with the error of reading it, and inputs for which none came. Those
+    /// that were changing, or still to come, when the watch was stopped do not count.
     pub(super) fn leftovers(&self, end: End) -> Vec<(Job, Error)> {
-        let files = std::mem::take(&mut self.state().files).into_values();
+        let (files, empty) = {
+            let mut state = self.state();
+            (std::mem::take(&mut state.files).into_values(), state.empty.take().unwrap_or_default())
+        };
+        let empty = empty.into_iter().filter(|_| end == End::Complete);
+        let empty = empty.map(|(input, error)| (Job { input, output: PathBuf::new() }, error));
         let unfinished = |file: File| match file.status {
             Status::Taken => None,
             Status::Broken(error, _) => Some((file.job, error)),
             Status::Coming if end == End::Stopped => None,
             Status::Coming => Frame::read(&file.job.input).err().map(|error| (file.job, error)),
         };
-        files.filter_map(unfinished).collect()
+        files.filter_map(unfinished).chain(empty).collect()
     }
 }
 
@@ -162,6 +171,10 @@ impl State {
                 self.told.push(path.clone());
                 self.failures.push((path, error));
             }
+        }
+        match &mut self.empty {
+            None => self.empty = Some(found.empty),
+            Some(empty) => empty.retain(|(path, _)| found.empty.iter().any(|(now, _)| now == path)),
         }
         let mut before = std::mem::take(&mut self.files);
         for job in found.jobs {
@@ -225,7 +238,7 @@ mod tests {
         fn new(again: bool) -> Self {
             let folder = tempfile::tempdir().unwrap();
             let job = Job { input: folder.path().join("a.exr"), output: PathBuf::new() };
-            let look = move || Look { jobs: vec![job.clone()], failures: Vec::new() };
+            let look = move || Look { jobs: vec![job.clone()], ..Look::default() };
             let watch = Arc::new(Watch::new(look, Some(Duration::from_millis(2500)), again));
             Self { folder, watch }
         }
@@ -282,7 +295,7 @@ mod tests {
 
     #[test]
     fn a_failure_is_told_once() {
-        let look = || Look { jobs: Vec::new(), failures: vec![("a".into(), Error::Usage("no".into()))] };
+        let look = || Look { failures: vec![("a".into(), Error::Usage("no".into()))], ..Look::default() };
         let watch = Watch::new(look, Some(INTERVAL), false);
         assert!(matches!(watch.next(|| false), Next::Failure(path, _) if path.ends_with("a")));
         assert!(matches!(watch.next(|| false), Next::End));

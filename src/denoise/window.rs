@@ -478,7 +478,12 @@ impl Window {
         }
         let is_alone = moment.links.values().all(Result::is_err);
         let end = if is_alone { "denoised alone" } else { "denoised with those that are left" };
-        let note = format!("{}; {end}", gaps.join("; "));
+        let again = if gaps.iter().any(|gap| gap.contains("cannot be read")) {
+            " (once it can be, do this frame again with --overwrite)"
+        } else {
+            ""
+        };
+        let note = format!("{}; {end}{again}", gaps.join("; "));
         if !report.notes.contains(&note) {
             report.notes.push(note);
         }

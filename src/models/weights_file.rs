@@ -120,7 +120,7 @@ pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()
 /// # Errors
 /// The file is unreadable, or not the weights of a network that this version knows.
 pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
-    parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+    parse(&weights::bytes(path)?, path)
 }
 
 /// Reads the network `config` from a weights file that holds it, or a narrower one of the same design. In the
@@ -130,7 +130,7 @@ pub fn read(path: &Path) -> Result<(Box<dyn Network>, Metadata)> {
 /// # Errors
 /// As [`read`], or the file holds another network.
 pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Network>> {
-    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    let bytes = weights::bytes(path)?;
     let (metadata, tensors) = metadata(&bytes, path)?;
     let held = &metadata.network;
     let mut network = super::build(config, seed);
@@ -205,7 +205,7 @@ pub fn set_prefilter(network: &mut dyn Network, bytes: &[u8], path: &Path) -> Re
 /// # Errors
 /// As [`read`].
 pub fn config(path: &Path) -> Result<Config> {
-    parse_config(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+    parse_config(&weights::bytes(path)?, path)
 }
 
 /// The configuration of the network that the bytes of a weights file hold; `path` is for messages.
@@ -252,6 +252,9 @@ fn check_inputs(held: Option<&str>, now: &str) -> Result<(), String> {
     ))
 }
 
+/// The least range that can be divided into steps of 8 bits; those of trained networks are some 2 to 650.
+const LEAST_RANGE: f32 = 1e-6;
+
 /// Parses the bytes of a weights file; `path` is for messages.
 ///
 /// # Errors
@@ -261,7 +264,9 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<(Box<dyn Network>, Metadata)> 
     let mut network = super::build(&metadata.network, 0);
     fill(&mut *network, &tensors, path)?;
     for conv in network.convolutions() {
-        conv.range = metadata.ranges.get(conv.name()).copied().filter(|range| range.is_finite());
+        // Without a range, a layer that gave nothing while it was validated is computed in f32.
+        let is_range = |range: &f32| range.is_finite() && *range >= LEAST_RANGE;
+        conv.range = metadata.ranges.get(conv.name()).copied().filter(is_range);
     }
     Ok((network, metadata))
 }
@@ -330,6 +335,19 @@ mod tests {
         });
         assert_eq!(read(&path).unwrap().1.inputs, None);
         assert!(check_inputs(None, "guides/logarithm/2").is_err(), "of the first kind, which is past");
+    }
+
+    #[test]
+    fn ranges_that_cannot_be_divided_are_none() {
+        let folder = tempfile::tempdir().unwrap();
+        for (range, is_kept) in [(2.5, true), (0.0, false), (-1.0, false), (1e-30, false)] {
+            let (_, path) = changed(folder.path(), |metadata, tensors| {
+                let name = tensors.iter().find_map(|tensor| tensor.name.strip_suffix(".weight")).unwrap();
+                metadata["ranges"] = serde_json::json!({ name: range });
+            });
+            let kept = read(&path).unwrap().0.convolutions().into_iter().any(|conv| conv.range.is_some());
+            assert_eq!(kept, is_kept, "{range}");
+        }
     }
 
     #[test]

@@ -55,12 +55,30 @@ pub fn write(path: &Path, metadata: &str, tensors: &[Tensor], precision: Precisi
     atomically(path, |mut file| file.write_all(&data).map_err(Error::io("write", path)))
 }
 
+/// No network that could be trained has so many bytes of weights.
+const MOST_BYTES: u64 = 4 << 30;
+
+/// The bytes of a weights file.
+///
+/// # Errors
+/// It cannot be read, or is no file of a size that weights may have: a pipe would wait for ever, and a device would
+/// be read until memory is gone.
+pub fn bytes(path: &Path) -> Result<Vec<u8>> {
+    let failed = |error| Error::io("read", path)(error);
+    let info = std::fs::metadata(path).map_err(failed)?;
+    if !info.is_file() || info.len() > MOST_BYTES {
+        let what = if info.is_file() { "is larger than any weights" } else { "is no file on a disk" };
+        return Err(Error::invalid(path, format!("{what}; take a file that `demc train` wrote")));
+    }
+    std::fs::read(path).map_err(failed)
+}
+
 /// Reads a weights file.
 ///
 /// # Errors
 /// The file cannot be read or is not one of demc's.
 pub fn read(path: &Path) -> Result<(String, Vec<Tensor>)> {
-    parse(&std::fs::read(path).map_err(Error::io("read", path))?, path)
+    parse(&bytes(path)?, path)
 }
 
 /// Parses the bytes of a weights file; `path` is for messages.

@@ -325,7 +325,7 @@ fn watch(args: &Args, search: Search, idle: Option<u32>) -> Result<Watch> {
                 return look;
             }
         };
-        look.failures = found.unusable;
+        (look.failures, look.empty) = (found.unusable, found.empty);
         let files: Vec<denoise::Input> = found.files.into_iter().filter(&is_wanted).collect();
         let mut plan = Plan::new(&out, &files);
         for input in files {
