@@ -10,6 +10,7 @@ names what was made otherwise. The scene is never saved, and an open scene is le
 """
 
 import argparse
+import hashlib
 import json
 import os
 import sys
@@ -29,6 +30,7 @@ from demc_blender.edits import Edits
 from demc_blender.position import store_position, write_position
 
 _STAMP = "demcExport"  # header attribute: what a file was made with
+_STATE = "blend"  # of that, which state of the .blend: a change of it may be none of the picture
 
 
 def parse(arguments):
@@ -51,7 +53,7 @@ def parse(arguments):
                         help="samples per pixel of the noisy frames (default 4)")
     parser.add_argument("--ref-spp", type=int, default=1024, metavar="N",
                         help="samples of the reference, 0 for none (default 1024)")
-    parser.add_argument("--ref-noise", type=float, default=0.0, metavar="T",
+    parser.add_argument("--ref-noise", type=cl.share, default=0.0, metavar="T",
                         help="adaptive sampling of the reference down to this noise threshold, "
                         "for example 0.004; much faster, slightly biased (default: off)")
     parser.add_argument("--seed", type=int, default=1, help="seed of all renders (default 1)")
@@ -80,6 +82,8 @@ def parse(arguments):
     parser.add_argument("--float", action="store_true", dest="full_float",
                         help="store every pass as 32-bit float (default: half, data passes float)")
     parser.add_argument("--name", type=cl.file_stem, help="scene name in the files (default: the .blend's)")
+    parser.add_argument("--scripts", action="store_true",
+                        help="let the scripts and scripted drivers of SCENE.blend run (default: as Blender does)")
     parser.add_argument("--threads", type=cl.positive, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--overwrite", action="store_true", help="render finished files again")
     options = parser.parse_args(arguments)
@@ -116,7 +120,7 @@ def jobs_of_frame(options, scene_name, frame, numbered):
                   "reference", True)
 
 
-def common_settings(options, scene, layers, views, vector):
+def common_settings(options, scene, layers, views, vector, state):
     """What every file of a run is made with, by the names that a user knows it by."""
     render = scene.render
     border = [round(getattr(render, f"border_{side}"), 6) for side in ("min_x", "max_x", "min_y", "max_y")]
@@ -131,6 +135,7 @@ def common_settings(options, scene, layers, views, vector):
         "vector": vector,
         "float": options.full_float,
         "seed": options.seed,
+        _STATE: state,
     }
 
 
@@ -142,6 +147,14 @@ def settings_of(options, common, job):
     return common | own
 
 
+def state_of(blend):
+    """What tells a saved scene from another, or from itself after a change; none for a scene without a file."""
+    if not os.path.isfile(blend):
+        return None
+    with open(blend, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def difference(path, settings):
     """How a finished file's settings differ from those wanted, in words; empty where they do not, or where
     the file tells none: it was made by an older script."""
@@ -149,7 +162,7 @@ def difference(path, settings):
     if told is None:
         return ""
     made = json.loads(told)
-    changed = [name for name in settings if made.get(name) != settings[name]]
+    changed = [name for name in settings if name != _STATE and made.get(name) != settings[name]]
     return ", ".join(f"{name} {made.get(name)} instead of {settings[name]}" for name in changed)
 
 
@@ -173,6 +186,7 @@ class Export:
     def __init__(self, options, scene, name, layers, common):
         self.options, self.scene, self.name, self.layers = options, scene, name, layers
         self.common = common
+        self.of_other_state = 0
 
     def frame(self, frame, numbered):
         """Renders what is missing of a frame and prints its line. Returns whether all went well."""
@@ -196,6 +210,9 @@ class Export:
                 raise RuntimeError(f"{job.path} was made with {other}; --overwrite renders it again, or choose "
                                    "another --out or --name")
             if not damaged:
+                told = exr.text_attribute(job.path, _STAMP)
+                made = json.loads(told).get(_STATE) if told else None
+                self.of_other_state += None not in (made, settings[_STATE]) and made != settings[_STATE]
                 return "is there"
         start = time.perf_counter()
         if not self.placed:
@@ -208,19 +225,23 @@ class Export:
 def export(options):
     """Renders everything asked for; returns the number of frames that failed."""
     if options.scene:
-        picking.open_scene(options.scene)
+        picking.open_scene(options.scene, options.scripts)
+    picking.warn_of_scripts()
     blend = bpy.data.filepath
     name = options.name or os.path.splitext(os.path.basename(blend))[0] or "untitled"
     scene = picking.chosen_scene(options.scene_name, os.path.basename(blend) or name)
     options.out = os.path.abspath(options.out or os.path.join(os.path.dirname(blend), "demc"))
     cl.make_folder(options.out)
-    if scene.camera is None:
-        raise RuntimeError(f"{name} has no camera in the scene {scene.name}")
+    if not picking.has_camera(scene):
+        raise RuntimeError(f"{name} has no camera in the scene {scene.name}: add one and make it the scene's, or choose "
+                           "another with --scene")
     picking.warn_of_missing_files()
     numbered = options.frames != []
     frames = picking.chosen_frames(scene, options.frames) if numbered else [scene.frame_current]
-    start, part = scene.frame_current, scene.frame_subframe
+    start, part, camera = scene.frame_current, scene.frame_subframe, scene.camera
     with Edits() as edits:
+        # Markers on the timeline switch cameras.
+        edits.on_undo(lambda: setattr(scene, "camera", camera))
         edits.on_undo(lambda: scene.frame_set(start, subframe=part))
         rendering.prepare_scene(edits, scene, as_framed=True)
         rendering.set_output(edits, scene, options.full_float)
@@ -243,9 +264,13 @@ def export(options):
         if refused:
             print(f"warning: no averaged position for {len(refused)} materials that cannot be "
                   f"edited (linked from a library?): {', '.join(refused[:4])}")
-        common = common_settings(options, scene, layers, views, vector)
+        common = common_settings(options, scene, layers, views, vector, state_of(blend))
         run = Export(options, scene, name, layers, common)
-        return sum(not run.frame(frame, numbered) for frame in frames)
+        failed = sum(not run.frame(frame, numbered) for frame in frames)
+        if run.of_other_state:
+            print(f"warning: {run.of_other_state} files that are there were made of another state of {os.path.basename(blend)}; "
+                  "if the picture has changed, --overwrite renders them again")
+        return failed
 
 
 def choose_vector(edits, options, scene, layers, numbered):

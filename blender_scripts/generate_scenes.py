@@ -68,7 +68,7 @@ def parse(arguments):
     parser.add_argument("--assets", action="append", default=[], metavar="DIR",
                         help="models, textures, HDRIs and pictures to furnish with; may be repeated")
     parser.add_argument("--blend", metavar="DIR", help="also render random views of the .blend scenes below DIR")
-    parser.add_argument("--blend-share", type=float, default=0.3, metavar="F",
+    parser.add_argument("--blend-share", type=cl.share, default=0.3, metavar="F",
                         help="share of seeds that go to --blend scenes (default 0.3)")
     parser.add_argument("--kinds", metavar="a,b", help="kinds of scenes (default: all)")
     parser.add_argument("--size", type=cl.side_or_size, default=(128, 128), metavar="N[xM]",
@@ -83,7 +83,7 @@ def parse(arguments):
     )
     parser.add_argument(
         "--adaptive-share",
-        type=float,
+        type=cl.share,
         default=0.0,
         metavar="F",
         help=f"a share of the crops is also rendered at Blender's defaults: {rendering.DEFAULT_SAMPLES} "
@@ -91,7 +91,7 @@ def parse(arguments):
     )
     parser.add_argument("--also-spp", type=cl.counts, default=[], metavar="N[,N]",
                         help="a share of the crops is also rendered with one of these sample counts")
-    parser.add_argument("--also-share", type=float, default=0.25, metavar="F", help="that share (default 0.25)")
+    parser.add_argument("--also-share", type=cl.share, default=0.25, metavar="F", help="that share (default 0.25)")
     parser.add_argument("--noisy-seeds", type=cl.positive, default=1, metavar="N",
                         help="noisy renders of each crop and sample count (default 1)")
     parser.add_argument(
@@ -102,7 +102,7 @@ def parse(arguments):
     )
     parser.add_argument(
         "--filter-share",
-        type=float,
+        type=cl.share,
         default=0.0,
         metavar="F",
         help="share of crops with a pixel filter that is not Blender's default, half of them a box",
@@ -126,14 +126,14 @@ def parse(arguments):
         help="every frame of a sequence has a reference and stands in the manifest, so that flicker can be measured",
     )
     parser.add_argument("--ref-spp", type=cl.positive, default=128, metavar="N", help="samples of the references (default 128)")
-    parser.add_argument("--ref-noise", type=float, default=0.01, metavar="T",
+    parser.add_argument("--ref-noise", type=cl.share, default=0.01, metavar="T",
                         help="references stop early below this noise threshold, 0 for never (default 0.01)")
     parser.add_argument("--denoise-references", action="store_true",
                         help="clean the references' last noise with Blender's own denoiser, guides denoised first: "
                              "64 to 128 samples then serve as well as many more")
     parser.add_argument(
         "--clean-share",
-        type=float,
+        type=cl.share,
         default=0.0,
         metavar="F",
         help=f"share of scenes whose references have at least {_LEAST_CLEAN} samples everywhere and are not "
@@ -149,7 +149,7 @@ def parse(arguments):
     )
     parser.add_argument(
         "--clean-noise",
-        type=float,
+        type=cl.share,
         default=0.005,
         metavar="T",
         help="and their noise threshold (default 0.005)",

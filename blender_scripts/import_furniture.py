@@ -39,7 +39,7 @@ def parse(arguments):
     """The command line."""
     parser = argparse.ArgumentParser(prog="import_furniture.py", description="Make an assets folder of Sweet Home 3D furniture.")
     parser.add_argument("--out", required=True, metavar="DIR", help="assets folder to fill")
-    parser.add_argument("libraries", nargs="+", metavar="LIBRARY", help=".sh3f files")
+    parser.add_argument("libraries", type=cl.file, nargs="+", metavar="LIBRARY", help=".sh3f files")
     return parser.parse_args(arguments)
 
 

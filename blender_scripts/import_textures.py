@@ -36,7 +36,7 @@ def parse(arguments):
     """The command line."""
     parser = argparse.ArgumentParser(prog="import_textures.py", description="Make an assets folder of images, by their names.")
     parser.add_argument("--out", required=True, metavar="DIR", help="assets folder to fill")
-    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="folders with images, searched below")
+    parser.add_argument("folders", type=cl.folder, nargs="+", metavar="FOLDER", help="folders with images, searched below")
     return parser.parse_args(arguments)
 
 

@@ -41,7 +41,7 @@ def parse(arguments):
     parser = argparse.ArgumentParser(prog="import_tracks.py", description="Make .blend scenes of SuperTuxKart's tracks.")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the scenes")
     parser.add_argument("--hdri", metavar="DIR", help="assets folder whose hdri/ lights the tracks (default: the track's own ambient light)")
-    parser.add_argument("data", metavar="DATA", help="the game's data folder")
+    parser.add_argument("data", type=cl.folder, metavar="DATA", help="the game's data folder")
     return parser.parse_args(arguments)
 
 

@@ -106,6 +106,9 @@ def main():
     lacking += [guide for guide in _GUIDES if not any(guide in name for name in noisy)]
     if lacking:
         parser.error(f"{options.noisy} has no {lacking[0][1:]}: render it with the passes of development_set.py")
+    sizes = {plane.shape for frame in (noisy, reference) for plane in frame.values()}
+    if len(sizes) > 1:
+        parser.error(f"{options.noisy} and {options.reference} are not of one size")
     os.makedirs(options.out, exist_ok=True)
     for case in CASES:
         changed, expected = case(noisy, reference)

@@ -49,7 +49,7 @@ impl Shot {
     }
 
     fn out(&self) -> PathBuf {
-        // Blender 5 takes words in braces for variables.
+        // From 4.5 on, Blender takes words in braces for variables.
         self.folder.path().join("out of {version}")
     }
 
@@ -305,4 +305,71 @@ fn mistyped_places_are_told_in_a_line() {
         let said = shot.refuse("", 1);
         assert!(said.contains("out of {version} is a file, not a folder (--out)"), "{said}");
     }
+}
+
+#[test]
+fn what_the_export_sets_is_not_animated() {
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "animated");
+        shot.export("--spp 2 --ref-spp 64 --half-buffers --float");
+        let combined = |name: &str| shot.passes(name).get(Pass::Combined).unwrap().clone();
+        let [a, b] = ["a", "b"].map(|half| combined(&format!("shot_0002spp_{half}.exr")));
+        assert!(a != b, "halves have noise of their own");
+        let reference = shot.passes("shot_ref.exr");
+        assert_eq!(reference.samples, Some(64));
+        // Nor did the time limit end it.
+        let rough = |planes: &demc::planes::Planes| {
+            let row = &planes.channel(0)[18 * 64 + 20..18 * 64 + 44];
+            row.windows(2).map(|pair| (pair[0] - pair[1]).abs()).sum::<f32>()
+        };
+        assert!(rough(reference.get(Pass::Combined).unwrap()) <= rough(&a));
+    }
+}
+
+#[test]
+fn noisy_and_reference_show_the_same_picture() {
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "catcher");
+        shot.export("--spp 64 --ref-spp 64");
+        let alpha = |name: &str| {
+            let alpha = shot.passes(name).get(Pass::Alpha).unwrap().clone();
+            alpha.data.iter().sum::<f32>() / alpha.data.len() as f32
+        };
+        let (noisy, reference) = (alpha("shot_0064spp.exr"), alpha("shot_ref.exr"));
+        assert!(
+            (noisy - reference).abs() < 0.02 * noisy,
+            "{noisy} {reference}: shadows are in the alpha of both or none"
+        );
+    }
+}
+
+#[test]
+fn cameras_of_markers_count_and_scripts_that_do_not_run_are_told() {
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "marked");
+        shot.export("--frames 1 --ref-spp 0");
+        assert_eq!(shot.files(), ["shot_0001spp.0001.exr"]);
+        let shot = Shot::new(&python, "driven");
+        let said = shot.export("--ref-spp 0");
+        assert!(
+            said.contains("warning: scripts of the file do not run") && said.contains("--scripts"),
+            "{said}"
+        );
+        assert!(!shot.export("--ref-spp 0 --scripts --overwrite").contains("do not run"));
+    }
+}
+
+#[test]
+fn files_of_another_state_of_the_scene_are_told() {
+    let shot = Shot::new(&python::python(), "");
+    shot.export("");
+    let mut bytes = fs::read(shot.blend()).unwrap();
+    bytes.push(0);
+    fs::write(shot.blend(), bytes).unwrap();
+    let said = shot.export("");
+    assert!(said.contains("2 files that are there were made of another state of shot.blend"), "{said}");
+    assert!(!shot.export("--overwrite").contains("another state"));
+    assert!(!shot.export("").contains("another state"));
+    let said = shot.refuse("--ref-noise nan", 2);
+    assert!(said.contains("nan is not a number from 0 to 1"), "{said}");
 }

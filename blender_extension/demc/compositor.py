@@ -7,8 +7,8 @@ import bpy
 _MARK = "demc"
 
 
-def wire(scene, picture):
-    """Adds an image node with the result, a Split node and a viewer. Nodes of the user's stay as they are;
+def wire(scene, picture, layer=""):
+    """Adds an image node with the result of a view layer, or of the first that is rendered, a Split node and a viewer. Nodes of the user's stay as they are;
     those that an earlier result brought make room for the new ones. Returns the tree, or None where the user
     has nodes that are turned off."""
     tree = _tree(scene)
@@ -16,12 +16,16 @@ def wire(scene, picture):
         return None
     for node in [node for node in tree.nodes if node.get(_MARK)]:
         tree.nodes.remove(node)
-    noisy = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
+    layer = layer or next((layer.name for layer in scene.view_layers if layer.use), "")
+    renders = [node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"]
+    noisy = next((node for node in renders if node.scene == scene and node.layer == layer), None)
     left = min((node.location.x for node in tree.nodes), default=0.0)
     bottom = min((node.location.y - 400 for node in tree.nodes), default=0.0)
     if noisy is None:
         noisy = _add(tree, "CompositorNodeRLayers", "Noisy", (left, bottom - 320))
         noisy.scene = scene
+        if layer:
+            noisy.layer = layer
     result = _add(tree, "CompositorNodeImage", "Denoised by demc", (left, bottom))
     result.image = picture
     split = _add(tree, "CompositorNodeSplit", "Noisy | denoised", (left + 320, bottom))

@@ -23,16 +23,25 @@ _before = {}
 def _on_init(scene, _depsgraph=None):
     _written.clear()
     _before.clear()
-    _before.update((path, _written_at(path)) for path in plans.frame_files(scene, scene.frame_current))
+    if scene.demc.after_render:
+        _before.update((path, _written_at(path)) for path in _files(scene))
 
 
 @persistent
 def _on_write(scene, _depsgraph=None):
     if not scene.demc.after_render:
         return
-    for path in plans.frame_files(scene, scene.frame_current):
+    for path in _files(scene):
         if scene.render.is_movie_format or _written_at(path) not in (None, _before.get(path)):
             _written.append(path)
+
+
+def _files(scene):
+    """The files of the current frame; none where its path cannot be read, which Blender itself tells."""
+    try:
+        return plans.frame_files(scene, scene.frame_current)
+    except jobs.JobError:
+        return []
 
 
 def _written_at(path):

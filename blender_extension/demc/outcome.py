@@ -24,8 +24,11 @@ def take(job):
         image.reload()
     # Radiance, as the render: without this, Blender would show it as if it were data.
     image.colorspace_settings.is_data = False
+    # Its colours are those that Blender computes in; Blender 5 lets a file choose them.
+    if hasattr(bpy.data, "colorspace"):
+        image.colorspace_settings.name = bpy.data.colorspace.working_space
     if scene is not None and scene.demc.use_compositor:
-        if compositor.wire(scene, image) is None:
+        if compositor.wire(scene, image, scene.demc.view_layer) is None:
             job.notes.append("the compositor's Use Nodes is off: the result is not wired into it")
     _show(image)
     return image

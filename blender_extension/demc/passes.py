@@ -79,6 +79,15 @@ def _prepare_output(scene, put):
             put(settings, "file_format", "OPEN_EXR_MULTILAYER", words)
     if settings.exr_codec not in _LOSSLESS:
         put(settings, "exr_codec", "ZIP", "files are compressed without loss (ZIP)")
+    if _wants_interleave(scene):
+        put(settings, "use_exr_interleave", True, "passes are interleaved in one part, as pixels are not square")
+
+
+def _wants_interleave(scene):
+    """Blender 5 writes no frames of pixels that are not square but with all passes in one part."""
+    render = scene.render
+    is_square = render.pixel_aspect_x == render.pixel_aspect_y
+    return not is_square and getattr(render.image_settings, "use_exr_interleave", None) is False
 
 
 def _of_scene(scene):
@@ -132,4 +141,6 @@ def _of_output(scene):
                      True)]
     if settings.exr_codec not in _LOSSLESS:
         return [Lack(f"{settings.exr_codec} compression loses detail of the passes: set Output > Codec to ZIP", True)]
+    if _wants_interleave(scene):
+        return [Lack("Blender writes no frames whose pixels are not square: turn on Output > Interleave", True)]
     return []

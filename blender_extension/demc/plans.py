@@ -67,7 +67,11 @@ def of_range(scene):
         raise JobError(f"None of the frames {first} to {last} is there, such as {wanted[0]}: render the animation first")
     if not found[0].lower().endswith(_SUFFIX):
         raise JobError(f"{os.path.basename(found[0])} keeps no passes: press Prepare Passes and render again")
-    return of_files(scene, found)
+    job = of_files(scene, found)
+    lost = [path for path in wanted if path not in found]
+    if lost:
+        job.notes.append(f"{len(lost)} of the frames {first} to {last} are not there, such as {os.path.basename(lost[0])}")
+    return job
 
 
 def of_files(scene, paths, overwrite=False):
@@ -82,7 +86,10 @@ def frame_files(scene, frame):
     eyes = [""]
     if render.use_multiview and render.image_settings.views_format == "INDIVIDUAL":
         eyes = [view.name for view in render.views if view.use]
-    return [bpy.path.abspath(render.frame_path(frame=frame, view=eye)) for eye in eyes]
+    try:
+        return [bpy.path.abspath(render.frame_path(frame=frame, view=eye)) for eye in eyes]
+    except RuntimeError as error:  # from 4.5 on, Blender looks for variables in braces
+        raise JobError(f"The Output path {render.filepath} cannot be read: {' '.join(str(error).split())}") from None
 
 
 def _refuse(scene, lacks, what):
@@ -141,6 +148,9 @@ def _save(render, scene, path):
     settings = scene.render.image_settings
     # All of it before anything is set, since one setting changes others.
     kept = {name: getattr(settings, name) for name, _ in _SAVED_AS if hasattr(settings, name)}
+    # Choosing a format resets the colour space of files, even if it is the same one.
+    linear = getattr(settings, "linear_colorspace_settings", None)
+    space = linear.name if linear is not None else ""
     try:
         for name, value in _SAVED_AS:
             if name in kept:
@@ -154,6 +164,8 @@ def _save(render, scene, path):
     finally:
         for name, value in kept.items():
             setattr(settings, name, value)
+        if space:
+            linear.name = space
 
 
 def _save_as_set(render, scene, path):

@@ -126,11 +126,56 @@ class Extension(unittest.TestCase):
             self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"}, kind)
             self.assertEqual(self.image_settings(), before)
 
-    def test_pixels_that_are_not_square(self):
+    def test_this_render_leaves_the_colour_space_of_files_as_it_is(self):
         self.prepared()
-        self.scene.render.pixel_aspect_x = 2.0
+        settings = self.scene.render.image_settings
+        settings.color_management = "OVERRIDE"
+        settings.linear_colorspace_settings.name = "ACEScg"
         bpy.ops.render.render()
         self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.assertEqual(settings.linear_colorspace_settings.name, "ACEScg")
+
+    def test_colours_are_those_that_blender_computes_in(self):
+        if not hasattr(bpy.data, "colorspace"):
+            self.skipTest("before Blender 5 there is one working space")
+        self.prepared()
+        bpy.ops.wm.set_working_color_space(working_space="ACEScg")
+        bpy.ops.render.render()
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.assertEqual(bpy.data.images[f"Denoised {self.scene.name}"].colorspace_settings.name, "ACEScg")
+
+    def test_pixels_that_are_not_square(self):
+        self.scene.render.pixel_aspect_x = 2.0
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+
+    def test_the_wipe_shows_this_scene(self):
+        self.prepared()
+        bpy.ops.render.render()
+        tree = sys.modules[f"{MODULE}.compositor"]._tree(self.scene)
+        elsewhere = bpy.data.scenes.new("elsewhere")
+        for node in tree.nodes:
+            if node.bl_idname == "CompositorNodeRLayers":
+                node.scene = elsewhere
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        split = next(node for node in tree.nodes if node.bl_idname == "CompositorNodeSplit")
+        shown = [link.from_node for socket in split.inputs for link in socket.links]
+        renders = [node.scene for node in shown if node.bl_idname == "CompositorNodeRLayers"]
+        self.assertEqual(renders, [self.scene])
+
+    def test_frames_that_are_not_there_and_paths_that_mean_nothing_are_told(self):
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.scene.frame_end = 5
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        told = sys.modules[f"{MODULE}.jobs"].current().notes
+        self.assertTrue(any("3 of the frames 1 to 5 are not there, such as shot_0003.exr" in note for note in told), told)
+        if bpy.app.version >= (4, 5):  # variables in braces
+            self.scene.render.filepath = os.path.join(self.folder, "{nope}", "shot_")
+            self.refused(bpy.ops.demc.denoise_range, "Output path .* cannot be read")
+            bpy.ops.render.render()
 
     def test_both_eyes(self):
         self.prepared()

@@ -4,6 +4,7 @@ import argparse
 import atexit
 import ctypes
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -103,6 +104,20 @@ def end_at_once(tidy):
     atexit.register(stop_waiting)
 
 
+def folder(text):
+    """Parses the path of a folder that is there."""
+    if not os.path.isdir(text):
+        raise argparse.ArgumentTypeError(f"{text} is no folder")
+    return text
+
+
+def file(text):
+    """Parses the path of a file that is there."""
+    if not os.path.isfile(text):
+        raise argparse.ArgumentTypeError(f"{text} is no file")
+    return text
+
+
 def make_folder(path):
     """Makes the folder of --out, or ends the script with a line that says why not."""
     try:
@@ -123,6 +138,10 @@ def reason(error):
 def finish(failed):
     """Ends a script with exit code 1 where something failed. An open Blender window stays open."""
     sys.stdout.flush()
+    if not inside_blender() and bpy.app.version < (5, 0):
+        # bpy 4.5 waits for ever to free the scripted drivers of a file.
+        shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
+        os._exit(1 if failed else 0)
     if failed and bpy.app.background:
         sys.exit(1)
 
@@ -138,6 +157,17 @@ def positive(text):
     value = _integer(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a number of at least 1")
+    return value
+
+
+def share(text):
+    """Parses a number from 0 to 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 to 1")
     return value
 
 

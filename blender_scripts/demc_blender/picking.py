@@ -9,11 +9,26 @@ import os
 import bpy
 
 
-def open_scene(path):
-    """Opens a .blend without its interface; raises RuntimeError in one line where it cannot."""
+def open_scene(path, scripts=False):
+    """Opens a .blend without its interface, and lets its scripts run where that is said; raises RuntimeError in one
+    line where it cannot."""
     if not os.path.isfile(path):
         raise RuntimeError(f"{path}: no such file")
-    bpy.ops.wm.open_mainfile(filepath=os.path.abspath(path), load_ui=False)
+    # Left out, it is as Blender was started: `blender --enable-autoexec` lets them run.
+    allowed = {"use_scripts": True} if scripts else {}
+    bpy.ops.wm.open_mainfile(filepath=os.path.abspath(path), load_ui=False, **allowed)
+
+
+def warn_of_scripts():
+    """Says that scripts and drivers of the open file were not run, so that what they move stays where it is."""
+    if bpy.app.autoexec_fail and not bpy.app.autoexec_fail_quiet:
+        print(f"warning: scripts of the file do not run ({bpy.app.autoexec_fail_message}), so what they drive stays as it "
+              "was saved; --scripts lets them, if you trust the file")
+
+
+def has_camera(scene):
+    """Whether there is one to render with, of the scene or of a marker on its timeline."""
+    return scene.camera is not None or any(marker.camera for marker in scene.timeline_markers)
 
 
 def chosen_layers(edits, scene, name):

@@ -23,7 +23,8 @@ _SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD"}
 def store_position(edits, view_layers):
     """Adds the AOV to the passes of the view layers; the materials must write it."""
     for layer in view_layers:
-        if POSITION_AOV not in layer.aovs:
+        # With Open Shading Language, Cycles leaves AOVs empty.
+        if POSITION_AOV not in layer.aovs and not layer.id_data.cycles.shading_system:
             aov = layer.aovs.add()
             aov.name, aov.type = POSITION_AOV, "COLOR"
             edits.on_undo(lambda layer=layer: layer.aovs.remove(layer.aovs[POSITION_AOV]))
@@ -60,9 +61,25 @@ def _cover_bare_objects(edits):
             if not obj.material_slots:
                 materials = obj.data.materials
                 materials.append(default)
+                _keep_indices(edits, obj.data)
                 edits.on_undo(lambda materials=materials: materials.clear())
         except (RuntimeError, AttributeError):  # data of a linked library cannot be edited
             continue
+
+
+def _keep_indices(edits, data):
+    """Puts back which slot each face is of: clearing the slots of a mesh drops that."""
+    attribute = getattr(data, "attributes", {}).get("material_index")
+    if attribute is None:
+        return
+    indices = [0] * len(attribute.data)
+    attribute.data.foreach_get("value", indices)
+
+    def put_back():
+        again = data.attributes.get("material_index") or data.attributes.new("material_index", "INT", "FACE")
+        again.data.foreach_set("value", indices)
+
+    edits.on_undo(put_back)
 
 
 def _default_material(edits):

@@ -69,11 +69,12 @@ def leave_out_vectors(edits, layers):
 
 
 def combined_only(edits, layers):
-    """Turns every pass off but Combined (the user's own AOVs stay)."""
+    """Turns every pass off but Combined (the user's own AOVs stay). The shadow catcher's stays as it is: it decides
+    whether Combined's alpha holds the shadows that were caught."""
     for layer in layers:
         for owner in (layer, layer.cycles):
             for prop in owner.bl_rna.properties:
-                if prop.identifier.startswith("use_pass_"):
+                if prop.identifier.startswith("use_pass_") and prop.identifier != "use_pass_shadow_catcher":
                     edits.set(owner, prop.identifier, prop.identifier == "use_pass_combined")
         edits.set(layer.cycles, "denoising_store_passes", False)
 
@@ -104,17 +105,22 @@ def denoise(edits, scene, layers):
 def set_output(edits, scene, full_float=False):
     """Multilayer EXR, ZIP. Half keeps files small: Cycles' data passes stay 32-bit float in it."""
     settings = scene.render.image_settings
-    # Registered first and so undone last: the media type resets the file format, and a depth is valid only
-    # for its own.
-    file_format, depth = settings.file_format, settings.color_depth
-    edits.on_undo(lambda: setattr(settings, "color_depth", depth))
-    edits.on_undo(lambda: setattr(settings, "file_format", file_format))
+    # Registered first and so undone last, the file format before the rest: the media type resets it, it resets the
+    # colour space, and a depth is valid only for its own.
+    linear = getattr(settings, "linear_colorspace_settings", None)
+    if linear is not None and linear.name:
+        space = linear.name
+        edits.on_undo(lambda: setattr(linear, "name", space))
+    for name in ("views_format", "color_depth", "file_format"):
+        edits.on_undo(lambda name=name, value=getattr(settings, name): setattr(settings, name, value))
     if hasattr(settings, "media_type"):  # Blender 5 wants it before the file format
         edits.set(settings, "media_type", "MULTI_LAYER_IMAGE")
     edits.set(settings, "file_format", "OPEN_EXR_MULTILAYER")
     edits.set(settings, "color_depth", "32" if full_float else "16")
     edits.set(settings, "exr_codec", "ZIP")
     edits.set(settings, "use_preview", False)
+    # In a colour space of the file's own, Blender would take positions for colours and convert them.
+    edits.set(settings, "color_management", "FOLLOW_SCENE")
     edits.set(settings, "views_format", "MULTIVIEW")  # both eyes in one file, where there are two
     render = scene.render
     if render.pixel_aspect_x != render.pixel_aspect_y:
@@ -174,8 +180,8 @@ def render_to(scene, path, layer=None, attributes=None):
     os.close(handle)
     os.remove(temporary)
     old = scene.render.filepath
-    # Blender 5 looks for variables in braces, {blend_name} for one.
-    has_variables = bpy.app.version >= (5, 0)
+    # From 4.5 on, Blender looks for variables in braces, {blend_name} for one.
+    has_variables = bpy.app.version >= (4, 5)
     scene.render.filepath = temporary.replace("{", "{{").replace("}", "}}") if has_variables else temporary
     command_line.forget_chatter()
     try:

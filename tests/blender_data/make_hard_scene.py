@@ -1,7 +1,8 @@
 """Writes a .blend with what an export must not pass over in silence, to the path given.
 
 Two scenes, `Main` (active) and `Other`, 64x36 pixels each: a cube that moves, seen by a camera. What is
-hard about them comes by name, as further arguments: stereo, border, step, aspect, blur, texture, library.
+hard about them comes by name, as further arguments: stereo, border, step, aspect, blur, texture, library, animated
+(what an export sets), catcher (of shadows), marked (cameras by markers alone), driven (by a script).
 """
 
 import os
@@ -58,4 +59,25 @@ if "library" in wanted:
         here.meshes = ["prop"]
     main.collection.objects.link(bpy.data.objects.new("prop", here.meshes[0]))
     os.remove(library)
+if "animated" in wanted:
+    main.cycles.driver_add("seed").driver.expression = "frame"
+    for frame, samples in ((1, 1), (9, 7)):
+        main.cycles.samples = samples
+        main.cycles.keyframe_insert("samples", frame=frame)
+    main.cycles.time_limit = 1e-3
+    main.cycles.keyframe_insert("time_limit", frame=1)
+if "catcher" in wanted:
+    card.is_shadow_catcher = main.render.film_transparent = True
+    main.view_layers[0].cycles.use_pass_shadow_catcher = True
+    small = bpy.data.objects.new("small", cube)
+    small.location.z, small.scale = 1.0, (0.3, 0.3, 0.3)
+    main.collection.objects.link(small)
+    lamp.rotation_euler.x = 0.5
+if "marked" in wanted:
+    marker = main.timeline_markers.new("shot", frame=1)
+    marker.camera, main.camera = camera, None
+if "driven" in wanted:
+    card.driver_add("scale", 0).driver.expression = "len(bpy.data.objects)"
 bpy.ops.wm.save_as_mainfile(filepath=path)
+# bpy 4.5 waits for ever at its end to free a driver of Python's.
+os._exit(0)
