@@ -197,8 +197,12 @@ fn denoise_arrays<'py>(
     Ok(PyArray1::from_iter(py, values))
 }
 
-/// Denoises a file: (view layer, width, height, seconds, repaired values by pass, notes).
+/// View layer, width, height, seconds, repaired values by pass, notes.
+type Told = (String, usize, usize, f64, HashMap<String, usize>, Vec<String>);
+
+/// Denoises a file.
 #[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python's function, which names each of them")]
 fn denoise_path(
     py: Python<'_>,
     source: PathBuf,
@@ -208,7 +212,7 @@ fn denoise_path(
     guides: (Option<PathBuf>, Option<PathBuf>),
     names: Vec<String>,
     threads: Option<usize>,
-) -> PyResult<(String, usize, usize, f64, HashMap<String, usize>, Vec<String>)> {
+) -> PyResult<Told> {
     let report = detached(py, threads, move |stopped| {
         let mut mapping = Mapping::default();
         for line in names {
