@@ -303,6 +303,19 @@ fn the_open_job_description_runs_in_chunks_and_reports() {
         "{said}"
     );
     assert_eq!(results(&folder.path().join("it's")).keys().filter(|name| name.ends_with(".exr")).count(), 8);
+
+    // Where a task could not even begin, it fails itself.
+    let mut command = Command::new(runner.program("openjd"));
+    command.arg("run").arg(farm("denoise.openjd.yaml")).current_dir(folder.path());
+    let demc = cargo_bin("demc").display().to_string();
+    for value in
+        ["Input=renders", "Output=lost", "Frames=1", "Model=lost.safetensors", &format!("Demc={demc}")]
+    {
+        command.args(["-p", value]);
+    }
+    let lost = command.output().unwrap();
+    let said = String::from_utf8_lossy(&lost.stdout);
+    assert!(!lost.status.success() && !said.contains("denoised in"), "{said}");
 }
 
 #[test]

@@ -218,6 +218,10 @@ fn what_frames_leaves_out_is_told_where_it_is_no_file() {
         .stderr(missing.clone())
         .stdout(contains("1 denoised"));
     denoise(folder.path(), "sc010 --out out --frames 1").code(1).stderr(missing.clone());
+    // Two of one name would have one place, if they were frames.
+    let two = denoise(folder.path(), "a/frames b/frames in --out out2 --frames 1").code(1);
+    two.stderr(contains("a/frames: cannot read").and(contains("b/frames: cannot read")))
+        .stdout(contains("1 denoised"));
     denoise(folder.path(), "sc010 --out out --frames 1 --watch 1").code(1).stderr(missing);
     denoise(folder.path(), "none/*.exr --out out --watch 1")
         .code(1)

@@ -222,6 +222,32 @@ fn a_result_is_the_same_bits_in_any_order_alone_and_resumed() {
 }
 
 #[test]
+fn a_frame_that_was_made_without_another_is_made_again_when_that_is_there() {
+    let dir = sequence(SHOT, 1..=8);
+    let [whole, mended] = ["whole", "mended"].map(|name| dir.path().join(name));
+    demc(&whole).arg(dir.path()).arg("--temporal").assert().success();
+    let render = fs::read(named(&dir, 4)).unwrap();
+    // Half written at first, and a frame at the end that nobody has rendered yet.
+    fs::write(named(&dir, 4), &render[..render.len() / 2]).unwrap();
+    let last = fs::read(named(&dir, 8)).unwrap();
+    fs::remove_file(named(&dir, 8)).unwrap();
+    demc(&mended).arg(dir.path()).arg("--temporal").assert().code(1);
+    (2..=6)
+        .filter(|n| *n != 4)
+        .for_each(|n| assert!(denoised(&whole, n) != denoised(&mended, n), "frame {n}"));
+    let again = || demc(&mended).arg(dir.path()).arg("--temporal").assert();
+    again().code(1).stdout(contains("0 denoised, 6 already there"));
+    fs::write(named(&dir, 4), &render).unwrap();
+    fs::write(named(&dir, 8), &last).unwrap();
+    // All but the first, whose window holds neither.
+    again().success().stdout(contains("7 denoised, 1 already there"));
+    (1..=8).for_each(|n| {
+        assert!(fs::read(result(&whole, n)).unwrap() == fs::read(result(&mended, n)).unwrap(), "{n}")
+    });
+    again().success().stdout(contains("0 denoised, 8 already there"));
+}
+
+#[test]
 fn a_result_depends_on_its_window_alone() {
     let dir = sequence(SHOT, 1..=7);
     let [first, second] = ["first", "second"].map(|name| dir.path().join(name));

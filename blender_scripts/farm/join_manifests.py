@@ -22,11 +22,12 @@ _TABLES = {
 
 
 def rows_of(path):
-    """The header and rows of a table; what a kill cut off is left out, as is all of it where the header's line has
-    no end."""
+    """The header and rows of a table; the line that a kill cut off is left out, even where it is the header."""
     with open(path, encoding="utf-8", newline="") as file:
         lines = file.read().splitlines(keepends=True)
-    if not lines or not lines[0].endswith("\n"):
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
+    if not lines:
         return None, []
     header, *rows = csv.reader(lines)
     return header, [dict(zip(header, row)) for row in rows if len(row) == len(header)]

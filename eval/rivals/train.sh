@@ -39,7 +39,7 @@ for name in "$@"; do
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
         if [ -n "$time" ]; then used=$((spent + time)); fi
         echo "$used" >"$out/$name.seconds"
-        if [ "$used" -ge "$seconds" ]; then kill -INT $pid 2>/dev/null || true; break; fi
+        if [ "$used" -ge "$seconds" ]; then kill -TERM $pid 2>/dev/null || true; break; fi
     done
     status=0
     wait $pid 2>/dev/null || status=$?

@@ -117,6 +117,15 @@ class Package(unittest.TestCase):
         with self.assertRaisesRegex(ValueError, "from 1 to 4096"):
             demc.denoise_file(ROOM, out, overwrite=True, threads=4097)
 
+    def test_ctrl_c_ends_the_command_as_it_ends_the_program(self):
+        arguments = ["denoise", str(self.folder), "--out", str(self.folder / "out"), "--watch"]
+        code = "import sys; from demc._command import main; sys.argv = ['demc', *sys.argv[1:]]; main()"
+        with subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True) as process:
+            time.sleep(2)
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=20)[1]
+        self.assertEqual((process.returncode, "Traceback" in said), (130, False), said)
+
     def test_inspect_and_compare_say_what_the_command_says(self):
         self.assertEqual(demc.inspect(ROOM), json.loads(command("inspect", "--json", ROOM).stdout))
         said = json.loads(command("compare", "--json", ROOM, REFERENCE).stdout)

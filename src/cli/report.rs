@@ -143,9 +143,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(if is_silent || failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
-/// What tells frames apart, since tasks may reach a folder by different paths.
+/// What tells frames apart, since tasks may reach a folder by different paths. Frames themselves may be links to one
+/// render.
 fn place(path: &Path) -> PathBuf {
-    fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let found = fs::canonicalize(folder).ok().zip(path.file_name());
+    found.map_or_else(|| path.to_owned(), |(folder, name)| folder.join(name))
 }
 
 /// Adds a line. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap.

@@ -20,7 +20,7 @@ use super::{
     sequence::{self, Stretch},
     watch::{Next, Watch},
 };
-use crate::{Error, Result, error::attempt, frame::Frame, models::Denoiser};
+use crate::{Error, Result, error::attempt, frame::Frame, frame_number::frame_number, models::Denoiser};
 
 /// What became of one file.
 pub enum Outcome {
@@ -298,6 +298,15 @@ impl Shared {
         }
     }
 
+    /// Whether a frame that a result was made without is there now.
+    fn can_be_completed(&self, job: &Job, result: &Frame) -> bool {
+        let (Some(reach), lacked) = (self.options.temporal, result.lacked()) else { return false };
+        let Some(number) = frame_number(&job.input).filter(|_| !lacked.is_empty()) else { return false };
+        let near = sequence::neighbours(&job.input, reach).into_iter();
+        let mut found = near.filter(|(offset, _)| lacked.contains(&(number + i64::from(*offset))));
+        found.any(|(_, path)| Frame::read(path).is_ok())
+    }
+
     /// Whether the result of a job exists already; if so, the job's end is reported.
     pub fn take_up_existing(&self, job: &Job, ended: &Sender<Message>) -> bool {
         if self.options.overwrite {
@@ -305,6 +314,7 @@ impl Shared {
         }
         let headers = match job::existing(&job.output) {
             Ok(None) => return false,
+            Ok(Some(result)) if self.can_be_completed(job, &result) => return false,
             existing => existing,
         };
         let take_up = |job: &Job| {

@@ -1,7 +1,7 @@
 //! One frame in three steps: load, denoise, store. A batch overlaps the steps of different frames.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     path::{Path, PathBuf},
     time::Instant,
 };
@@ -15,7 +15,7 @@ use super::{
 use crate::{
     Error, Result,
     companion::Companion,
-    frame::{Frame, NewChannel, Recoded, SampleKind},
+    frame::{Frame, NewChannel, Recoded, SampleKind, UNSTORABLE},
     models::{Denoiser, ExpectedError, check_expects},
     passes::{self, COMBINED, COMPOSITE, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
     planes::Planes,
@@ -123,6 +123,8 @@ pub struct Report {
     pub repaired: BTreeMap<String, usize>,
     /// What the user should know.
     pub notes: Vec<String>,
+    /// Frames of its window, by number, that it was made without since they were not there, or could not be read.
+    pub lacked: BTreeSet<i64>,
 }
 
 /// A frame and, for each of its stereo views, where the view's beauty is and what `T` holds of the view.
@@ -190,7 +192,8 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         }
         // Before any work: a missing pass is the user's commonest mistake.
         model.check(&shot.passes)?;
-        if needed.contains(&Pass::Normal) && !layer.passes.contains_key(&Pass::Normal) {
+        let is_given = options.sources.normal.is_some();
+        if needed.contains(&Pass::Normal) && !is_given && !layer.passes.contains_key(&Pass::Normal) {
             report.notes.push("Normal is missing; Denoising Normal, of camera space, took its place".into());
         }
         if model.reads_halves() {
@@ -217,6 +220,10 @@ fn check_added(frame: &Frame, view_layer: &str, options: &Options) -> Result<()>
         let name = layer_name(view_layer, &added);
         if frame.has_foreign_layer(&name) {
             let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
+            return Err(Error::invalid(frame.path(), why));
+        }
+        if name.contains(UNSTORABLE) {
+            let why = format!("a layer cannot be called {name:?}; give the view layer another name");
             return Err(Error::invalid(frame.path(), why));
         }
     }
@@ -473,9 +480,9 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
     for (layer, _) in &views {
         check_added(&frame, &layer.name, options)?;
     }
-    if let Some(guide) =
-        options.sources.guides(frame.path())?.into_iter().find(|guide| are_same(guide, output))
-    {
+    // A pattern that leads to no file is told where it is read.
+    let mut guides = options.sources.guides(frame.path()).unwrap_or_default().into_iter();
+    if let Some(guide) = guides.find(|guide| are_same(guide, output)) {
         let why = "is a guide of this frame, which the result would overwrite; choose another --out";
         return Err(Error::invalid(guide, why));
     }
@@ -496,6 +503,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         }
         let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
         frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
+        frame.set_lacked(&result, &report.lacked);
         let name = layer_name(&layer.name, &error_layer(options));
         // Such a layer of an earlier result would not be true of this one, so it is replaced, by numbers that are
         // none where nothing is known.
@@ -590,16 +598,15 @@ fn file_name(name: &str) -> String {
     name.chars().map(write).collect()
 }
 
-/// The EXR that exists at `output`, if there is one. Results are written whole: one of demc's that lacks blocks, as a
-/// full disk or a failed copy leaves it, is none. Of others, and of deep files, headers are enough to tell that they
-/// are there.
+/// The headers of the EXR that exists at `output`, if there is one. Results are written whole: one of demc's that was
+/// cut off, as a full disk or a failed copy leaves it, is none.
 ///
 /// # Errors
 /// The system does not let it be read, so nobody knows what would be lost.
 pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
     let lost = |error: &Error| matches!(error, Error::Io { .. }) && output.exists();
-    match Frame::read(output) {
-        Ok(frame) => Ok(Some(frame)),
+    match Frame::read_headers_of_whole(output) {
+        Ok(headers) => Ok(Some(headers)),
         Err(error) if lost(&error) => Err(error),
         Err(_) => Ok(Frame::read_headers(output).ok().filter(|headers| !headers.is_result())),
     }
@@ -652,8 +659,9 @@ pub(super) fn take_up(existing: &Frame, options: &Options) -> Result<()> {
     if missing.is_empty() {
         return Ok(());
     }
+    let frame = Frame::read(output)?;
     for (layer, path) in missing {
-        let set = passes::read_layer(existing, layer, &[Pass::Combined])?;
+        let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
         write(&path, set.require(Pass::Combined, "--preview")?)?;
     }
     Ok(())

@@ -8,7 +8,11 @@
 //! a stream, each is read and denoised once. Both averages follow the Vector pass, and leave out what does
 //! not agree: see [`agreement`](crate::filters::agreement).
 
-use std::{borrow::Cow, collections::BTreeMap, time::Instant};
+use std::{
+    borrow::Cow,
+    collections::{BTreeMap, BTreeSet},
+    time::Instant,
+};
 
 use super::{
     Denoised, Options, Report, Views,
@@ -64,6 +68,8 @@ type ViewKey = (String, Option<String>);
 enum Gap {
     /// As a sentence for the user.
     Said(String),
+    /// Likewise; and the frame is not there, or cannot be read, which may change.
+    Lost(i64, String),
     /// It lies beyond one of which it was said.
     Beyond,
 }
@@ -79,6 +85,8 @@ struct Moment {
     links: BTreeMap<i32, Result<HalfFloats, Gap>>,
     /// What the model makes of it and its neighbours' renders.
     result: Option<Planes>,
+    /// Frames whose renders the result was made without since they were not there, or could not be read.
+    lacked: BTreeSet<i64>,
 }
 
 /// A frame that is averaged with another.
@@ -310,12 +318,23 @@ impl Window {
         }
         self.explain(number, view, report);
         self.infer(number, view, model, options, report)?;
+        report.lacked.extend(self.lost(number, view, renders.max(results)));
         for offset in offsets(results) {
             if self.is_linked(number, view, offset) {
-                self.infer(number + i64::from(offset), view, model, options, report)?;
+                let other = number + i64::from(offset);
+                self.infer(other, view, model, options, report)?;
+                report.lacked.extend(&self.moment(other, view).expect("it was inferred").lacked);
             }
         }
         Ok(())
+    }
+
+    /// The frames up to so many away that are not there, or cannot be read.
+    fn lost(&self, number: i64, view: &ViewKey, reach: i32) -> BTreeSet<i64> {
+        let links = offsets(reach).filter_map(|offset| self.moment(number, view)?.links.get(&offset));
+        links
+            .filter_map(|link| if let Err(Gap::Lost(frame, _)) = link { Some(*frame) } else { None })
+            .collect()
     }
 
     /// The frames up to so many away that a frame is averaged with.
@@ -377,7 +396,9 @@ impl Window {
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
         let image = run(&shot, model, options, report)?;
-        self.moment_mut(number, view).expect("it is there").result = Some(image);
+        let lacked = self.lost(number, view, renders);
+        let moment = self.moment_mut(number, view).expect("it is there");
+        (moment.result, moment.lacked) = (Some(image), lacked);
         Ok(())
     }
 
@@ -407,11 +428,10 @@ impl Window {
         let said = |text: String| Err(Gap::Said(text));
         let there = number + i64::from(offset);
         let own = self.moment(number, view).expect("links begin at frames that are there");
-        let Some(held) = self.held.get(&there) else {
-            return said(format!("frame {there} is not there"));
-        };
+        let lost = |why: String| Err(Gap::Lost(there, format!("frame {there} {why}")));
+        let Some(held) = self.held.get(&there) else { return lost("is not there".into()) };
         if let Some(trouble) = &held.trouble {
-            return said(format!("frame {there} cannot be read ({trouble})"));
+            return lost(format!("cannot be read ({trouble})"));
         }
         let Some(other) = held.moments.get(view) else {
             return said(format!("frame {there} has no such view layer or view"));
@@ -468,7 +488,7 @@ impl Window {
     fn explain(&self, number: i64, view: &ViewKey, report: &mut Report) {
         let Some(moment) = self.moment(number, view) else { return };
         let gaps = moment.links.values().filter_map(|link| match link {
-            Err(Gap::Said(text)) => Some(text.as_str()),
+            Err(Gap::Said(text) | Gap::Lost(_, text)) => Some(text.as_str()),
             _ => None,
         });
         let mut gaps: Vec<&str> = gaps.collect();
@@ -478,12 +498,7 @@ impl Window {
         }
         let is_alone = moment.links.values().all(Result::is_err);
         let end = if is_alone { "denoised alone" } else { "denoised with those that are left" };
-        let again = if gaps.iter().any(|gap| gap.contains("cannot be read")) {
-            " (once it can be, do this frame again with --overwrite)"
-        } else {
-            ""
-        };
-        let note = format!("{}; {end}{again}", gaps.join("; "));
+        let note = format!("{}; {end}", gaps.join("; "));
         if !report.notes.contains(&note) {
             report.notes.push(note);
         }
@@ -522,7 +537,7 @@ impl Moment {
             Some((pass, halves))
         });
         let waiting = waiting.collect();
-        Self { shot, waiting, look, links: BTreeMap::new(), result: None }
+        Self { shot, waiting, look, links: BTreeMap::new(), result: None, lacked: BTreeSet::new() }
     }
 
     fn values(&self, pass: Pass) -> Option<&dyn Values> {

@@ -3,7 +3,7 @@
 //!
 //! In: full-resolution f32 planes. Out: the frame, ready to be written.
 
-use std::fmt;
+use std::{collections::BTreeSet, fmt};
 
 use exr::{
     block::{BlockIndex, UncompressedBlock, chunk::TileCoordinates},
@@ -29,6 +29,9 @@ use super::{
 };
 use crate::{Error, Result};
 
+/// What no layer's name may hold: names end at a zero, and marks list them one a line.
+pub const UNSTORABLE: [char; 2] = ['\0', '\n'];
+
 /// Largest finite half.
 pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 
@@ -38,9 +41,11 @@ const MARK: &str = "demc";
 /// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
 /// view layer.
 const EXPECTED_ERROR: &str = "demcExpectedError";
+/// Attribute that lists the frames by number that results were made without.
+const LACKED: &str = "demcLacked";
 /// Attributes that another part of the same picture does not take over; nor does it take those of
 /// cryptomattes.
-const OWN: [&str; 6] = [MARK, EXPECTED_ERROR, "name", "preview", "chunkCount", "idManifest"];
+const OWN: [&str; 7] = [MARK, EXPECTED_ERROR, LACKED, "name", "preview", "chunkCount", "idManifest"];
 /// The name that a part without one gets in a file of several parts, where each must have a name.
 const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
@@ -95,7 +100,7 @@ impl Frame {
     /// (`ViewLayer.Denoised-left`), or in the channels' (`ViewLayer.Denoised.left.R`).
     ///
     /// # Errors
-    /// The part cannot be decoded or encoded, or a name has control characters.
+    /// The part cannot be decoded or encoded, or a name cannot be stored.
     ///
     /// # Panics
     /// If there are no channels, two of one name, or one that has not as many values as the part has pixels.
@@ -114,7 +119,7 @@ impl Frame {
             assert!(!is_twice, "two channels '{}'", channel.component);
         }
         let names = channels.iter().map(|channel| channel.component).chain([name]).chain(view);
-        if let Some(name) = names.into_iter().find(|name| name.contains(char::is_control)) {
+        if let Some(name) = names.into_iter().find(|name| name.contains(UNSTORABLE)) {
             return Err(Error::invalid(&self.path, format!("a layer or channel cannot be called {name:?}")));
         }
         let own_part = self.is_part_per_pass(beside);
@@ -147,9 +152,7 @@ impl Frame {
     /// # Panics
     /// If demc made no such layer.
     pub fn set_expected_error(&mut self, name: &str, view_layer: &str, error: Option<f64>) {
-        let is_holder = |part: &usize| self.marked(*part).iter().any(|layer| layer == name);
-        let part = (0..self.parts.len()).find(is_holder).expect("the layer was made before");
-        let attributes = &mut self.stored[part].attributes;
+        let attributes = self.attributes_beside(name);
         let mut errors = expected_errors(attributes);
         if errors.is_empty() && error.is_none() {
             return;
@@ -163,6 +166,35 @@ impl Frame {
     /// The view layers whose results note an expected RelMSE, each with that error.
     pub fn expected_errors(&self) -> Vec<(String, f64)> {
         self.stored.iter().flat_map(|stored| expected_errors(&stored.attributes)).collect()
+    }
+
+    /// Notes the frames by number that the layer `name`, which demc made, was made without though they belong to its
+    /// window; or forgets those of an earlier result.
+    ///
+    /// # Panics
+    /// If demc made no such layer.
+    pub fn set_lacked(&mut self, name: &str, frames: &BTreeSet<i64>) {
+        let attributes = self.attributes_beside(name);
+        if frames.is_empty() && attributes.text(LACKED).is_none() {
+            return;
+        }
+        let frames: Vec<String> = frames.iter().map(i64::to_string).collect();
+        attributes.set_text(LACKED, &frames.join(" "));
+    }
+
+    /// The frames by number that its results were made without.
+    pub fn lacked(&self) -> BTreeSet<i64> {
+        let lists = self.stored.iter().filter_map(|stored| stored.attributes.text(LACKED));
+        lists
+            .flat_map(|list| list.split(' ').filter_map(|frame| frame.parse().ok()).collect::<Vec<i64>>())
+            .collect()
+    }
+
+    /// The attributes of the part that holds a layer which demc made.
+    fn attributes_beside(&mut self, name: &str) -> &mut Attributes {
+        let is_holder = |part: &usize| self.marked(*part).iter().any(|layer| layer == name);
+        let part = (0..self.parts.len()).find(is_holder).expect("the layer was made before");
+        &mut self.stored[part].attributes
     }
 
     /// Lists a layer among those that demc made.

@@ -29,7 +29,7 @@ use exr::{
 
 pub use atomic::{atomically, ignores_case, prepare_folder};
 pub use chroma::to_rgb;
-pub use edit::{HALF_MAX, NewChannel, Recoded};
+pub use edit::{HALF_MAX, NewChannel, Recoded, UNSTORABLE};
 
 use crate::{Error, Result, metrics::display::LUMINANCE};
 use bytes::{Bytes, Opened};

@@ -74,10 +74,10 @@ impl Frames {
     /// The files of these frames. Warns of single frames that were asked for and have no file.
     ///
     /// # Errors
-    /// There is no such file.
-    pub fn pick(&self, files: Vec<Input>) -> Result<Vec<Input>> {
+    /// There is no such file, where `are_all` that were named.
+    pub fn pick(&self, files: Vec<Input>, are_all: bool) -> Result<Vec<Input>> {
         let picked: Vec<Input> = files.into_iter().filter(|file| self.has(file)).collect();
-        if picked.is_empty() {
+        if picked.is_empty() && are_all {
             return Err(Error::Usage(
                 "--frames: none of the inputs has a name that ends in one of these numbers, as in shot.0017.exr"
                     .into(),

@@ -296,9 +296,16 @@ enum Work {
 
 impl Work {
     fn of(args: &Args, search: &Search) -> Result<Self> {
-        let Inputs { files, unusable, .. } = inputs::expand(&args.inputs, search)?;
+        let Inputs { files, mut unusable, .. } = inputs::expand(&args.inputs, search)?;
+        // What is not there, and no EXR by its name, is a folder, most likely: it has no place among results.
+        let is_file = |input: &denoise::Input| inputs::is_exr(&input.file) || input.file.exists();
+        let (files, missing): (Vec<_>, Vec<_>) = files.into_iter().partition(is_file);
+        unusable.extend(missing.into_iter().filter_map(|input| {
+            let error = std::fs::metadata(&input.file).err()?;
+            Some((input.file.clone(), Error::io("read", &input.file)(error)))
+        }));
         let files = match &args.frames {
-            Some(frames) => frames.pick(files)?,
+            Some(frames) => frames.pick(files, unusable.is_empty())?,
             None => files,
         };
         Ok(Self::List { jobs: denoise::plan_tree(files, &args.out)?, unusable })

@@ -265,7 +265,10 @@ fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
     About {
         half: layer.passes.keys().copied().filter(is_half).collect(),
         position_averaged: layer.position_averaged,
-        denoised_by_demc: frame.expected_errors().iter().any(|(name, _)| *name == layer.name),
+        denoised_by_demc: layer.passes.get(&Pass::Combined).is_some_and(|at| {
+            let own = [at.name.clone(), format!("{}.{}", layer.name, at.name)];
+            own.iter().any(|name| frame.is_own_layer(name))
+        }),
         colour_space: ["colorInteropID", "oiio:ColorSpace"]
             .iter()
             .find_map(|name| frame.text_attribute(name)),
