@@ -128,7 +128,7 @@ pub fn parse_reach(text: &str) -> Result<u8> {
 }
 
 /// The name of a method in tables. A weights file has its stem and what was asked for behind it as its name.
-/// Where another file, or a method that demc knows, has the same name its folder is added, and where that does
+/// Where another file, a method that demc knows, or what is compared with has the same name its folder is added, and where that does
 /// not help either the name is all that was asked for.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
@@ -142,7 +142,9 @@ pub fn short_name(name: &str, all: &[&str]) -> String {
         Some(format!("{folder}/{}", stem(name)?))
     };
     let tells_nothing = file.file_stem().is_none_or(|stem| {
-        stem == "best" || stem.to_str().is_some_and(|stem| models::catalogue::find(stem).is_some())
+        stem == "best"
+            || stem == "reference"
+            || stem.to_str().is_some_and(|stem| models::catalogue::find(stem).is_some())
     });
     let short = (!tells_nothing).then(|| stem(name)).flatten().filter(|own| is_unique(own, name, all, stem));
     let long = || with_folder(name).filter(|own| is_unique(own, name, all, with_folder));

@@ -36,6 +36,8 @@ const GAP: f64 = 0.14;
 const NARROWEST: f64 = 10.0;
 /// Bars from this width on carry their value.
 const ROOM_FOR_VALUE: f64 = 12.5;
+/// Groups are as wide as the longest label, up to this: longer ones are cut.
+const WIDEST_LABEL: i32 = 116;
 /// The most scenes with bars of their own; further ones are in the means only.
 const MOST_SCENES: usize = 60;
 const MEAN_BACKGROUND: RGBColor = RGBColor(243, 243, 246);
@@ -137,7 +139,9 @@ impl Bars {
 
     /// The groups of each row: as few rows as keep the bars wide enough, evenly filled.
     fn rows(&self) -> Vec<&[Group]> {
-        let narrowest = NARROWEST * self.methods.len() as f64 / (1.0 - GAP);
+        let widest = self.groups.iter().map(|group| VALUE.measure(&group.label).0).max().unwrap_or(0);
+        let bars = NARROWEST * self.methods.len() as f64 / (1.0 - GAP);
+        let narrowest = bars.max(f64::from(widest.min(WIDEST_LABEL)));
         let most = (f64::from(PLOT.1 - PLOT.0) / narrowest).floor().max(1.0) as usize;
         let rows = self.groups.len().div_ceil(most).max(1);
         self.groups.chunks(self.groups.len().div_ceil(rows).max(1)).collect()

@@ -96,6 +96,9 @@ impl Figure for Chart {
 
 /// A score to three significant digits.
 pub fn number_label(value: f64) -> String {
+    if value != 0.0 && value.abs() < 1e-6 {
+        return format!("{value:.2e}");
+    }
     let decimals = (2 - value.abs().max(1e-9).log10().floor() as i32).clamp(0, 8) as usize;
     format!("{value:.decimals$}")
 }

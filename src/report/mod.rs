@@ -37,8 +37,9 @@ pub use heat::{HeatCell, HeatMap};
 pub use loss::loss_chart;
 pub(crate) use page::{document, picture_of, sheet_text};
 pub use palette::is_own;
+pub use provenance::Provenance;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
-pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, sheet_name};
+pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, remove_chart, sheet_name};
 pub use settings::file_stamp;
 pub use summary::{MethodSummary, geometric_mean, mean, summarise};
 

@@ -56,6 +56,19 @@ impl Provenance {
     }
 }
 
+impl Provenance {
+    /// What of it a page lists beside the command, by name.
+    pub fn facts(&self) -> [(&'static str, String); 4] {
+        let commit = self.commit.as_ref().map(|commit| format!(", commit {commit}")).unwrap_or_default();
+        [
+            ("started", self.started.clone()),
+            ("program", format!("demc {}{commit}", self.version)),
+            ("processor", format!("{}, {} logical cores, {}", self.cpu, self.cores, self.system)),
+            ("kernels", self.instructions.clone()),
+        ]
+    }
+}
+
 /// See [`Provenance::instructions`].
 fn instructions() -> String {
     let (tier, engine) = (Tier::detect(), Engine::detect());

@@ -6,7 +6,7 @@
 
 use std::{
     collections::{HashMap, HashSet},
-    path::PathBuf,
+    path::{Path, PathBuf},
 };
 
 use super::{
@@ -25,7 +25,7 @@ use super::{
     summary,
 };
 use crate::{
-    Result, denoise,
+    Error, Result, denoise,
     error::attempt,
     frame::prepare_folder,
     metrics::{self, pairing},
@@ -172,6 +172,10 @@ pub fn evaluate(
         ("RelMSE of every scene", Bars::relmse(&rows, &summaries).write(out, "bars_relmse")?),
         ("SSIM of every scene", Bars::ssim(&rows, &summaries).write(out, "bars_ssim")?),
     ];
+    // What this run has nothing for is not left over from another.
+    for name in ["bars_flicker", "error_over_samples"] {
+        remove_chart(out, name)?;
+    }
     if rows.iter().any(|row| row.flicker.is_some()) {
         charts.push(("Flicker of every frame", Bars::flicker(&rows, &summaries).write(out, "bars_flicker")?));
     }
@@ -186,6 +190,11 @@ pub fn evaluate(
             (pair, is_known.then(|| sheets.join(name)).filter(|path| path.is_file()))
         })
         .collect();
+    for slice in std::fs::read_dir(out.join("slices")).into_iter().flatten().flatten() {
+        if slice.path().extension().is_some_and(|extension| extension == "png") {
+            std::fs::remove_file(slice.path()).map_err(Error::io("remove", slice.path()))?;
+        }
+    }
     let sequences = if options.sheets { sequences::section(out, pairs, &names)? } else { None };
     Page {
         sequences: sequences.as_ref(),
@@ -200,10 +209,29 @@ pub fn evaluate(
     Ok(rows)
 }
 
+/// Removes a chart of an earlier run, where there is one.
+///
+/// # Errors
+/// The system does not let it be removed.
+pub fn remove_chart(out: &Path, name: &str) -> Result<()> {
+    for path in ["png", "svg"].map(|extension| out.join(name).with_extension(extension)) {
+        match std::fs::remove_file(&path) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(Error::io("remove", path)(error));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 /// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
 pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
-    let twins: Vec<&Pair> = pairs.iter().filter(|p| p.id() == pair.id()).collect();
-    let id = pair.id().replace(['/', '\\'], "_");
+    let file_name = |pair: &Pair| pair.id().replace(['/', '\\'], "_");
+    let id = file_name(pair);
+    // Some disks take capital letters for small ones.
+    let is_twin = |other: &&Pair| file_name(other).to_lowercase() == id.to_lowercase();
+    let twins: Vec<&Pair> = pairs.iter().filter(is_twin).collect();
     match twins.iter().position(|p| *p == pair) {
         Some(at) if at > 0 => format!("{id}_{}.png", at + 1),
         _ => format!("{id}.png"),

@@ -62,9 +62,13 @@ fn folder(out: &Path, sheet: &str) -> PathBuf {
     out.join("frames").join(sheet.trim_end_matches(".png").replace(':', "_"))
 }
 
-/// The file that shows a method's result.
+/// The file that shows a method's result. No two methods share one.
 fn file(folder: &Path, method: &str) -> PathBuf {
-    folder.join(format!("{}.png", method.replace(['/', '\\', ':'], "_")))
+    let write = |c: char| match c {
+        '/' | '\\' | ':' | '%' => format!("%{:02X}", u32::from(c)),
+        _ => c.into(),
+    };
+    folder.join(method.chars().map(write).collect::<String>() + ".png")
 }
 
 /// Stores each method's result on a frame, as the sheet of that name shows it, and the reference. Those of
@@ -93,6 +97,13 @@ impl Sequence<'_> {
     /// Its name: the scene's, and the samples.
     fn label(&self) -> String {
         format!("{}, {} samples per pixel", self.first().scene, self.first().spp)
+    }
+
+    /// Its frames: "5 frames, 0001 to 0005".
+    fn span(&self) -> String {
+        let number = |pair: &Pair| pair.frame.clone().unwrap_or_default();
+        let (first, last) = (number(self.first()), number(self.pairs[self.pairs.len() - 1]));
+        format!("{} frames, {first} to {last}", self.pairs.len())
     }
 
     /// The file that shows a method's result on a frame.
@@ -173,12 +184,13 @@ pub fn section(out: &Path, pairs: &[Pair], methods: &[String]) -> Result<Option<
             for method in &shown {
                 let image = picture::small(&sequence.file(out, pair, method))?;
                 bytes += image.address.len();
-                frames.push((f, *method, image.address));
+                let name = pair.frame.clone().unwrap_or_else(|| (f + 1).to_string());
+                frames.push((f, name, *method, image.address));
             }
         }
         let stepper = (bytes < MOST_BYTES).then(|| stepper(&frames, &shown, sequence.pairs.len()));
         parts.push(html! {
-            h3 { (sequence.label()) ", " (sequence.pairs.len()) " frames" }
+            h3 { (sequence.label()) ", " (sequence.span()) }
             @match stepper {
                 Some(stepper) => (stepper),
                 None => p.faint { "Its frames lie beside this page, in " code { "frames/" } "." },
@@ -197,7 +209,7 @@ pub fn section(out: &Path, pairs: &[Pair], methods: &[String]) -> Result<Option<
 }
 
 /// Two methods side by side, and a slider over the frames.
-fn stepper(frames: &[(usize, &str, String)], methods: &[&str], count: usize) -> Markup {
+fn stepper(frames: &[(usize, String, &str, String)], methods: &[&str], count: usize) -> Markup {
     // Shown at first: the first method, which is usually `noisy`, beside the last one before the reference.
     let chosen = [0, methods.len().saturating_sub(2)];
     html! {
@@ -214,9 +226,9 @@ fn stepper(frames: &[(usize, &str, String)], methods: &[&str], count: usize) -> 
                     }
                 }
             }
-            label { "frame " input type="range" min="0" max=(count - 1) value="0"; " " output { "1" } }
-            @for (frame, method, address) in frames {
-                img hidden data-frame=(frame) data-method=(method) src=(address) alt="";
+            label { "frame " input type="range" min="0" max=(count - 1) value="0"; " " output { (frames[0].1) } }
+            @for (frame, name, method, address) in frames {
+                img hidden data-frame=(frame) data-name=(name) data-method=(method) src=(address) alt="";
             }
         }
     }
@@ -235,6 +247,19 @@ mod tests {
             spp,
             frame: frame.map(str::to_owned),
         }
+    }
+
+    #[test]
+    fn no_two_methods_share_a_picture_and_no_two_scenes_a_sheet() {
+        let names = ["a/w", "a_w", "a:w", "a%2Fw", "a\\w"];
+        let files: std::collections::BTreeSet<PathBuf> =
+            names.iter().map(|n| file(Path::new("f"), n)).collect();
+        assert_eq!(files.len(), names.len(), "{files:?}");
+        assert!(files.iter().all(|file| file.parent() == Some(Path::new("f"))));
+        let pairs = ["kitchen/wide", "kitchen_wide", "Kitchen_Wide"].map(|scene| pair(scene, 4, None));
+        let sheets: std::collections::BTreeSet<String> =
+            pairs.iter().map(|pair| sheet_name(&pairs, pair).to_lowercase()).collect();
+        assert_eq!(sheets.len(), pairs.len(), "{sheets:?}");
     }
 
     #[test]

@@ -263,7 +263,8 @@ pub fn write(
                 let (x, y) = (x as i32, y as i32);
                 canvas.frame([(x, y), (x + CELL as i32 - 1, y + cell_height as i32 - 1)], colour, 2)?;
             }
-            let Some(row) = rows.get(name) else { continue };
+            // The last column is the reference's, which has no scores.
+            let Some(row) = images.get(column).and_then(|_| rows.get(name)) else { continue };
             let below = top + (lines * (cell_height + GAP)) as i32;
             let value = |v: Option<f64>, digits: usize| v.map_or("-".into(), |v| format!("{v:.digits$}"));
             let first = format!("RelMSE {}   SSIM {}", value(row.relmse, 4), value(row.ssim, 4));

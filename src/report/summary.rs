@@ -125,16 +125,19 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
                 let common: Vec<_> =
                     common.iter().filter(|pair| limits.iter().all(|of| has(of, pair))).copied().collect();
                 let values: Vec<f64> = common.iter().filter_map(|pair| metric(of[*pair])).collect();
-                // There is no ratio to a baseline that is exact.
-                let ratio = |pair: &&&Files| {
-                    let base = metric(base.get(**pair)?)?;
-                    (base != 0.0).then_some(metric(of[**pair])? / base)
+                // One black frame, which methods leave as it is, or one input that equals its reference would decide
+                // a product: where any score is 0, no method's counts.
+                let is_exact = |pair: &Files| {
+                    by_model.values().any(|of| of.get(pair).and_then(|row| metric(row)) == Some(0.0))
                 };
-                let ratios: Vec<f64> = common.iter().filter_map(|pair| ratio(&pair)).collect();
+                let inexact: Vec<_> = common.iter().filter(|pair| !is_exact(pair)).collect();
+                let factors: Vec<f64> = inexact.iter().filter_map(|pair| metric(of[**pair])).collect();
+                let ratio = |pair: &Files| Some(metric(of[pair])? / metric(base.get(pair)?)?);
+                let ratios: Vec<f64> = inexact.iter().filter_map(|pair| ratio(pair)).collect();
                 Statistics {
                     mean: mean(&values),
                     median: median(&values),
-                    geomean: geometric_mean(&values),
+                    geomean: geometric_mean(&factors),
                     ratio: geometric_mean(&ratios),
                 }
             });
@@ -217,6 +220,22 @@ mod tests {
 
     fn close(found: Option<f64>, expected: f64) {
         assert!((found.unwrap() - expected).abs() < 1e-12, "{found:?} for {expected}");
+    }
+
+    #[test]
+    fn a_frame_that_some_method_gets_exactly_decides_no_product() {
+        let scores = [("a", "x", 0.2), ("a", "y", 0.1), ("black", "x", 0.0), ("black", "y", 1e-5)];
+        let rows: Vec<Row> = scores.map(|(scene, model, relmse)| row(scene, model, 4, Some(relmse))).into();
+        let all = summarise(&rows, &models(&["x", "y"]), "y");
+        let of = |model: &str| all.iter().find(|s| s.model == model && s.spp.is_none()).unwrap().of("relmse");
+        for (model, geomean, ratio, mean) in [("x", 0.2, 2.0, 0.1), ("y", 0.1, 1.0, 0.050005)] {
+            let close = |value: Option<f64>, wanted: f64| (value.unwrap() - wanted).abs() < 1e-9;
+            let own = of(model);
+            assert!(
+                close(own.geomean, geomean) && close(own.ratio, ratio) && close(own.mean, mean),
+                "{model}"
+            );
+        }
     }
 
     #[test]

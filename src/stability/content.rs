@@ -98,7 +98,8 @@ impl Case {
     /// Finds the faults, given the energy of the input, and the largest RelMSE where the input had none.
     fn judge(&mut self, input_energy: Option<f64>, harm: f64) {
         if self.failed > 0 {
-            self.faults.push(format!("no result for {} renders", self.failed));
+            let plural = if self.failed == 1 { "" } else { "s" };
+            self.faults.push(format!("no result for {} render{plural}", self.failed));
         }
         if let Some(ratio) = self.to_input.filter(|ratio| *ratio > 1.0) {
             self.faults.push(format!("{ratio:.2} x the input's RelMSE"));

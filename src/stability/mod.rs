@@ -22,7 +22,7 @@ use crate::{
     metrics::{self, display, error, ssim},
     planes::Planes,
     report::{
-        self, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, append_row, cell,
+        self, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, Provenance, append_row, cell,
         geometric_mean, to_csv, write_file,
     },
     shot::Shot,
@@ -133,6 +133,10 @@ pub fn run(
 ) -> Result<(Vec<TrialRow>, Vec<Case>)> {
     let out = &options.out;
     prepare_folder(out)?;
+    let provenance = Provenance::now();
+    let made = serde_json::json!({ "provenance": &provenance, "threads": options.threads });
+    let made = serde_json::to_string_pretty(&made).expect("strings and numbers serialise") + "\n";
+    write_file(&out.join("run.json"), made.as_bytes())?;
     let table = out.join("stability.csv");
     write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
     let mut rows = Vec::new();
@@ -171,7 +175,7 @@ pub fn run(
         &out.join("stability_scenes.csv"),
         to_csv(&content::COLUMNS, cases.iter().map(Case::cells)).as_bytes(),
     )?;
-    show(pairs, methods, options, &summary, &cases)?;
+    show(pairs, methods, options, &provenance, (&summary, &cases))?;
     Ok((rows, cases))
 }
 
@@ -180,10 +184,18 @@ fn show(
     pairs: &[Pair],
     methods: &[Contender],
     options: &StabilityOptions,
-    summary: &[Summary],
-    cases: &[Case],
+    provenance: &Provenance,
+    (summary, cases): (&[Summary], &[Case]),
 ) -> Result<()> {
     let names: Vec<String> = methods.iter().map(|method| method.name.clone()).collect();
+    // What this run has nothing for is not left over from another.
+    for name in ["map_input", "map_baseline", "map_trials"] {
+        report::remove_chart(&options.out, name)?;
+    }
+    let folder = options.out.join("worst");
+    if folder.join("report.html").is_file() {
+        std::fs::remove_dir_all(&folder).map_err(Error::io("remove", &folder))?;
+    }
     let mut maps = Vec::new();
     if !cases.is_empty() {
         let title = "RelMSE over the input's (below 1 is better; framed: out of bounds)".into();
@@ -203,7 +215,6 @@ fn show(
     let maps = maps.into_iter().map(|(title, map, name)| Ok((title, map.write(&options.out, name)?)));
     let maps: Vec<(&str, String)> = maps.collect::<Result<_>>()?;
     let worst = worst(pairs, cases, options);
-    let folder = options.out.join("worst");
     if !worst.is_empty() {
         let shown = report::EvalOptions {
             out: folder.clone(),
@@ -216,7 +227,7 @@ fn show(
         };
         report::evaluate(&worst, methods, &shown, &mut |_: EvalEvent<'_>| {})?;
     }
-    page::write(&options.out, &maps, cases, &worst)
+    page::write(options, &maps, cases, &worst, provenance)
 }
 
 /// What a table calls a pair's scene. Those of one name in different folders are different scenes, while the noise

@@ -1,22 +1,27 @@
 //! `stability.html`: the maps, what is out of bounds, and the worst scenes with pictures, on one page that
 //! refers to no other file.
 
-use std::path::Path;
-
 use maud::{PreEscaped, html};
 
-use super::content::Case;
+use super::{StabilityOptions, content::Case};
 use crate::{
     Result,
-    report::{document, picture_of, sheet_name, sheet_text, write_file},
+    report::{Provenance, document, picture_of, sheet_name, sheet_text, write_file},
     testset::Pair,
 };
 
-/// Writes the page into `out`. The folder `worst` in `out` holds a report of the worst scenes.
+/// Writes the page. The folder `worst` beside it holds a report of the worst scenes.
 ///
 /// # Errors
 /// A sheet cannot be read or the file not be written.
-pub fn write(out: &Path, maps: &[(&str, String)], cases: &[Case], worst: &[Pair]) -> Result<()> {
+pub fn write(
+    options: &StabilityOptions,
+    maps: &[(&str, String)],
+    cases: &[Case],
+    worst: &[Pair],
+    made: &Provenance,
+) -> Result<()> {
+    let out = &options.out;
     let judged = cases.iter().filter(|case| case.passes().is_some()).count();
     let failed: Vec<&Case> = cases.iter().filter(|case| case.passes() == Some(false)).collect();
     let mut pictures = Vec::new();
@@ -54,6 +59,12 @@ pub fn write(out: &Path, maps: &[(&str, String)], cases: &[Case], worst: &[Pair]
                 h3 { (pair.label()) ", " (pair.spp) " samples per pixel" }
                 figure { (picture) }
             }
+        }
+        h2 { "How it was made" }
+        dl {
+            dt { "command" } dd { code { (made.command) } }
+            @for (name, text) in made.facts() { dt { (name) } dd { (text) } }
+            dt { "threads" } dd { (options.threads) }
         }
     };
     write_file(&out.join("stability.html"), document("demc stability", &body).into_string().as_bytes())

@@ -111,7 +111,7 @@ impl Page<'_> {
         let spp: BTreeSet<u32> = self.scenes.iter().map(|(pair, _)| pair.spp).collect();
         let body = html! {
                     p.faint {
-                        (p.started) ", " (self.options.threads) " threads, " (p.cpu) ", demc " (p.version)
+                        (p.started) ", " (self.options.threads) " thread" (if self.options.threads == 1 { "" } else { "s" }) ", " (p.cpu) ", demc " (p.version)
                     }
                     (self.best())
                     (self.failures())
@@ -162,7 +162,10 @@ impl Page<'_> {
         let winner = |value: fn(&MethodSummary) -> Option<f64>, sign: f64| {
             let scored = self.overall().filter(|s| s.model != NOISY);
             let scored = scored.filter_map(|s| Some((s.model.as_str(), value(s)?)));
-            scored.min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))
+            let scored: Vec<(&str, f64)> = scored.collect();
+            let best = *scored.iter().min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))?;
+            // Of equals, none is the best.
+            (scored.iter().filter(|other| other.1 == best.1).count() == 1).then_some(best)
         };
         let relmse = winner(|s| s.of("relmse").geomean, 1.0);
         let ssim = winner(|s| s.of("ssim").mean, -1.0);
@@ -255,11 +258,7 @@ impl Page<'_> {
 
     fn how(&self) -> Markup {
         let p = self.provenance;
-        let commit = p.commit.as_ref().map(|c| format!(", commit {c}")).unwrap_or_default();
         let facts = [
-            ("program", format!("demc {}{commit}", p.version)),
-            ("processor", format!("{}, {} logical cores, {}", p.cpu, p.cores, p.system)),
-            ("kernels", p.instructions.clone()),
             ("threads", self.options.threads.to_string()),
             (
                 "times",
@@ -291,7 +290,7 @@ impl Page<'_> {
             h2 #how { "How it was made" }
             dl {
                 dt { "command" } dd { code { (p.command) } }
-                @for (name, text) in &facts { dt { (name) } dd { (text) } }
+                @for (name, text) in p.facts().iter().chain(&facts) { dt { (name) } dd { (text) } }
             }
         }
     }

@@ -22,12 +22,12 @@ for (const table of document.querySelectorAll("table.sortable")) {
 for (const stepper of document.querySelectorAll(".stepper")) {
   const [slider, output] = [stepper.querySelector("input"), stepper.querySelector("output")];
   const show = () => {
-    output.textContent = Number(slider.value) + 1;
     for (const pane of stepper.querySelectorAll(".panes > div")) {
       const method = pane.querySelector("select").value;
       const of = [...stepper.querySelectorAll("img[hidden]")];
       const frame = of.find((img) => img.dataset.method === method && img.dataset.frame === slider.value);
       pane.querySelector(".pane").src = frame.src;
+      output.textContent = frame.dataset.name;
     }
   };
   stepper.addEventListener("input", show);
