@@ -15,7 +15,7 @@ if [ -z "$pythons" ]; then
     exit 1
 fi
 rm -rf "$root/wheels" "$root/wheel-build" "$root"/wheel-try-* python/demc._demc.data
-trap 'rm -rf python/demc._demc.data' EXIT
+trap 'rm -rf "$root/../python/demc._demc.data"' EXIT
 
 # environment FOLDER PYTHON PACKAGE...
 environment() {

@@ -4,18 +4,34 @@
 one file is from another. The command `demc` is installed beside this module and makes the same bits.
 """
 
+import atexit
 import json
 import os
+import typing
 
 import numpy as np
 
 from . import _demc
 from ._demc import Error, __version__
 
-__all__ = ["Error", "__version__", "compare", "denoise", "denoise_file", "inspect"]
+__all__ = ["Error", "Report", "__version__", "compare", "denoise", "denoise_file", "inspect"]
+
+# Daemon threads may be in a call when Python ends, and must not take its lock any more.
+atexit.register(_demc.leave)
 
 # The largest number that float16 holds.
 _HALF_MAX = float(np.finfo(np.float16).max)
+
+
+class Report(typing.TypedDict):
+    """What `denoise_file` returns."""
+
+    view_layer: str
+    width: int
+    height: int
+    seconds: float
+    repaired: dict[str, int]
+    notes: list[str]
 
 
 def _image(name, image, shape=None):
@@ -27,6 +43,8 @@ def _image(name, image, shape=None):
         raise ValueError(f"{name} is of {image.dtype}; give float32 or float16")
     if shape is not None and image.shape != shape:
         raise ValueError(f"{name} has shape {image.shape}, color {shape}; give arrays of one render")
+    if np.ma.isMaskedArray(image):
+        image = image.filled(np.nan)
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
@@ -36,6 +54,23 @@ def _count(name, value, most):
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= value <= most:
         return int(value)
     raise ValueError(f"{name} is {value!r}; give a number from 1 to {most}, or None")
+
+
+def _path(name, path):
+    try:
+        return os.fsdecode(path)
+    except TypeError:
+        raise ValueError(f"{name} is a {type(path).__name__}; give a path or a name as text") from None
+
+
+def _lines(names):
+    """What `names` says, as `demc denoise --map` takes it."""
+    if not isinstance(names or {}, dict):
+        raise ValueError(f'names is a {type(names).__name__}; give a dict such as {{"albedo": "my colour"}}')
+    for word, name in (names or {}).items():
+        if not (isinstance(word, str) and isinstance(name, str)):
+            raise ValueError(f"names has {word!r}: {name!r}; give text for both")
+    return [f"{word}={name}" for word, name in (names or {}).items()]
 
 
 def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, threads=None):
@@ -49,7 +84,7 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
         it in their metadata, arrays cannot.
     threads: how many threads to use; None for all cores.
 
-    Rows run from top to bottom. Values that are not finite are filled in from around them. Python's lock is
+    Rows run from top to bottom. Values that are not finite, or masked, are filled in from around them. Python's lock is
     released; after Ctrl-C the call ends at once, and the work in the background when the model has done.
 
     ValueError: arrays that do not fit, an unknown model, or arrays that the model needs and that are missing.
@@ -61,7 +96,7 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
         for name, guide in [("albedo", albedo), ("normal", normal)]
     ]
     counts = _count("samples", samples, 65535), _count("threads", threads, _demc.MOST_THREADS)
-    result = _demc.denoise_arrays(radiance, *guides, os.fspath(model), *counts).reshape(color.shape)
+    result = _demc.denoise_arrays(radiance, *guides, _path("model", model), *counts).reshape(color.shape)
     if color.dtype == np.float16:
         result = result.clip(-_HALF_MAX, _HALF_MAX).astype(np.float16)
     return result
@@ -82,24 +117,26 @@ def denoise_file(
         words are those of `demc denoise --map`.
     threads: how many threads to use; None for all cores.
 
-    Returns a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of
+    Returns a `Report`, a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of
     values that were not finite by pass; notes, a list of what is good to know.
 
     ValueError: an unknown model, or `out` is `source`.
     Error: a file cannot be read or written, lacks a pass, or exists without `overwrite`. `out` is whole, or
     not there; after Ctrl-C it is not begun.
     """
-    source, out = os.fspath(source), os.fspath(out)
+    source, out, model = _path("source", source), _path("out", out), _path("model", model)
+    guides = tuple(None if path is None else _path(name, path) for name, path in (("albedo", albedo), ("normal", normal)))
+    lines = _lines(names)
+    if not isinstance(view_layer, str | None):
+        raise ValueError(f"view_layer is a {type(view_layer).__name__}; give its name, or None")
     if os.path.exists(out):
-        read = [source, *(os.fspath(path) for path in (albedo, normal) if path is not None)]
+        read = [source, *(path for path in guides if path is not None)]
         if any(os.path.exists(path) and os.path.samefile(path, out) for path in read):
             raise ValueError(f"{out}: the result would overwrite what it is made of; choose another out")
         if not overwrite:
             raise Error(f"{out}: exists; overwrite=True replaces it, or choose another out")
     threads = _count("threads", threads, _demc.MOST_THREADS)
-    guides = tuple(None if path is None else os.fspath(path) for path in (albedo, normal))
-    lines = [f"{word}={name}" for word, name in (names or {}).items()]
-    values = _demc.denoise_path(source, out, os.fspath(model), view_layer, guides, lines, threads)
+    values = _demc.denoise_path(source, out, model, view_layer, guides, lines, threads)
     return dict(zip(("view_layer", "width", "height", "seconds", "repaired", "notes"), values))
 
 
@@ -109,7 +146,7 @@ def inspect(path):
 
     Error: the file cannot be read.
     """
-    return json.loads(_demc.inspect_json(os.fspath(path)))
+    return json.loads(_demc.inspect_json(_path("path", path)))
 
 
 def compare(image, reference):
@@ -120,4 +157,4 @@ def compare(image, reference):
 
     Error: a file cannot be read, or the images differ in size or place or hold values that are not finite.
     """
-    return dict(_demc.compare_files(os.fspath(image), os.fspath(reference)))
+    return dict(_demc.compare_files(_path("image", image), _path("reference", reference)))

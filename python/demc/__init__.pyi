@@ -1,18 +1,17 @@
 from os import PathLike
-from typing import Any, TypedDict, TypeVar, type_check_only
+from typing import Any, TypeAlias, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Error", "__version__", "compare", "denoise", "denoise_file", "inspect"]
+__all__ = ["Error", "Report", "__version__", "compare", "denoise", "denoise_file", "inspect"]
 
 __version__: str
+_Path: TypeAlias = str | bytes | PathLike[str] | PathLike[bytes]
 _Float = TypeVar("_Float", np.float32, np.float16)
 
 class Error(RuntimeError): ...
 
-# What `denoise_file` returns; the module itself has no such name.
-@type_check_only
 class Report(TypedDict):
     view_layer: str
     width: int
@@ -25,22 +24,22 @@ def denoise(
     color: NDArray[_Float],
     albedo: NDArray[np.float32] | NDArray[np.float16] | None = None,
     normal: NDArray[np.float32] | NDArray[np.float16] | None = None,
-    model: str | PathLike[str] = "demc-m",
+    model: _Path = "demc-m",
     *,
-    samples: int | None = None,
-    threads: int | None = None,
+    samples: int | np.integer[Any] | None = None,
+    threads: int | np.integer[Any] | None = None,
 ) -> NDArray[_Float]: ...
 def denoise_file(
-    source: str | PathLike[str],
-    out: str | PathLike[str],
-    model: str | PathLike[str] = "demc-m",
+    source: _Path,
+    out: _Path,
+    model: _Path = "demc-m",
     *,
     overwrite: bool = False,
     view_layer: str | None = None,
-    albedo: str | PathLike[str] | None = None,
-    normal: str | PathLike[str] | None = None,
+    albedo: _Path | None = None,
+    normal: _Path | None = None,
     names: dict[str, str] | None = None,
-    threads: int | None = None,
+    threads: int | np.integer[Any] | None = None,
 ) -> Report: ...
-def inspect(path: str | PathLike[str]) -> dict[str, Any]: ...
-def compare(image: str | PathLike[str], reference: str | PathLike[str]) -> dict[str, float | None]: ...
+def inspect(path: _Path) -> dict[str, Any]: ...
+def compare(image: _Path, reference: _Path) -> dict[str, float | None]: ...

@@ -12,7 +12,7 @@ use std::{
     process,
     sync::{
         Arc, LazyLock, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
         mpsc::{RecvTimeoutError, channel},
     },
     thread,
@@ -100,8 +100,16 @@ fn detached<T: Send + 'static>(
         let _ = done.send(outcome);
     });
     let result = Mutex::new(result);
+    let _call = Call::begin();
     loop {
-        let received = py.detach(|| result.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(LOOK));
+        let received = py.detach(|| {
+            let received = result.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(LOOK);
+            // Python's lock is nobody's any more. Whoever asks for it is ended in a way that Rust does not survive.
+            while ENDS.load(Ordering::SeqCst) {
+                thread::park();
+            }
+            received
+        });
         match received {
             Ok(outcome) => return outcome.map_err(to_python),
             Err(RecvTimeoutError::Timeout) => py.check_signals().inspect_err(|_| {
@@ -111,6 +119,36 @@ fn detached<T: Send + 'static>(
                 return Err(Error::new_err("the thread that denoises has gone; please report it"));
             }
         }
+    }
+}
+
+/// Whether Python ends, and how many calls are under way.
+static ENDS: AtomicBool = AtomicBool::new(false);
+static CALLS: AtomicUsize = AtomicUsize::new(0);
+
+/// A call that is under way.
+struct Call;
+
+impl Call {
+    fn begin() -> Self {
+        CALLS.fetch_add(1, Ordering::SeqCst);
+        Self
+    }
+}
+
+impl Drop for Call {
+    fn drop(&mut self) {
+        CALLS.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+/// Called when Python ends: calls in daemon threads, which nobody waits for, do not come back to it.
+#[pyfunction]
+fn leave(py: Python<'_>) {
+    ENDS.store(true, Ordering::SeqCst);
+    if CALLS.load(Ordering::SeqCst) > 0 {
+        // Those that have seen the result, or look for Ctrl-C just now, still need the lock.
+        py.detach(|| thread::sleep(3 * LOOK));
     }
 }
 
@@ -259,6 +297,7 @@ fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
 fn _demc(module: &Bound<'_, PyModule>) -> PyResult<()> {
     LazyLock::force(&LOADED_IN);
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add_function(wrap_pyfunction!(leave, module)?)?;
     module.add("MOST_THREADS", demc::cli::MOST_THREADS)?;
     module.add("Error", module.py().get_type::<Error>())?;
     module.add_function(wrap_pyfunction!(denoise_arrays, module)?)?;

@@ -117,6 +117,40 @@ class Package(unittest.TestCase):
         with self.assertRaisesRegex(ValueError, "from 1 to 4096"):
             demc.denoise_file(ROOM, out, overwrite=True, threads=4097)
 
+    def test_python_ends_while_a_daemon_thread_is_in_a_call(self):
+        code = (
+            "import sys, threading, time, numpy, demc\n"
+            "image = numpy.random.rand(400, 600, 3).astype('f4')\n"
+            "threading.Thread(target=demc.denoise, args=(image,), kwargs={'threads': 1}, daemon=True).start()\n"
+            "time.sleep(0.3)\n"
+        )
+        for _ in range(3):
+            ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+            self.assertEqual((ended.returncode, ended.stderr), (0, ""))
+
+    def test_what_is_masked_is_filled_in(self):
+        color, albedo, normal, _ = self.arrays()
+        hidden = np.zeros(color.shape, bool)
+        hidden[10:20, 10:20] = True
+        masked = np.ma.array(np.where(hidden, np.float32(1e4), color), mask=hidden)
+        holes = np.where(hidden, np.float32(np.nan), color)
+        one, other = (demc.denoise(c, albedo, normal, model="demc-s") for c in (masked, holes))
+        np.testing.assert_array_equal(one, other)
+
+    def test_wrong_arguments_are_named(self):
+        for wrong, words in [
+            ({"names": ["albedo=x"]}, "names is a list"), ({"names": {"albedo": None}}, "names has 'albedo': None"),
+            ({"view_layer": 3}, "view_layer is a int"), ({"model": 3}, "model is a int"), ({"albedo": 3}, "albedo is a int"),
+        ]:
+            with self.assertRaisesRegex(ValueError, words):
+                demc.denoise_file(ROOM, self.folder / "out.exr", **wrong)
+        demc.denoise_file(os.fsencode(ROOM), os.fsencode(self.folder / "bytes.exr"), model="demc-s")
+        pipe = self.folder / "pipe"
+        os.mkfifo(pipe)
+        with self.assertRaisesRegex(demc.Error, "is no file, and is not replaced"):
+            demc.denoise_file(ROOM, pipe, model="demc-s", overwrite=True)
+        self.assertTrue(pipe.is_fifo())
+
     def test_ctrl_c_ends_the_command_as_it_ends_the_program(self):
         arguments = ["denoise", str(self.folder), "--out", str(self.folder / "out"), "--watch"]
         code = "import sys; from demc._command import main; sys.argv = ['demc', *sys.argv[1:]]; main()"

@@ -57,7 +57,7 @@ impl Args {
 /// # Errors
 /// A file is unusable, or the images cannot be compared.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let (scores, reference) = scores(args)?;
+    let (scores, reference) = scores(args, &|note| warn_line(note))?;
     if args.json {
         let object: serde_json::Map<String, serde_json::Value> =
             scores.named().into_iter().map(|(name, value)| (name.into(), value.into())).collect();
@@ -73,16 +73,16 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The scores, and the image that is the reference.
+/// The scores, and the image that is the reference. `say` is told what was compared where that might surprise.
 ///
 /// # Errors
 /// As [`run`].
-pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
-    let image = judged(args)?;
+pub fn scores(args: &Args, say: &dyn Fn(&str)) -> Result<(Scores, Planes)> {
+    let image = judged(args, say)?;
     let reference = reference(args, &image.view_layer)?;
     if image.view_layer != reference.view_layer {
         let [a, b] = [&image.view_layer, &reference.view_layer];
-        warn_line(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
+        say(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
     }
     image.check_same_pixels(&reference, "its reference")?;
     let [image, reference] =
@@ -97,14 +97,14 @@ pub fn scores(args: &Args) -> Result<(Scores, Planes)> {
 
 /// The image to judge, as the Combined of its view layer: the layer named, or by default `Denoised`, or else
 /// Combined.
-fn judged(args: &Args) -> Result<PassSet> {
+fn judged(args: &Args, say: &dyn Fn(&str)) -> Result<PassSet> {
     let (frame, view_layer) = (Frame::read(&args.image)?, args.view_layer.as_deref());
     let layer = match args.layer.as_deref() {
         None => {
             let denoised = passes::rgb_layers(&frame, view_layer, DENOISED).into_iter().next();
             if denoised.is_some() {
                 let path = args.image.display();
-                warn_line(&format!("{path}: its layer '{DENOISED}' is judged (or say --layer {COMBINED})"));
+                say(&format!("{path}: its layer '{DENOISED}' is judged (or say --layer {COMBINED})"));
             }
             denoised
         }

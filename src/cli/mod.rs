@@ -115,7 +115,9 @@ pub fn inspect_json(path: &Path) -> Result<String> {
 /// # Errors
 /// A file is unusable, or the images cannot be compared.
 pub fn compare_files(image: &Path, reference: &Path) -> Result<Scores> {
-    attempt(image, || compare::scores(&compare::Args::of(image, reference)).map(|(scores, _)| scores))
+    attempt(image, || {
+        compare::scores(&compare::Args::of(image, reference), &|_| {}).map(|(scores, _)| scores)
+    })
 }
 
 fn main_with(Cli { command }: Cli) -> ExitCode {

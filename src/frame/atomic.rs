@@ -29,11 +29,15 @@ static OWN_PREFIX: LazyLock<String> = LazyLock::new(|| {
 /// No frame takes this long to write.
 const LONG: Duration = Duration::from_secs(24 * 3600);
 
-/// Lets `write` fill a new file that takes the name `path` only when it is complete.
+/// Lets `write` fill a new file that takes the name `path` only when it is complete. A file of that name, or a link, is
+/// replaced.
 ///
 /// # Errors
-/// Those of `write`, or the file cannot be created or renamed.
+/// Those of `write`, the file cannot be created or renamed, or something else has its name, such as a device.
 pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Result<()> {
+    if fs::symlink_metadata(path).is_ok_and(|there| !(there.is_file() || there.is_symlink())) {
+        return Err(Error::invalid(path, "is no file, and is not replaced by one; choose another name"));
+    }
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),

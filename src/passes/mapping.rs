@@ -91,7 +91,7 @@ impl Mapping {
         Err(Error::invalid(
             path,
             format!(
-                "has no layer '{name}' with the components of {pass}, as --map says; there are: {}",
+                "has no layer '{name}' with the components of {pass}, as the mapping (--map) says; there are: {}",
                 held.join(", ")
             ),
         ))

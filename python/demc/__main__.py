@@ -1,0 +1,5 @@
+"""`python -m demc`: the command `demc`."""
+
+from ._command import main
+
+main()
