@@ -441,7 +441,6 @@ impl Vectorised for Quads<'_> {
 ///
 /// # Panics
 /// As [`reduce`].
-#[expect(clippy::too_many_arguments, reason = "planes and their gradients, each under its own name")]
 pub fn reduce_gradient(
     size: Size,
     image: &[f32],

@@ -242,7 +242,6 @@ impl Demc {
     }
 
     /// The detail map, and each encoder's skips and latent.
-    #[expect(clippy::type_complexity, reason = "a triple that one function returns and one takes apart")]
     fn encode<T: Tape<f32, Cpu> + Merge<T>>(
         &self,
         batch: &Batch,
