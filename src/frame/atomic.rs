@@ -36,7 +36,10 @@ const LONG: Duration = Duration::from_secs(24 * 3600);
 /// Those of `write`, the file cannot be created or renamed, or something else has its name, such as a device.
 pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Result<()> {
     if fs::symlink_metadata(path).is_ok_and(|there| !(there.is_file() || there.is_symlink())) {
-        return Err(Error::invalid(path, "is no file, and is not replaced by one; choose another name"));
+        return Err(Error::invalid(
+            path,
+            "cannot write: what has this name is no file; move it away, or choose another",
+        ));
     }
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
