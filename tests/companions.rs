@@ -165,7 +165,7 @@ fn a_result_without_light_passes_is_not_taken_for_one_with_them() {
     again("--model demc-s --passes").code(1).stderr(contains("without denoised light passes"));
     again("--model demc-s --passes --overwrite").success();
     again("--model demc-s --passes").success();
-    again("--model noisy --passes --overwrite").code(1).stderr(contains("takes demc-s, demc-m or demc-l"));
+    again("--model noisy --passes --overwrite").code(2).stderr(contains("takes demc-s, demc-m or demc-l"));
 }
 
 fn over_white(set: &PassSet, pass: (&[f32], &[f32])) -> Vec<f32> {
