@@ -155,13 +155,16 @@ def state_of(blend):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def difference(path, settings):
-    """How a finished file's settings differ from those wanted, in words; empty where they do not, or where
-    the file tells none: it was made by an older script."""
-    told = exr.text_attribute(path, _STAMP)
-    if told is None:
+def settings_in(path):
+    """What a finished file was made with; empty where it tells nothing: it was made by an older script."""
+    return json.loads(exr.text_attribute(path, _STAMP) or "{}")
+
+
+def difference(made, settings):
+    """How the settings that a file was made with differ from those wanted, in words; empty where they do not, or
+    where nothing is told of them."""
+    if not made:
         return ""
-    made = json.loads(told)
     changed = [name for name in settings if name != _STATE and made.get(name) != settings[name]]
     return ", ".join(f"{name} {made.get(name)} instead of {settings[name]}" for name in changed)
 
@@ -205,14 +208,14 @@ class Export:
         settings, damaged = settings_of(self.options, self.common, job), False
         if os.path.exists(job.path) and not self.options.overwrite:
             damaged = not exr.is_whole(job.path)
-            other = "" if damaged else difference(job.path, settings)
+            made = {} if damaged else settings_in(job.path)
+            other = difference(made, settings)
             if other:
                 raise RuntimeError(f"{job.path} was made with {other}; --overwrite renders it again, or choose "
                                    "another --out or --name")
             if not damaged:
-                told = exr.text_attribute(job.path, _STAMP)
-                made = json.loads(told).get(_STATE) if told else None
-                self.of_other_state += None not in (made, settings[_STATE]) and made != settings[_STATE]
+                states = {made.get(_STATE), settings[_STATE]}
+                self.of_other_state += None not in states and len(states) > 1
                 return "is there"
         start = time.perf_counter()
         if not self.placed:

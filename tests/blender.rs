@@ -194,7 +194,9 @@ fn exports_a_region_of_a_frame_range_and_puts_the_scene_back() {
         .arg(snippet("leaves_no_trace.py"))
         .arg(script(""))
         .arg(&blend)
-        .arg(folder.path().join("open")));
+        .arg("--out")
+        .arg(folder.path().join("open"))
+        .args("--vector --resolution 24x16 --region 2,2,8,8 --frames 3 --view-layer Main".split(' ')));
     assert!(said.lines().any(|line| line.trim() == "changed: []"), "{said}");
 }
 

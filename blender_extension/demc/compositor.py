@@ -8,8 +8,8 @@ _MARK = "demc"
 
 
 def wire(scene, picture, layer=""):
-    """Adds an image node with the result of a view layer, or of the first that is rendered, a Split node and a viewer. Nodes of the user's stay as they are;
-    those that an earlier result brought make room for the new ones. Returns the tree, or None where the user
+    """Adds an image node with the result of a view layer, or of the first that is rendered, a Split node and a
+    viewer. Nodes of the user's stay as they are; those that an earlier result brought make room for the new ones. Returns the tree, or None where the user
     has nodes that are turned off."""
     tree = _tree(scene)
     if tree is None:

@@ -68,7 +68,7 @@ def of_range(scene):
     if not found[0].lower().endswith(_SUFFIX):
         raise JobError(f"{os.path.basename(found[0])} keeps no passes: press Prepare Passes and render again")
     job = of_files(scene, found)
-    lost = [path for path in wanted if path not in found]
+    lost = sorted(set(wanted) - set(found))
     if lost:
         job.notes.append(f"{len(lost)} of the frames {first} to {last} are not there, such as {os.path.basename(lost[0])}")
     return job

@@ -29,6 +29,12 @@ class Edits(AbstractContextManager):
         setattr(owner, name, value)
         self.on_undo(lambda: setattr(owner, name, old))
 
+    def keep(self, owner, *names):
+        """Remembers properties that change as others are set. They are put back in this order."""
+        for name in reversed(names):
+            value = getattr(owner, name)
+            self.on_undo(lambda name=name, value=value: setattr(owner, name, value))
+
     def on_undo(self, action):
         """Registers what takes back a change that is no plain property."""
         self._undo.append(action)

@@ -109,15 +109,11 @@ def set_output(edits, scene, full_float=False):
     # colour space, and a depth is valid only for its own.
     linear = getattr(settings, "linear_colorspace_settings", None)
     if linear is not None and linear.name:
-        space = linear.name
-        edits.on_undo(lambda: setattr(linear, "name", space))
+        edits.keep(linear, "name")
     if hasattr(settings, "view_settings"):  # of files that have their own colours, which Blender then sets anew
-        for owner, names in ((settings.display_settings, ("display_device",)),
-                             (settings.view_settings, ("view_transform", "look", "exposure", "gamma"))):
-            for name in reversed(names):
-                edits.on_undo(lambda owner=owner, name=name, value=getattr(owner, name): setattr(owner, name, value))
-    for name in ("views_format", "color_depth", "file_format"):
-        edits.on_undo(lambda name=name, value=getattr(settings, name): setattr(settings, name, value))
+        edits.keep(settings.view_settings, "view_transform", "look", "exposure", "gamma")
+        edits.keep(settings.display_settings, "display_device")
+    edits.keep(settings, "file_format", "color_depth", "views_format")
     if hasattr(settings, "media_type"):  # Blender 5 wants it before the file format
         edits.set(settings, "media_type", "MULTI_LAYER_IMAGE")
     edits.set(settings, "file_format", "OPEN_EXR_MULTILAYER")

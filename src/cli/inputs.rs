@@ -212,7 +212,11 @@ fn has_wildcard(path: &Path) -> bool {
     path.to_string_lossy().contains(['*', '?', '['])
 }
 
-/// Whether a name is that of an EXR file.
-pub fn is_exr(path: &Path) -> bool {
+/// Whether a path leads to nothing and is no EXR by its name: a folder that is not there, most likely.
+pub fn is_missing_folder(path: &Path) -> bool {
+    !(is_exr(path) || path.exists())
+}
+
+fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
 }

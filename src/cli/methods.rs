@@ -128,7 +128,8 @@ pub fn parse_reach(text: &str) -> Result<u8> {
 }
 
 /// The name of a method in tables. A weights file has its stem and what was asked for behind it as its name.
-/// Where another file, a method that demc knows, or what is compared with has the same name its folder is added, and where that does
+/// Where another file, a method that demc knows, or what is compared with has the same name its folder is added,
+/// and where that does
 /// not help either the name is all that was asked for.
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };

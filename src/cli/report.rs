@@ -6,9 +6,9 @@
 
 use std::{
     collections::BTreeMap,
-    fs::{self, File},
+    fs::File,
     io::{BufRead, BufReader},
-    path::{Path, PathBuf},
+    path::PathBuf,
 };
 
 use clap::Args as ClapArgs;
@@ -17,7 +17,7 @@ use serde::Deserialize;
 use super::inputs::{self, Search};
 use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
 use super::ranking::{Ranking, parse_wish};
-use crate::{Error, Result};
+use crate::{Error, Result, frame::place_of};
 
 /// Arguments of `demc report`.
 #[derive(Debug, ClapArgs)]
@@ -143,14 +143,6 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(if is_silent || failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
-/// What tells frames apart, since tasks may reach a folder by different paths. Frames themselves may be links to one
-/// render.
-fn place(path: &Path) -> PathBuf {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let found = fs::canonicalize(folder).ok().zip(path.file_name());
-    found.map_or_else(|| path.to_owned(), |(folder, name)| folder.join(name))
-}
-
 /// Adds a line. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap.
 fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     let rank = |status| match status {
@@ -158,7 +150,8 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
         Status::Skipped => 1,
         Status::Done => 2,
     };
-    let place = place(&line.input);
+    // Tasks may reach a folder by different paths.
+    let place = place_of(&line.input);
     let known = frames.get(&place).map(|frame| rank(frame.status));
     if known.is_none_or(|known| known <= rank(line.status)) {
         let error = line.error.unwrap_or_default();
@@ -173,6 +166,6 @@ fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) ->
     }
     let search = Search { recursive, ..Search::default() };
     let mut files = inputs::expand(of, &search)?.paths();
-    files.retain(|file| !frames.contains_key(&place(file)));
+    files.retain(|file| !frames.contains_key(&place_of(file)));
     Ok(files)
 }

@@ -617,15 +617,15 @@ pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
 ///
 /// # Errors
 /// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
-pub(super) fn take_up(existing: &Frame, options: &Options) -> Result<()> {
-    let output = existing.path();
-    let layers = passes::layers_by(existing, &options.sources.mapping);
-    let layer = passes::choose(existing, &layers, options.view_layer.as_deref())?;
+pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
+    let output = headers.path();
+    let layers = passes::layers_by(headers, &options.sources.mapping);
+    let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
     let chosen = &layer.name;
     let name = options.layer.as_deref().unwrap_or(COMBINED);
     let full_name = layer_name(chosen, name);
     let views = match &options.layer {
-        Some(added) => passes::rgb_layers(existing, Some(chosen), added),
+        Some(added) => passes::rgb_layers(headers, Some(chosen), added),
         // The beauty, whatever its renderer calls it.
         None => layers
             .iter()
@@ -639,18 +639,18 @@ pub(super) fn take_up(existing: &Frame, options: &Options) -> Result<()> {
         );
         Err(Error::invalid(output, why))
     };
-    if views.is_empty() || !existing.is_own_layer(&full_name) {
+    if views.is_empty() || !headers.is_own_layer(&full_name) {
         return lacks(&format!("'{full_name}'"));
     }
     let is_own = |at: &PassChannels| match &options.layer {
-        Some(added) => existing.is_own_layer(&added_name(layer, &at.name, added)),
-        None => existing.is_own_layer(&layer_name(chosen, &at.name)),
+        Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
+        None => headers.is_own_layer(&layer_name(chosen, &at.name)),
     };
     let lights = denoised_lights(layer);
     if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
         return lacks("denoised light passes");
     }
-    if options.confidence && !existing.is_own_layer(&layer_name(chosen, &error_layer(options))) {
+    if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
         return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
     }
     let Some(write) = options.preview else { return Ok(()) };

@@ -7,7 +7,7 @@
 
 use std::{
     fs::{self, File},
-    path::Path,
+    path::{Path, PathBuf},
     sync::LazyLock,
     time::Duration,
 };
@@ -41,16 +41,26 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
             "cannot write: what has this name is no file; move it away, or choose another",
         ));
     }
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    let file = temporary(folder).map_err(Error::io("write", path))?;
+    let file = temporary(folder_of(path)).map_err(Error::io("write", path))?;
     write(file.as_file())?;
     // After a crash of the machine, there must be no file of that name without its pixels.
     file.as_file().sync_all().map_err(Error::io("write", path))?;
     file.persist(path).map_err(|e| Error::io("write", path)(e.error))?;
     Ok(())
+}
+
+/// The folder that a file is in.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// A file's path by the place of its folder on the disk, the same by whatever path that is reached. The file itself may
+/// be a link to another, and stays a file of its own.
+pub fn place_of(path: &Path) -> PathBuf {
+    match (fs::canonicalize(folder_of(path)), path.file_name()) {
+        (Ok(folder), Some(name)) => folder.join(name),
+        _ => path.to_owned(),
+    }
 }
 
 /// Makes a folder for results and finds out now, not after an hour, whether files can be made in it.

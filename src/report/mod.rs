@@ -38,12 +38,17 @@ pub use loss::loss_chart;
 pub(crate) use page::{document, picture_of, sheet_text};
 pub use palette::is_own;
 pub use provenance::Provenance;
-pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file};
+pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file, write_json};
 pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, remove_chart, sheet_name};
 pub use settings::file_stamp;
 pub use summary::{MethodSummary, geometric_mean, mean, summarise};
 
 use crate::models::Denoiser;
+
+/// The ending of a word that counts so many.
+pub(crate) fn plural(count: usize) -> &'static str {
+    if count == 1 { "" } else { "s" }
+}
 
 /// Name of the method that every report has: the input itself.
 pub const NOISY: &str = "noisy";

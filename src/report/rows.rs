@@ -7,10 +7,15 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::cell;
-use crate::{Error, Result, frame::atomically, metrics::Scores, testset::Pair};
+use crate::{
+    Error, Result,
+    frame::{atomically, place_of},
+    metrics::Scores,
+    testset::Pair,
+};
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
 pub const COLUMNS: [&str; 24] = [
@@ -151,18 +156,9 @@ impl Row {
         (noisy, reference, self.model.clone())
     }
 
-    /// The noisy and the reference file, by whatever path their folders are reached. (A frame that is held may be a
-    /// link to another.)
+    /// The noisy and the reference file, by whatever path their folders are reached.
     pub fn files(&self) -> (PathBuf, PathBuf) {
-        let place = |path: &Path| {
-            let folder =
-                path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            match (fs::canonicalize(folder), path.file_name()) {
-                (Ok(folder), Some(name)) => folder.join(name),
-                _ => path.to_owned(),
-            }
-        };
-        (place(&self.noisy), place(&self.reference))
+        (place_of(&self.noisy), place_of(&self.reference))
     }
 
     /// Adds to the note.
@@ -248,6 +244,18 @@ pub fn to_csv<R: AsRef<[String]>>(columns: &[&str], rows: impl IntoIterator<Item
 /// It cannot be written.
 pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
     atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
+}
+
+/// Replaces a file by a value as JSON, in one step.
+///
+/// # Errors
+/// It cannot be written.
+///
+/// # Panics
+/// If JSON has no form for the value.
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).expect("the value has a form in JSON");
+    write_file(path, (text + "\n").as_bytes())
 }
 
 /// Appends a row to a CSV file at once.

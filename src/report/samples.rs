@@ -18,6 +18,7 @@ use super::{
     chart::SIZE,
     figure::Figure,
     palette::{GRID, INK, colours, legible},
+    plural,
     rows::Row,
     summary::geometric_mean,
 };
@@ -153,8 +154,7 @@ impl Figure for Samples {
 
     fn draw<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Result<()> {
         let (width, height) = (SIZE.0 as i32, SIZE.1 as i32);
-        let plural = if self.scenes == 1 { "" } else { "s" };
-        let title = format!("Error over samples, {} scene{plural}", self.scenes);
+        let title = format!("Error over samples, {} scene{}", self.scenes, plural(self.scenes));
         canvas.text(&title, (width / 2, 28), Anchor::Centre, Style { bold: true, ..Style::new(22) })?;
         let half = width / 2;
         let area = |i: i32| Area {

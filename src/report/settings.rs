@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     Contender, EvalOptions, NOISY,
     provenance::Provenance,
-    rows::{Row, write_file},
+    rows::{Row, write_json},
 };
 use crate::{Result, denoise, shot, testset::Pair};
 
@@ -55,8 +55,7 @@ impl Settings {
 
     /// Stores them.
     pub fn write(&self, path: &Path) -> Result<()> {
-        let text = serde_json::to_string_pretty(self).expect("maps of strings are JSON");
-        write_file(path, (text + "\n").as_bytes())
+        write_json(path, self)
     }
 
     /// Whether `row`, which was made with the settings `self`, would come out the same with `now`. Where

@@ -4,8 +4,8 @@
 //! In: the rows of [`super::run`]. Renders of one scene at one sample count count as its noise seeds. Two
 //! bounds apply. The result has at most the input's RelMSE, since a denoiser that makes a frame worse had
 //! better be off; where the input is exact, at most a RelMSE of 0.0001. And the sum of
-//! its light is within 2% of the reference's, about the least difference in brightness that an eye sees (Weber's fraction). This tolerance grows by as much as the input's own sum is
-//! off, since the input may have fireflies or lack light that only few paths find.
+//! its light is within 2% of the reference's, about the least difference in brightness that an eye sees
+//! (Weber's fraction). This tolerance grows by as much as the input's own sum is off, since the input may have fireflies or lack light that only few paths find.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -13,7 +13,7 @@ use std::{
 };
 
 use super::{Trial, TrialRow};
-use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean};
+use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean, plural};
 
 /// RelMSE that a method may bring to an input that is exact: nothing that an eye sees.
 const HARMLESS: f64 = 1e-4;
@@ -98,8 +98,7 @@ impl Case {
     /// Finds the faults, given the energy of the input, and the largest RelMSE where the input had none.
     fn judge(&mut self, input_energy: Option<f64>, harm: f64) {
         if self.failed > 0 {
-            let plural = if self.failed == 1 { "" } else { "s" };
-            self.faults.push(format!("no result for {} render{plural}", self.failed));
+            self.faults.push(format!("no result for {} render{}", self.failed, plural(self.failed)));
         }
         if let Some(ratio) = self.to_input.filter(|ratio| *ratio > 1.0) {
             self.faults.push(format!("{ratio:.2} x the input's RelMSE"));

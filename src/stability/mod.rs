@@ -23,7 +23,7 @@ use crate::{
     planes::Planes,
     report::{
         self, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, Provenance, append_row, cell,
-        geometric_mean, to_csv, write_file,
+        geometric_mean, to_csv, write_file, write_json,
     },
     shot::Shot,
     testset::Pair,
@@ -135,8 +135,7 @@ pub fn run(
     prepare_folder(out)?;
     let provenance = Provenance::now();
     let made = serde_json::json!({ "provenance": &provenance, "threads": options.threads });
-    let made = serde_json::to_string_pretty(&made).expect("strings and numbers serialise") + "\n";
-    write_file(&out.join("run.json"), made.as_bytes())?;
+    write_json(&out.join("run.json"), &made)?;
     let table = out.join("stability.csv");
     write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
     let mut rows = Vec::new();

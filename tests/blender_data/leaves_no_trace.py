@@ -1,13 +1,14 @@
-"""Runs the export on the open scene and lists every property, node or slot that it left changed.
+"""Runs the export on the open scene, whose files have colours of their own, and lists every property, node or slot
+that it left changed.
 
-Arguments: the scripts' folder, the .blend, the output folder.
+Arguments: the scripts' folder, the .blend, and those of the export.
 """
 
 import sys
 
 import bpy
 
-scripts, blend, out = sys.argv[1:4]
+scripts, blend, *arguments = sys.argv[1:]
 sys.path.insert(0, scripts)
 import export_passes
 
@@ -17,12 +18,16 @@ settings = scene.render.image_settings
 if hasattr(settings, "media_type"):
     settings.media_type = "IMAGE"
 settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+settings.color_management = "OVERRIDE"
+settings.linear_colorspace_settings.name = "ACEScg"
+settings.view_settings.view_transform, settings.view_settings.exposure = "Standard", 1.5
 scene.frame_set(2, subframe=0.5)
 
 
 def snapshot():
     found = {}
-    owners = [scene, scene.render, scene.render.image_settings, scene.cycles]
+    owners = [scene, scene.render, scene.cycles, settings]
+    owners += [settings.view_settings, settings.display_settings, settings.linear_colorspace_settings]
     owners += [o for layer in scene.view_layers for o in (layer, layer.cycles)]
     for number, owner in enumerate(owners):
         for prop in owner.bl_rna.properties:
@@ -42,8 +47,7 @@ def snapshot():
 
 
 before = snapshot()
-options = export_passes.parse(["unused.blend", "--out", out, "--ref-spp", "1", "--spp", "1", "--vector",
-                               "--resolution", "24x16", "--region", "2,2,8,8", "--frames", "3", "--view-layer", "Main"])
+options = export_passes.parse(["unused.blend", "--ref-spp", "1", "--spp", "1", *arguments])
 options.scene = None  # the open one
 assert export_passes.export(options) == 0
 after = snapshot()

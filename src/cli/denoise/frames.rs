@@ -8,7 +8,7 @@ use std::str::FromStr;
 
 use crate::{
     Error, Result,
-    cli::{inputs::is_exr, lines::warn_line},
+    cli::{inputs::is_missing_folder, lines::warn_line},
     denoise::{Input, frame_number},
 };
 
@@ -64,11 +64,10 @@ impl Frames {
         self.0.iter().any(|span| span.contains(frame))
     }
 
-    /// Whether a file is of one of these frames, or no file but a path that is not there, as that of a folder
-    /// which is not mounted: reading it tells that.
+    /// Whether a file is of one of these frames, or a folder that is not mounted: reading it tells that.
     pub fn has(&self, input: &Input) -> bool {
         let is_of_these = frame_number(&input.file).is_some_and(|frame| self.contains(frame));
-        is_of_these || !(is_exr(&input.file) || input.file.exists())
+        is_of_these || is_missing_folder(&input.file)
     }
 
     /// The files of these frames. Warns of single frames that were asked for and have no file.

@@ -297,9 +297,9 @@ enum Work {
 impl Work {
     fn of(args: &Args, search: &Search) -> Result<Self> {
         let Inputs { files, mut unusable, .. } = inputs::expand(&args.inputs, search)?;
-        // What is not there, and no EXR by its name, is a folder, most likely: it has no place among results.
-        let is_file = |input: &denoise::Input| inputs::is_exr(&input.file) || input.file.exists();
-        let (files, missing): (Vec<_>, Vec<_>) = files.into_iter().partition(is_file);
+        // They have no place among results.
+        let (missing, files): (Vec<_>, Vec<_>) =
+            files.into_iter().partition(|input| inputs::is_missing_folder(&input.file));
         unusable.extend(missing.into_iter().filter_map(|input| {
             let error = std::fs::metadata(&input.file).err()?;
             Some((input.file.clone(), Error::io("read", &input.file)(error)))

@@ -19,6 +19,7 @@ use super::{
     EvalOptions, NOISY,
     palette::colours,
     picture::{self, Picture},
+    plural,
     provenance::Provenance,
     rows::{Row, write_file},
     summary::{MethodSummary, Statistics},
@@ -111,7 +112,8 @@ impl Page<'_> {
         let spp: BTreeSet<u32> = self.scenes.iter().map(|(pair, _)| pair.spp).collect();
         let body = html! {
                     p.faint {
-                        (p.started) ", " (self.options.threads) " thread" (if self.options.threads == 1 { "" } else { "s" }) ", " (p.cpu) ", demc " (p.version)
+                        (p.started) ", " (self.options.threads) " thread" (plural(self.options.threads)) ", " (p.cpu) ", demc "
+                        (p.version)
                     }
                     (self.best())
                     (self.failures())
@@ -147,7 +149,6 @@ impl Page<'_> {
     /// "10 renders, 6 methods".
     fn counted(&self) -> String {
         let methods = self.overall().count();
-        let plural = |n: usize| if n == 1 { "" } else { "s" };
         let renders = self.scenes.len();
         format!("{renders} render{}, {methods} method{}", plural(renders), plural(methods))
     }
