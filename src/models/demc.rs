@@ -183,22 +183,22 @@ impl Encoder {
         Self { units: units.collect() }
     }
 
-    /// The activations before each pool, finest first, and the latent after the last pool.
-    fn forward<T: Tape<f32, Cpu> + Merge<T>>(
-        &self,
-        input: Vec<Activation<T>>,
-    ) -> (Vec<Activation<T>>, Activation<T>) {
+    /// The activation before each pool, finest first. The tape goes with the last: what reads it must read that
+    /// one too, or nothing here is trained.
+    fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, input: Vec<Activation<T>>) -> Vec<Activation<T>> {
         let mut x = input;
-        let mut skips = Vec::with_capacity(self.units.len());
+        let mut skips: Vec<Activation<T>> = Vec::with_capacity(self.units.len());
         for unit in &self.units {
+            if let Some(before) = skips.pop() {
+                skips.push(before.fork());
+                x = vec![MaxPool.forward(before)]; // (N, K, H, W) -> (N, K, H/2, W/2)
+            }
             for conv in unit {
                 x = vec![conv.forward(x)];
             }
-            let before = x.pop().expect("a unit has one output");
-            skips.push(before.fork());
-            x.push(MaxPool.forward(before)); // (N, K, H, W) -> (N, K, H/2, W/2)
+            skips.push(x.pop().expect("a unit has one output"));
         }
-        (skips, x.pop().expect("the last unit has one output"))
+        skips
     }
 }
 
@@ -241,12 +241,12 @@ impl Demc {
         Self { config: Config::new(architecture, widths), fusion, encoders, decoder, output }
     }
 
-    /// The detail map, and each encoder's skips and latent.
+    /// What each encoder hands to the decoder, see [`Encoder::forward`]; the colours' is last.
     fn encode<T: Tape<f32, Cpu> + Merge<T>>(
         &self,
         batch: &Batch,
         stats: &mut Stats,
-    ) -> Vec<(Vec<Activation<T>>, Activation<T>)> {
+    ) -> Vec<Vec<Activation<T>>> {
         let [colour, features] = [0, 1].map(|i| Activation::<T>::input(batch[i].0, &batch[i].1));
         let detail = match &self.fusion {
             Some(fusion) => fusion.forward(features, stats),
@@ -262,18 +262,12 @@ impl Demc {
     }
 
     fn run<T: Tape<f32, Cpu> + Merge<T>>(&self, batch: &Batch, stats: &mut Stats) -> Images<T> {
-        let mut encoded = self.encode::<T>(batch, stats);
-        // The decoder starts from the colour latent (Section 3.2); the feature encoder's latent goes unused.
-        let (colour_skips, mut x) = encoded.pop().expect("there is at least one encoder");
-        let mut skips: Vec<Vec<Activation<T>>> = encoded.into_iter().map(|(skips, _)| skips).collect();
-        skips.push(colour_skips);
+        let mut skips = self.encode::<T>(batch, stats);
+        let mut x = latent(&skips);
         for level in &self.decoder {
             let up = level.up.forward(vec![x]); // (N, K', H, W) -> (N, K, 2H, 2W)
-            let mut sources = vec![up];
-            for encoder in &mut skips {
-                sources.push(encoder.pop().expect("one skip a level"));
-            }
-            x = level.fuse.forward(sources); // Eq. 2: (N, 3K, H, W) -> (N, K, H, W)
+            let skip = skips.iter_mut().map(|encoder| encoder.pop().expect("one skip a level"));
+            x = level.fuse.forward([up].into_iter().chain(skip).collect()); // Eq. 2: (N, 3K, H, W) -> (N, K, H, W)
         }
         let compressed = self.output.forward(vec![x]); // (N, K, H, W) -> (N, 3, H, W)
         powf(softplus(compressed.into_images()), GAMMA)
@@ -287,8 +281,7 @@ impl Demc {
                 (shape, vec![0.0; c * width * height].into())
             })
             .into();
-        let encoded = self.encode::<NoneTape>(&batch, &mut Stats::Running);
-        let shape = encoded.last().expect("there is at least one encoder").1.shape();
+        let shape = latent(&self.encode::<NoneTape>(&batch, &mut Stats::Running)).shape();
         (shape.c, shape.h, shape.w)
     }
 
@@ -303,6 +296,13 @@ impl Demc {
         let decoder = decoder.flat_map(|(level, l)| [(&l.up, level), (&l.fuse, level)]);
         fusion.chain(encoders).chain(decoder).chain([(&self.output, 0)])
     }
+}
+
+/// Where the decoder starts (Section 3.2): the coarsest level of the colours, pooled once more. (N, K, H, W) ->
+/// (N, K, H/2, W/2). The features have no use for theirs.
+fn latent<T: Tape<f32, Cpu> + Merge<T>>(encoded: &[Vec<Activation<T>>]) -> Activation<T> {
+    let coarsest = encoded.last().and_then(|colour| colour.last());
+    MaxPool.forward(coarsest.expect("an encoder has levels").fork())
 }
 
 /// `ln(1 + e^(S x)) / S`: like a ReLU, but with a gradient on either side, so that a step too far can be
