@@ -30,8 +30,10 @@ for name in "$@"; do
             --every $((steps / 15 > 0 ? steps / 15 : 1))"
     fi
     # shellcheck disable=SC2086 # the options are words
-    "$demc" train --out "$out/$name" $set_up 2>>"$out/$name.log" &
+    "$demc" train --out "$out/$name" $set_up --threads 1 2>>"$out/$name.log" &
     pid=$!
+    # A shell's background jobs do not hear Ctrl-C.
+    trap 'kill -TERM $pid 2>/dev/null; wait $pid; exit 130' INT TERM HUP
     used=$spent
     while kill -0 $pid 2>/dev/null; do
         sleep 1

@@ -39,8 +39,10 @@ for name in "$@"; do
         rm -rf "$run"
         # shellcheck disable=SC2046 # the options are words
         "$demc" train --data "$data" --val "$held_out" --out "$run" --every "$steps" $(options "$name" "$steps") \
-            2>"$run.log" &
+            --threads 1 2>"$run.log" &
         pid=$!
+        # A shell's background jobs do not hear Ctrl-C.
+        trap 'kill -TERM $pid 2>/dev/null; wait $pid; exit 130' INT TERM HUP
         used=0
         while time=$(ps -o cputimes= -p $pid | tr -d ' ') && [ -n "$time" ]; do
             used=$time

@@ -164,15 +164,22 @@ fn usage(message: impl Into<String>) -> Error {
     Error::Usage(message.into())
 }
 
-/// All pairs of several test sets; a file without its counterpart is named.
+/// All pairs of several test sets, each once however often it is named; a file without its counterpart is named.
 fn all_pairs(specs: &[String]) -> Result<Vec<Pair>> {
-    let mut pairs = Vec::new();
+    let (mut pairs, mut seen) = (Vec::new(), HashSet::new());
     for spec in specs {
         let set = testset::read(spec)?;
         set.unmatched.iter().for_each(|unmatched| warn_line(&format!("warning: {unmatched}")));
-        pairs.extend(set.pairs);
+        pairs.extend(
+            set.pairs.into_iter().filter(|pair| seen.insert([&pair.noisy, &pair.reference].map(same))),
+        );
     }
     Ok(pairs)
+}
+
+/// A file by one path, in however many ways it may have been typed.
+fn same(file: &PathBuf) -> PathBuf {
+    fs::canonicalize(file).unwrap_or_else(|_| file.clone())
 }
 
 /// Whether a pair is held out: decided by its view, so that every sample count, seed, frame and crop of a view
@@ -218,13 +225,14 @@ fn from_anywhere(mut pairs: Vec<Pair>) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Whether the noisy frame of a pair holds what KPCN's two streams read.
-fn has_light_passes(pair: &Pair) -> Result<bool> {
-    let frame = Frame::read(&pair.noisy)?;
+/// Whether the noisy frame of a pair holds what KPCN's two streams read. A file that cannot be read is told of where it is
+/// needed.
+fn has_light_passes(pair: &Pair) -> bool {
+    let Ok(frame) = Frame::read_headers(&pair.noisy) else { return true };
     let layers = passes::layers(&frame);
-    let layer = passes::choose(&frame, &layers, None)?;
     let light = [Pass::DiffuseDirect, Pass::DiffuseIndirect, Pass::DiffuseColor];
-    Ok(light.iter().all(|pass| layer.passes.contains_key(pass)))
+    passes::choose(&frame, &layers, None)
+        .map_or(true, |layer| light.iter().all(|pass| layer.passes.contains_key(pass)))
 }
 
 impl Args {
@@ -243,7 +251,17 @@ impl Args {
             network.widths = models::widths(network.architecture, widths);
         }
         if let Some(path) = &self.prefilter {
+            if network.prefilter.is_empty() {
+                return Err(usage(format!("--prefilter: {} has no prefilter; leave it out", self.model)));
+            }
             network.prefilter = weights_file::prefilter_widths(path)?;
+        } else if let Some(path) = &self.init
+            && !network.prefilter.is_empty()
+        {
+            let own = weights_file::config(path)?.prefilter;
+            if !own.is_empty() {
+                network.prefilter = own;
+            }
         }
         let pairs = all_pairs(&self.data)?;
         let (validation, training) = if self.val.is_empty() {
@@ -255,12 +273,11 @@ impl Args {
         } else {
             (all_pairs(&self.val)?, pairs)
         };
-        // The same file may have been typed in different ways.
-        let file = |p: &Pair| fs::canonicalize(&p.reference).unwrap_or_else(|_| p.reference.clone());
-        let validated: HashSet<PathBuf> = validation.iter().map(file).collect();
-        if let Some(pair) = training.iter().find(|p| validated.contains(&file(p))) {
+        let files = |p: &'_ Pair| [p.noisy.clone(), p.reference.clone()];
+        let validated: HashSet<PathBuf> = validation.iter().flat_map(files).map(|file| same(&file)).collect();
+        if let Some(file) = training.iter().flat_map(files).find(|file| validated.contains(&same(file))) {
             return Err(Error::invalid(
-                &pair.reference,
+                file,
                 "is both trained on and validated on; give --val other scenes than --data",
             ));
         }
@@ -274,12 +291,21 @@ impl Args {
                 "note: no scene is held out, so nothing tells the best weights from the last: name some with --val",
             );
         }
-        if network.architecture == Architecture::Kpcn && !has_light_passes(&training[0])? {
-            warn_line(&format!(
-                "note: {} holds no diffuse light passes: kpcn is trained on Combined, as kpcn-combined",
-                training[0].noisy.display()
-            ));
-            network.architecture = Architecture::KpcnCombined;
+        if network.architecture == Architecture::Kpcn {
+            let pairs = || training.iter().chain(&validation);
+            let lacking: Vec<&Pair> = pairs().filter(|pair| !has_light_passes(pair)).collect();
+            if let [first, ..] = lacking[..] {
+                if lacking.len() < pairs().count() {
+                    return Err(Error::invalid(
+                        &first.noisy,
+                        "holds no diffuse light passes, which other pairs do; leave it out, or train --model kpcn-combined",
+                    ));
+                }
+                warn_line(
+                    "note: no pair holds diffuse light passes: kpcn is trained on Combined, as kpcn-combined",
+                );
+                network.architecture = Architecture::KpcnCombined;
+            }
         }
         let options = TrainOptions {
             network,
@@ -348,6 +374,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 "holds a run already; pass --resume to go on with it, or another --out",
             ));
         }
+        // Without its configuration a run cannot be resumed, but its weights may be somebody's only ones.
+        if let Some(name) =
+            ["best.safetensors", "last.safetensors"].iter().find(|name| args.out.join(name).exists())
+        {
+            return Err(Error::invalid(
+                args.out.join(name),
+                "would be replaced; choose another --out, or move these weights away",
+            ));
+        }
         args.options()?
     };
     warn_line(&format!(
@@ -392,7 +427,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     match train::run(&options, &args.out, args.resume, &stop, &mut on) {
         Err(Error::Interrupted) => {
             let out = args.out.display();
-            warn_line(&format!("stopped; go on with: demc train --out {out} --resume"));
+            warn_line(&match config.exists() {
+                true => format!("stopped; go on with: demc train --out {out} --resume"),
+                false => "stopped before the first step".into(),
+            });
             Ok(ExitCode::from(super::stop::INTERRUPTED))
         }
         other => other.map(|()| ExitCode::SUCCESS),

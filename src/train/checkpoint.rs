@@ -68,7 +68,10 @@ pub fn check_size(path: &Path, config: &Config) -> Result<()> {
     models::check(config).map_err(|reason| Error::Usage(format!("network: {reason}")))?;
     let bytes = std::fs::metadata(path).map_err(Error::io("read", path))?.len();
     if bytes / (size_of::<f32>() as u64) < models::least_parameters(config) as u64 {
-        let why = format!("is too small to hold {config}; give \"network\" in config.json its widths again");
+        let why = format!(
+            "is too small to hold {config}; give \"network\" in config.json its widths again, or train anew if the file is \
+             damaged"
+        );
         return Err(Error::invalid(path, why));
     }
     Ok(())

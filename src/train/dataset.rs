@@ -1,6 +1,9 @@
 //! Training frames in memory, and the crops drawn from them.
 
-use std::collections::HashMap;
+use std::{
+    collections::HashMap,
+    sync::atomic::{AtomicBool, Ordering},
+};
 
 use half::{f16, slice::HalfFloatSliceExt, vec::HalfFloatVecExt};
 use rayon::prelude::*;
@@ -53,6 +56,10 @@ pub struct Sample {
     pub raw_reference: Option<Planes>,
 }
 
+/// Single values of a reference that are not finite are filled in from their neighbours; of more than one in so many,
+/// some lie together and would be learned as black.
+const MOST_HOLES: usize = 1000;
+
 /// The training copy of a pass, (C, H, W).
 #[cfg_attr(test, derive(Clone))]
 enum Values {
@@ -98,18 +105,21 @@ impl Dataset {
     /// smaller than `least` in either direction are an error, since no crop fits them.
     ///
     /// # Errors
-    /// A file is unreadable, lacks a pass, or the two of a pair differ in size.
+    /// A file is unreadable, lacks a pass, the two of a pair differ in size, or a reference has holes; or `stop` was
+    /// set meanwhile.
     pub fn load(
         pairs: &[Pair],
         passes: (&[Pass], &[Pass]),
         targets: &[Pass],
         raw_references: bool,
         least: usize,
+        stop: &AtomicBool,
     ) -> Result<Self> {
-        let frames: Vec<Stored> = pairs
-            .par_iter()
-            .map(|pair| Stored::load(pair, passes, targets, raw_references, least))
-            .collect::<Result<_>>()?;
+        let load = |pair| match stop.load(Ordering::Relaxed) {
+            true => Err(Error::Interrupted),
+            false => Stored::load(pair, passes, targets, raw_references, least),
+        };
+        let frames: Vec<Stored> = pairs.par_iter().map(load).collect::<Result<_>>()?;
         Ok(Self::of(frames))
     }
 
@@ -120,6 +130,11 @@ impl Dataset {
             total
         });
         Self { pixels: pixels.collect(), seeds: seeds(&frames), frames }
+    }
+
+    /// Whether some reference is held as it was before it was denoised.
+    pub fn has_raw_references(&self) -> bool {
+        self.frames.iter().any(|stored| stored.raw_reference.is_some())
     }
 
     /// Frames held.
@@ -239,8 +254,8 @@ impl Stored {
     ) -> Result<Self> {
         let noisy = shot::prepare(&pair.noisy, None)?.passes;
         noisy.require_all(needed.iter().copied(), "training")?;
-        let mut reference = passes::load_like(&pair.reference, &noisy.view_layer)?;
-        reference.sanitize();
+        let mut reference = passes::load_like(&pair.reference, &noisy)?;
+        let filled_in = reference.sanitize();
         reference.require_all(targets.iter().copied(), "training")?;
         noisy.check_same_pixels(&reference, "its reference")?;
         if noisy.width.min(noisy.height) < least {
@@ -264,6 +279,16 @@ impl Stored {
             [Some(noisy), Some(clean)] => pairing::warning(pair.noisy.display(), noisy, clean),
             _ => None,
         };
+        let holes = targets.iter().chain(raw.map(|_| &Pass::NoisyImage));
+        let holes: usize = holes.filter_map(|pass| filled_in.get(pass)).sum();
+        let values = 3 * noisy.width * noisy.height;
+        let told = format!("{holes} of the values to learn are NaN or infinite");
+        if holes * MOST_HOLES > values {
+            let why = format!("{told}; render the reference again, or leave the pair out");
+            return Err(Error::invalid(&pair.reference, why));
+        }
+        let filled_in = format!("{}: {told}, and were filled in from around", pair.reference.display());
+        let warning = (holes > 0).then_some(filled_in).or(warning);
         Ok(Self {
             pair: pair.clone(),
             view_layer: noisy.view_layer.clone(),
@@ -408,8 +433,9 @@ mod tests {
 
     /// The only frame of a dataset of one pair, with one pass and Combined as its target.
     fn only(pair: Pair, pass: Pass) -> Sample {
-        let data = Dataset::load(&[pair], (&[pass], &[]), &[Pass::Combined], false, 1).unwrap();
-        data.frame(0).1
+        let data =
+            Dataset::load(&[pair], (&[pass], &[]), &[Pass::Combined], false, 1, &AtomicBool::new(false));
+        data.unwrap().frame(0).1
     }
 
     #[test]
@@ -436,6 +462,33 @@ mod tests {
     }
 
     #[test]
+    fn single_bad_values_of_references_are_told_and_holes_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let load = |bad: usize| {
+            let mut pair = room();
+            let mut frame = Frame::read(&pair.reference).unwrap();
+            let values: Vec<f32> = (0..128 * 128).map(|i| if i < bad { f32::NAN } else { 0.5 }).collect();
+            let channels = ["R", "G", "B"].map(|component| NewChannel {
+                component,
+                kind: SampleKind::Float,
+                values: &values,
+            });
+            frame.set_layer(0, "ViewLayer.Combined", None, &channels).unwrap();
+            pair.reference = folder.path().join("room_ref.exr");
+            frame.write(&pair.reference).unwrap();
+            let none = AtomicBool::new(false);
+            Dataset::load(&[pair], (&[Pass::Combined], &[]), &[Pass::Combined], false, 1, &none)
+        };
+        let told: Vec<String> = load(2).unwrap().warnings().cloned().collect();
+        assert!(told[0].contains("room_ref.exr: 6 of the values to learn are NaN"), "{told:?}");
+        let refused = load(300).err().expect("a hole").to_string();
+        assert!(
+            refused.contains("room_ref.exr: 900 of the values") && refused.contains("render"),
+            "{refused}"
+        );
+    }
+
+    #[test]
     fn frames_that_hold_no_crop_at_all_are_named() {
         let pair = room();
         let load = |least| {
@@ -445,6 +498,7 @@ mod tests {
                 &[Pass::Combined],
                 false,
                 least,
+                &AtomicBool::new(false),
             )
         };
         assert_eq!(load(128).map(|data| data.len()).ok(), Some(1));

@@ -18,6 +18,7 @@ use crate::{
 /// Everything that decides a run's result. It is written to the run folder as `config.json` once all pairs
 /// have been read, so a folder without that file is free for a new run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct TrainOptions {
     /// The network.
     pub network: Config,

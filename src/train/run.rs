@@ -1,6 +1,8 @@
 //! The training loop.
 
 use std::{
+    collections::BTreeSet,
+    fs::{File, TryLockError},
     io::Write,
     path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
@@ -51,8 +53,15 @@ pub enum TrainEvent {
 /// A run is given up where a row of the log is due and at least this many steps in a row were skipped.
 const MOST_SKIPPED: usize = 10;
 
+/// What to do where a run fell apart.
+const SLOWER: &str = "lower \"lr\" in its config.json and pass --resume to go on from the checkpoint before, or train \
+                      anew with a lower --lr";
+
 /// Seconds between checkpoints, which is about the most that is lost when a run is killed.
 const CHECKPOINT_SECONDS: f64 = 60.0;
+
+/// The file of a run folder that holds the log.
+const LOG: &str = "log.csv";
 
 /// Validation errors below this count as this.
 const LEAST_RELMSE: f64 = 1e-6;
@@ -63,7 +72,8 @@ const LEAST_RELMSE: f64 = 1e-6;
 /// before are still good.
 ///
 /// # Errors
-/// A pair is unusable, the run folder cannot be read or written, or step after step had no finite gradient.
+/// A pair is unusable, the run folder cannot be read or written or another run works in it, or step after step had
+/// no finite gradient.
 pub fn run(
     options: &TrainOptions,
     out: &Path,
@@ -72,106 +82,225 @@ pub fn run(
     on: &mut dyn FnMut(TrainEvent),
 ) -> Result<()> {
     prepare_folder(out)?;
-    let (log_path, checkpoint_path) = (out.join("log.csv"), out.join(CHECKPOINT));
-    if resume {
-        if !checkpoint_path.exists() {
-            let why = "is missing, and without it a run cannot go on; begin another one in another --out, with the weights \
-                       of this one for --init";
-            return Err(Error::invalid(&checkpoint_path, why));
-        }
-        checkpoint::check_size(&checkpoint_path, &options.network)?;
-    }
-    let mut network = match &options.init {
-        Some(path) if !resume => weights_file::read_as(path, &options.network, options.seed)?,
-        _ => models::build(&options.network, options.seed),
-    };
-    // A checkpoint holds every parameter, those of the prefilter too: the files that gave them may be gone.
-    if !resume {
-        set_prefilter(&mut *network, options)?;
-    }
-    network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
-    train_only(&mut *network, &options.only)?;
-    let mut average = network.duplicate();
-    let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
-    let mut progress = Progress::default();
-    if resume {
-        progress = checkpoint::load(&checkpoint_path, &mut *network, &mut *average, &mut optimizer)?;
-    }
-    let mut rows = log::read(&log_path, progress.step)?;
-    if progress.step >= options.steps {
+    let _lock = lock(out)?;
+    let mut run = Run::begin(options, out, resume)?;
+    if run.progress.step >= options.steps {
+        on(TrainEvent::Warning(format!(
+            "{}: all {} steps are done; to go on, give \"steps\" in config.json a larger number",
+            out.display(),
+            options.steps
+        )));
         return Ok(());
     }
-    let wanted = (network.passes(), network.optional_passes());
-    let least = network.multiple().max(options.loss.least_side());
-    let targets = network.targets();
-    let training = Dataset::load(&options.train, wanted, targets, options.raw_references, least)?;
-    let validation = Dataset::load(&options.validation, wanted, targets, false, 1)?;
+    let (training, validation) = run.load(stop)?;
     if !resume {
-        let config = out.join("config.json");
-        let text = serde_json::to_string_pretty(options).expect("options serialise");
-        // The checkpoint comes first: config.json promises that --resume needs none of the files that this
-        // run began with.
-        checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
-        atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))?;
+        run.store_config()?;
     }
-    training
-        .warnings()
-        .chain(validation.warnings())
-        .for_each(|warning| on(TrainEvent::Warning(warning.clone())));
-    let (mut since, mut saved) = (Instant::now(), Instant::now());
-    while progress.step < options.steps {
-        let samples = draw(&training, options, network.multiple(), progress.step);
+    let warnings = training.warnings().chain(validation.warnings());
+    warnings.for_each(|warning| on(TrainEvent::Warning(warning.clone())));
+    if options.raw_references && !training.has_raw_references() {
+        let why = "no reference holds a Noisy Image, so --raw-references changes nothing";
+        on(TrainEvent::Warning(why.into()));
+    }
+    run.train(&training, &validation, stop, on)
+}
+
+/// Keeps other runs out of a folder until it is dropped, where the disk knows locks.
+///
+/// # Errors
+/// Another run works there, or no file can be made.
+fn lock(out: &Path) -> Result<File> {
+    let path = out.join(".lock");
+    let file = File::create(&path).map_err(Error::io("write", &path))?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(Error::invalid(
+            out,
+            "another demc train works in this folder; wait for it, or choose another --out",
+        )),
+        _ => Ok(file),
+    }
+}
+
+/// A run under way.
+struct Run<'a> {
+    options: &'a TrainOptions,
+    out: &'a Path,
+    network: Box<dyn Network>,
+    /// Its weights averaged over steps: what is validated and kept.
+    average: Box<dyn Network>,
+    optimizer: Optimizer,
+    progress: Progress,
+    /// Rows of the log.
+    rows: Vec<log::LogRow>,
+    /// Layers that were found to give nothing.
+    silent: BTreeSet<String>,
+    /// When `progress.seconds` was last brought up to date.
+    since: Instant,
+    /// When the state was last saved.
+    saved: Instant,
+}
+
+impl<'a> Run<'a> {
+    /// Sets up the network and what trains it, anew or from the checkpoint.
+    fn begin(options: &'a TrainOptions, out: &'a Path, resume: bool) -> Result<Self> {
+        let checkpoint = out.join(CHECKPOINT);
+        if resume {
+            if !checkpoint.exists() {
+                let why = "is missing, and without it a run cannot go on; begin another one in another --out, with the \
+                           weights of this one for --init";
+                return Err(Error::invalid(&checkpoint, why));
+            }
+            checkpoint::check_size(&checkpoint, &options.network)?;
+        }
+        let mut network = match &options.init {
+            Some(path) if !resume => weights_file::read_as(path, &options.network, options.seed)?,
+            _ => models::build(&options.network, options.seed),
+        };
+        // A checkpoint holds every parameter, those of the prefilter too: the files that gave them may be gone.
+        if !resume {
+            set_prefilter(&mut *network, options)?;
+        }
+        network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
+        train_only(&mut *network, &options.only)?;
+        let mut average = network.duplicate();
+        let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
+        let mut progress = Progress::default();
+        if resume {
+            progress = checkpoint::load(&checkpoint, &mut *network, &mut *average, &mut optimizer)?;
+        }
+        let rows = log::read(&out.join(LOG), progress.step)?;
+        let now = Instant::now();
+        let silent = BTreeSet::new();
+        Ok(Self { options, out, network, average, optimizer, progress, rows, silent, since: now, saved: now })
+    }
+
+    /// Reads the pairs: those to train on, and those to validate on.
+    fn load(&self, stop: &AtomicBool) -> Result<(Dataset, Dataset)> {
+        let Self { options, network, .. } = self;
+        let wanted = (network.passes(), network.optional_passes());
+        let least = network.multiple().max(options.loss.least_side());
+        let targets = network.targets();
+        let training = Dataset::load(&options.train, wanted, targets, options.raw_references, least, stop)?;
+        Ok((training, Dataset::load(&options.validation, wanted, targets, false, 1, stop)?))
+    }
+
+    /// Stores the state and the settings. The checkpoint comes first: config.json promises that --resume needs none
+    /// of the files that this run began with.
+    fn store_config(&mut self) -> Result<()> {
+        self.save()?;
+        let config = self.out.join("config.json");
+        let text = serde_json::to_string_pretty(self.options).expect("options serialise");
+        atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))
+    }
+
+    fn save(&mut self) -> Result<()> {
+        let path = self.out.join(CHECKPOINT);
+        checkpoint::save(&path, &self.progress, &mut *self.network, &mut *self.average, &mut self.optimizer)?;
+        self.saved = Instant::now();
+        Ok(())
+    }
+
+    /// Takes the steps that are left.
+    fn train(
+        &mut self,
+        training: &Dataset,
+        validation: &Dataset,
+        stop: &AtomicBool,
+        on: &mut dyn FnMut(TrainEvent),
+    ) -> Result<()> {
+        (self.since, self.saved) = (Instant::now(), Instant::now());
+        loop {
+            let finite = self.step(training, on)?;
+            let last = self.progress.step == self.options.steps;
+            if self.progress.step.is_multiple_of(self.options.every) || last {
+                self.log(validation, on)?;
+            }
+            let stopping = stop.load(Ordering::Relaxed);
+            let due = stopping || self.saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS;
+            if last || (due && finite) {
+                self.count_seconds();
+                self.save()?;
+            }
+            match (last, stopping) {
+                (true, _) => return Ok(()),
+                (false, true) => return Err(Error::Interrupted),
+                _ => {}
+            }
+        }
+    }
+
+    /// Takes a step. Returns whether it had a finite gradient; if not, nothing changed.
+    fn step(&mut self, training: &Dataset, on: &mut dyn FnMut(TrainEvent)) -> Result<bool> {
+        let Self { options, network, progress, .. } = self;
+        let samples = draw(training, options, network.multiple(), progress.step);
         let lr = learning_rate(options.lr, options.steps, progress.step);
-        let (loss, finite) = step(&mut *network, &mut optimizer, options, lr, progress.step + 1, &samples)?;
         progress.step += 1;
+        let (loss, finite) = step(&mut **network, &mut self.optimizer, options, lr, progress.step, &samples)?;
         if finite {
             progress.losses.0 += loss;
             progress.losses.1 += 1;
-            follow(&mut *average, &mut *network, options.average, progress.step);
+            follow(&mut *self.average, &mut **network, options.average, progress.step);
         } else {
             progress.skipped += 1;
         }
         on(TrainEvent::Step { step: progress.step, loss });
-        let last = progress.step == options.steps;
-        if progress.step % options.every == 0 || last {
-            progress.seconds += since.elapsed().as_secs_f64();
-            let (sum, count) = std::mem::take(&mut progress.losses);
-            report_skipped(progress.skipped, count, out, on)?;
-            if count > 0 {
-                progress.skipped = 0;
-            }
-            let score = validate(&mut *average, &validation)?;
-            let row = log::LogRow {
-                step: progress.step,
-                seconds: (progress.seconds * 10.0).round() / 10.0,
-                lr,
-                train_loss: (count > 0).then(|| sum / count as f64),
-                val_relmse: score.map(|s| s.0),
-                val_ssim: score.and_then(|s| s.1),
-            };
-            rows.push(row.clone());
-            log::write(&log_path, &rows)?;
-            // Without validation frames the latest weights are the best known.
-            weights_file::write(&out.join("last.safetensors"), &mut *average, &facts(options, &row))?;
-            if row.val_relmse.is_none_or(|v| progress.best.is_none_or(|best| v < best)) {
-                progress.best = row.val_relmse;
-                weights_file::write(&out.join("best.safetensors"), &mut *average, &facts(options, &row))?;
-            }
-            on(TrainEvent::Logged(rows.clone()));
-            since = Instant::now();
+        Ok(finite)
+    }
+
+    /// Validates, adds a row to the log and writes the weights.
+    fn log(&mut self, validation: &Dataset, on: &mut dyn FnMut(TrainEvent)) -> Result<()> {
+        self.count_seconds();
+        let progress = &mut self.progress;
+        let (sum, count) = std::mem::take(&mut progress.losses);
+        report_skipped(progress.skipped, count, self.out, on)?;
+        if count > 0 {
+            progress.skipped = 0;
         }
-        let stopping = stop.load(Ordering::Relaxed);
-        let due = stopping || saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS;
-        if last || (due && finite) {
-            progress.seconds += std::mem::replace(&mut since, Instant::now()).elapsed().as_secs_f64();
-            checkpoint::save(&checkpoint_path, &progress, &mut *network, &mut *average, &mut optimizer)?;
-            saved = Instant::now();
+        let score = validate(&mut *self.average, validation, self.out)?;
+        let row = log::LogRow {
+            step: progress.step,
+            seconds: (progress.seconds * 10.0).round() / 10.0,
+            lr: learning_rate(self.options.lr, self.options.steps, progress.step - 1),
+            train_loss: (count > 0).then(|| sum / count as f64),
+            val_relmse: score.map(|s| s.0),
+            val_ssim: score.and_then(|s| s.1),
+        };
+        self.rows.push(row.clone());
+        log::write(&self.out.join(LOG), &self.rows)?;
+        // Without validation frames the latest weights are the best known.
+        let facts = facts(self.options, &row);
+        weights_file::write(&self.out.join("last.safetensors"), &mut *self.average, &facts)?;
+        if row.val_relmse.is_none_or(|v| progress.best.is_none_or(|best| v < best)) {
+            progress.best = row.val_relmse;
+            weights_file::write(&self.out.join("best.safetensors"), &mut *self.average, &facts)?;
         }
-        if stopping && !last {
-            return Err(Error::Interrupted);
+        on(TrainEvent::Logged(self.rows.clone()));
+        self.report_silent(on);
+        self.since = Instant::now();
+        Ok(())
+    }
+
+    /// Warns of layers whose ReLUs let nothing through on any frame of the validation: no gradient passes them either,
+    /// so that what leads to them learns no more.
+    fn report_silent(&mut self, on: &mut dyn FnMut(TrainEvent)) {
+        let convolutions = self.average.convolutions().into_iter();
+        let found = convolutions.filter(|conv| conv.range == Some(0.0));
+        let found: Vec<String> =
+            found.map(|conv| conv.weight.name.trim_end_matches(".weight").into()).collect();
+        let new: Vec<String> = found.into_iter().filter(|name| self.silent.insert(name.clone())).collect();
+        if !new.is_empty() {
+            on(TrainEvent::Warning(format!(
+                "nothing passes the ReLUs of {} any more, and what leads there is no longer trained; train anew with a \
+                 lower --lr or more --weight-decay",
+                new.join(", ")
+            )));
         }
     }
-    Ok(())
+
+    fn count_seconds(&mut self) {
+        let passed = std::mem::replace(&mut self.since, Instant::now()).elapsed();
+        self.progress.seconds += passed.as_secs_f64();
+    }
 }
 
 /// Warns of skipped steps. `skipped` and `taken` count the steps since the last row of the log before which
@@ -183,10 +312,7 @@ fn report_skipped(skipped: usize, taken: usize, out: &Path, on: &mut dyn FnMut(T
     if taken == 0 && skipped >= MOST_SKIPPED {
         return Err(Error::invalid(
             out,
-            format!(
-                "none of the last {skipped} steps had a finite gradient; lower \"lr\" in its config.json and pass \
-                 --resume to go on from the checkpoint before, or train anew with a lower --lr"
-            ),
+            format!("none of the last {skipped} steps had a finite gradient; {SLOWER}"),
         ));
     }
     if skipped > 0 {
@@ -299,7 +425,7 @@ fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step
 
 /// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames. The layers of `trained`
 /// learn what range their outputs have there.
-fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, Option<f64>)>> {
+fn validate(trained: &mut dyn Network, frames: &Dataset, out: &Path) -> Result<Option<(f64, Option<f64>)>> {
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
     let mut network = trained.duplicate();
     network.freeze();
@@ -309,7 +435,10 @@ fn validate(trained: &mut dyn Network, frames: &Dataset) -> Result<Option<(f64, 
         let image = network.infer(&sample.passes, None)?;
         let (image, reference) = (&image, &network.target(&sample.reference)?);
         if image.non_finite() > 0 {
-            return Err(Error::invalid(name, "the network's output is not finite; lower --lr"));
+            return Err(Error::invalid(
+                out,
+                format!("the network's output on {name} is not finite; {SLOWER}"),
+            ));
         }
         // A black frame that is exact would outweigh all others.
         logs.push(metrics::error::relmse(image, reference).max(LEAST_RELMSE).ln());
