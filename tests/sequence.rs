@@ -44,10 +44,23 @@ struct Shot {
     seed: u32,
     /// Light from column `shadow + 3 * frame` on is a third.
     shadow: Option<f32>,
+    /// By how much the light of frames of odd numbers is more, and that of the others less.
+    flicker: f32,
+    /// The light of a lamp that guides and vectors do not know, twelve columns further in each frame.
+    lamp: f32,
 }
 
-const SHOT: Shot =
-    Shot { speed: 2.0, vectors: true, vector_scale: 1.0, scene: 0, size: SIZE, seed: 1, shadow: None };
+const SHOT: Shot = Shot {
+    speed: 2.0,
+    vectors: true,
+    vector_scale: 1.0,
+    scene: 0,
+    size: SIZE,
+    seed: 1,
+    shadow: None,
+    flicker: 0.0,
+    lamp: 0.0,
+};
 
 /// A number from 0 to 1 that depends on all of `parts`.
 fn random(parts: [u32; 3]) -> f32 {
@@ -67,14 +80,25 @@ impl Shot {
     }
 
     fn light(&self, x: f32, frame: i64) -> f32 {
-        match self.shadow {
+        let light = match self.shadow {
             Some(edge) if x > edge + 3.0 * frame as f32 => 0.3,
             _ => 0.9,
-        }
+        };
+        light * if frame % 2 == 0 { 1.0 - self.flicker } else { 1.0 + self.flicker }
+    }
+
+    /// Whether a pixel of a frame shows the lamp.
+    fn is_lamp(&self, i: usize, frame: i64) -> bool {
+        let (x, y) = (i % self.size.0, i / self.size.0);
+        let first = 12 * frame as usize;
+        self.lamp > 0.0 && (first..first + 6).contains(&x) && (12..18).contains(&y)
     }
 
     /// Combined without noise.
     fn truth(&self, c: usize, i: usize, frame: i64) -> f32 {
+        if self.is_lamp(i, frame) {
+            return self.lamp;
+        }
         let place = ((i % self.size.0) as f32, (i / self.size.0) as f32);
         self.light(place.0, frame) * self.albedo(c, place, frame)
     }
@@ -296,7 +320,7 @@ fn ends_gaps_and_frames_that_do_not_fit_are_told() {
     // A neighbour that cannot be read.
     cut.write(&named(&dir, 18), 18);
     let assert = demc(&out).arg(named(&dir, 18)).arg("--temporal").assert().success();
-    assert.stderr(contains("frame 17 cannot be read"));
+    assert.stderr(contains("frame 17 cannot be used"));
 }
 
 #[test]
@@ -331,6 +355,103 @@ fn a_shadow_that_vectors_do_not_know_is_not_dragged() {
         let [with, without] = [&out, &alone].map(|dir| shot.error(&result(dir, n), "ViewLayer.Denoised", n));
         assert!(with < 0.7 * without, "frame {n}: {with} beside {without}");
     }
+}
+
+#[test]
+fn light_that_flickers_stays_as_it_is() {
+    for flicker in [0.08, 0.15, 0.4] {
+        let shot = Shot { flicker, ..SHOT };
+        let dir = sequence(shot, 1..=5);
+        let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+        demc(&alone).arg(dir.path()).assert().success();
+        let said =
+            demc(&out).arg(dir.path()).arg("--temporal").assert().success().get_output().stderr.clone();
+        // Frames next to one whose light is all but another's are left out.
+        let is_left_out = flicker > 0.3;
+        assert_eq!(String::from_utf8(said).unwrap().contains("times as bright"), is_left_out, "{flicker}");
+        for n in 2..=4 {
+            let [with, without] =
+                [&out, &alone].map(|dir| shot.error(&result(dir, n), "ViewLayer.Denoised", n));
+            assert!(
+                with < if is_left_out { 1.01 } else { 0.7 } * without,
+                "{flicker}, {n}: {with} beside {without}"
+            );
+            let mean = |of: &dyn Fn(usize) -> f32| (0..SIZE.0 * SIZE.1).map(of).sum::<f32>();
+            let image = read_exr(result(&out, n));
+            let got = values(&image, "ViewLayer.Denoised.G");
+            let level = mean(&|i| got[i]) / mean(&|i| shot.truth(1, i, n));
+            assert!((level - 1.0).abs() < 0.02, "{flicker}, frame {n}: {level}");
+        }
+    }
+}
+
+#[test]
+fn a_lamp_leaves_nothing_where_it_was_nor_where_it_will_be() {
+    let shot = Shot { speed: 0.0, lamp: 1e5, ..SHOT };
+    let dir = sequence(shot, 0..=3);
+    let out = dir.path().join("out");
+    demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+    for n in 0..=3 {
+        let image = read_exr(result(&out, n));
+        let got = values(&image, "ViewLayer.Denoised.R");
+        let elsewhere = (0..got.len()).filter(|i| !shot.is_lamp(*i, n));
+        let most = elsewhere.map(|i| got[i]).fold(0.0, f32::max);
+        assert!(most < 2.0, "frame {n}: {most}");
+    }
+}
+
+#[test]
+fn a_frame_of_more_samples_takes_little_of_those_of_fewer() {
+    let dir = sequence(SHOT, 1..=5);
+    // A noisier render of fewer samples would take from the noiseless one what it can.
+    let channels = SHOT.channels("ViewLayer", "", 3);
+    let mut attributes = LayerAttributes::default();
+    let samples = exr::meta::attribute::AttributeValue::Text("4096".into());
+    attributes.other.insert("cycles.ViewLayer.samples".into(), samples);
+    let channels = channels.into_iter().map(|mut channel| {
+        if let Some(c) =
+            ["R", "G", "B"].iter().position(|c| channel.name.eq(&format!("ViewLayer.Combined.{c}")))
+        {
+            channel.sample_data =
+                FlatSamples::F32((0..SIZE.0 * SIZE.1).map(|i| SHOT.truth(c, i, 3)).collect());
+        }
+        channel
+    });
+    let layer = Layer::new(SIZE, attributes, Encoding::SMALL_LOSSLESS, AnyChannels::sort(channels.collect()));
+    Image::from_layer(layer).write().to_file(named(&dir, 3)).unwrap();
+    let out = dir.path().join("out");
+    demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+    let error = SHOT.error(&result(&out, 3), "ViewLayer.Denoised", 3);
+    assert!(error < 1e-5, "{error}");
+    let alone = dir.path().join("alone");
+    demc(&alone).arg(named(&dir, 2)).assert().success();
+    let [with, without] = [&out, &alone].map(|dir| SHOT.error(&result(dir, 2), "ViewLayer.Denoised", 2));
+    assert!(with < 0.7 * without, "{with} beside {without}");
+}
+
+#[test]
+fn results_of_single_frames_are_not_taken_for_those_with_neighbours() {
+    let dir = sequence(SHOT, 1..=3);
+    let out = dir.path().join("out");
+    demc(&out).arg(dir.path()).assert().success();
+    let refused = demc(&out).arg(dir.path()).arg("--temporal").assert().code(1);
+    refused.stderr(contains("exists without its neighbours (--temporal 2)").and(contains("--overwrite")));
+    demc(&out).arg(dir.path()).args(["--temporal", "1", "--overwrite"]).assert().success();
+    demc(&out).arg(dir.path()).args(["--temporal", "2"]).assert().code(1);
+    demc(&out).arg(dir.path()).args(["--temporal", "1"]).assert().success();
+    demc(&out).arg(dir.path()).assert().success().stdout(contains("3 already there"));
+}
+
+#[test]
+fn frames_beside_one_that_cannot_be_used_are_done_once() {
+    let dir = sequence(SHOT, 1..=4);
+    // It reads well, but has not this view layer.
+    write_channels(&named(&dir, 3), SIZE, SHOT.channels("Other", "", 3), &[]);
+    let out = dir.path().join("out");
+    let arguments = ["--temporal", "--view-layer", "ViewLayer"];
+    demc(&out).arg(dir.path()).args(arguments).assert().code(1).stderr(contains("frame 3 cannot be used"));
+    let again = demc(&out).arg(dir.path()).args(arguments).assert().code(1);
+    again.stdout(contains("0 denoised, 3 already there"));
 }
 
 #[test]

@@ -298,13 +298,18 @@ impl Shared {
         }
     }
 
-    /// Whether a frame that a result was made without is there now.
+    /// Whether a frame that a result was made without can be used now.
     fn can_be_completed(&self, job: &Job, result: &Frame) -> bool {
         let (Some(reach), lacked) = (self.options.temporal, result.lacked()) else { return false };
         let Some(number) = frame_number(&job.input).filter(|_| !lacked.is_empty()) else { return false };
         let near = sequence::neighbours(&job.input, reach).into_iter();
         let mut found = near.filter(|(offset, _)| lacked.contains(&(number + i64::from(*offset))));
-        found.any(|(_, path)| Frame::read(path).is_ok())
+        found.any(|(_, path)| {
+            let frame = attempt(&path, || Frame::read(&path));
+            frame
+                .and_then(|frame| attempt(&path, || job::take_apart(frame, &*self.model, &self.options)))
+                .is_ok()
+        })
     }
 
     /// Whether the result of a job exists already; if so, the job's end is reported.

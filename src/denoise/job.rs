@@ -504,6 +504,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
         frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
         frame.set_lacked(&result, &report.lacked);
+        frame.set_reach(&result, options.temporal.unwrap_or(0));
         let name = layer_name(&layer.name, &error_layer(options));
         // Such a layer of an earlier result would not be true of this one, so it is replaced, by numbers that are
         // none where nothing is known.
@@ -649,6 +650,9 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     let lights = denoised_lights(layer);
     if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
         return lacks("denoised light passes");
+    }
+    if let Some(reach) = options.temporal.filter(|reach| headers.reach() < *reach) {
+        return lacks(&format!("its neighbours (--temporal {reach})"));
     }
     if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
         return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));

@@ -113,19 +113,22 @@ pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
         let place = Place::of(&job.input);
         let number = place.as_ref().map_or(0, |place| place.number);
         // Two files with the same number, such as 7 and 0007, are put into two sequences, so that neither
-        // hides the other.
+        // hides the other. One of them is what other frames have for a neighbour, whatever is denoised.
+        let is_sibling = |at: &usize| sequences[*at].files.get(&number).is_none_or(|file| *file == job.input);
+        let is_new = |at: &usize| sequences[*at].jobs.iter().all(|(_, other)| *other != number);
         let at = place.as_ref().and_then(|place| known.get(&place.key)).copied();
-        let at = at.filter(|at| sequences[*at].jobs.iter().all(|(_, other)| *other != number));
-        let at = at.unwrap_or_else(|| {
+        let at = at.filter(|at| is_sibling(at) && is_new(at)).unwrap_or_else(|| {
             let files = place.as_ref().map(Place::siblings).unwrap_or_default();
             sequences.push(Sequence { files, jobs: Vec::new(), is_numbered: place.is_some() });
-            sequences.len() - 1
+            let at = sequences.len() - 1;
+            let is_sibling = sequences[at].files.get(&number).is_none_or(|file| *file == job.input);
+            if let Some(place) = place.filter(|_| is_sibling) {
+                known.entry(place.key).or_insert(at);
+            }
+            at
         });
         sequences[at].files.insert(number, job.input.clone());
         sequences[at].jobs.push((job, number));
-        if let Some(place) = place {
-            known.insert(place.key, at);
-        }
     }
     let whole = |Sequence { files, mut jobs, is_numbered }| {
         jobs.sort_by_key(|(_, number)| *number);

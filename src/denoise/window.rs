@@ -23,7 +23,7 @@ use crate::{
     Error, Result,
     features::exposure,
     filters::{
-        agreement::{Guides, Look},
+        agreement::{self, Guides, Look},
         motion::{Direction, Flow},
         temporal::{self, Link, likeness},
     },
@@ -60,6 +60,13 @@ const CUT: f32 = 0.03;
 /// strong blur and among stars; of 104 pairs that were shifted by three pixels, 98%.
 const STILL: f32 = 0.3;
 
+/// Exposed radiance that is dark.
+const DARK: f32 = 0.02;
+
+/// A neighbour that is more times as bright, or less than one in so many, is not averaged: not all lights of a scene
+/// change by so much.
+const FLASH: f32 = 1.5;
+
 /// Name of a view layer, and the stereo view.
 type ViewKey = (String, Option<String>);
 
@@ -68,7 +75,7 @@ type ViewKey = (String, Option<String>);
 enum Gap {
     /// As a sentence for the user.
     Said(String),
-    /// Likewise; and the frame is not there, or cannot be read, which may change.
+    /// Likewise; and the frame is not there, or cannot be used, which may change.
     Lost(i64, String),
     /// It lies beyond one of which it was said.
     Beyond,
@@ -81,12 +88,19 @@ struct Moment {
     /// These passes, which half floats hold exactly: a frame that stays alone is denoised to the same bits.
     waiting: BTreeMap<Pass, HalfFloats>,
     look: Look,
-    /// Weights of neighbours, (1, H, W), by how many frames later these are.
-    links: BTreeMap<i32, Result<HalfFloats, Gap>>,
+    /// How neighbours belong together with it, by how many frames later these are.
+    links: BTreeMap<i32, Result<Found, Gap>>,
     /// What the model makes of it and its neighbours' renders.
     result: Option<Planes>,
-    /// Frames whose renders the result was made without since they were not there, or could not be read.
+    /// Frames whose renders the result was made without since they were not there, or could not be used.
     lacked: BTreeSet<i64>,
+}
+
+/// What is kept of a [`Link`], whose flow is followed anew.
+struct Found {
+    weights: HalfFloats,
+    brightness: f32,
+    share: f32,
 }
 
 /// A frame that is averaged with another.
@@ -272,7 +286,7 @@ impl Window {
         let likeness = likeness::Own::of(result, &render, exposure(&render));
         let neighbours = self.neighbours(number, &view, self.reaches[1]).map(|Neighbour { moment, link }| {
             let (guides, there) = (own.guides(), moment.guides());
-            let features = own.look.features(&moment.look, &link.flow, &guides, &there);
+            let features = own.look.features(&moment.look, &link.flow, link.brightness, &guides, &there);
             Candidate {
                 inside: link.inside(),
                 render: [link.nearest(&moment.render()), features],
@@ -329,7 +343,7 @@ impl Window {
         Ok(())
     }
 
-    /// The frames up to so many away that are not there, or cannot be read.
+    /// The frames up to so many away that are not there, or cannot be used.
     fn lost(&self, number: i64, view: &ViewKey, reach: i32) -> BTreeSet<i64> {
         let links = offsets(reach).filter_map(|offset| self.moment(number, view)?.links.get(&offset));
         links
@@ -341,10 +355,11 @@ impl Window {
     fn neighbours(&self, number: i64, view: &ViewKey, reach: i32) -> impl Iterator<Item = Neighbour<'_>> {
         offsets(reach).filter_map(move |offset| {
             let own = self.moment(number, view)?;
-            let weights = own.links.get(&offset)?.as_ref().ok()?.planes();
+            let Found { weights, brightness, share } = own.links.get(&offset)?.as_ref().ok()?;
             let flow = self.flow(number, view, offset).ok()?;
             let moment = self.moment(number + i64::from(offset), view)?;
-            Some(Neighbour { moment, link: Link { flow, weights } })
+            let link = Link { flow, weights: weights.planes(), brightness: *brightness, share: *share };
+            Some(Neighbour { moment, link })
         })
     }
 
@@ -414,8 +429,8 @@ impl Window {
         }
     }
 
-    /// The weights of a neighbour.
-    fn find_link(&mut self, number: i64, view: &ViewKey, offset: i32) -> Result<HalfFloats, Gap> {
+    /// How a neighbour belongs together with a frame.
+    fn find_link(&mut self, number: i64, view: &ViewKey, offset: i32) -> Result<Found, Gap> {
         let (step, _) = step(offset);
         // What lies further away is reached through what lies nearer.
         for nearer in 0..offset.abs() - 1 {
@@ -431,10 +446,14 @@ impl Window {
         let lost = |why: String| Err(Gap::Lost(there, format!("frame {there} {why}")));
         let Some(held) = self.held.get(&there) else { return lost("is not there".into()) };
         if let Some(trouble) = &held.trouble {
-            return lost(format!("cannot be read ({trouble})"));
+            return lost(format!("cannot be used ({trouble})"));
         }
         let Some(other) = held.moments.get(view) else {
-            return said(format!("frame {there} has no such view layer or view"));
+            let (layer, _) = view;
+            return said(format!(
+                "frame {there} has not this view layer and view, or another was chosen of it (--view-layer '{layer}' takes \
+                 this one of all)"
+            ));
         };
         let place = |set: &PassSet| (set.width, set.height, set.origin);
         if place(&own.shot.passes) != place(&other.shot.passes) {
@@ -456,7 +475,11 @@ impl Window {
                 });
             }
         };
-        let weights = own.look.agreement(&other.look, &flow, &own.guides(), &other.guides());
+        let brightness = own.look.brightness(&other.look, &flow);
+        let mut weights = own.look.agreement(&other.look, &flow, brightness, &own.guides(), &other.guides());
+        if let [Some(light), Some(there)] = [own, other].map(|moment| moment.values(Pass::Combined)) {
+            agreement::dim(&mut weights, &flow, light, there, DARK / exposure(&own.render()));
+        }
         let (mut sum, mut inside) = (0.0, 0usize);
         for y in 0..weights.height {
             let row = &weights.data[y * weights.width..][..weights.width];
@@ -481,7 +504,19 @@ impl Window {
         if share < CUT {
             return said(format!("frame {there} shows another picture: a cut"));
         }
-        Ok(HalfFloats::of(&weights))
+        if !(1.0 / FLASH..FLASH).contains(&brightness) {
+            let times = 1.0 / brightness;
+            return said(format!(
+                "frame {there} is {times:.2} times as bright, and its noise is that of other light"
+            ));
+        }
+        // The noise of fewer samples would make a frame worse.
+        let share = match (own.shot.passes.samples, other.shot.passes.samples) {
+            (Some(own), Some(there)) if there < own => there as f32 / own as f32,
+            _ => 1.0,
+        };
+        weights.data.iter_mut().for_each(|weight| *weight *= share);
+        Ok(Found { weights: HalfFloats::of(&weights), brightness, share })
     }
 
     /// Says what a frame stays without, where its window is not full.
@@ -623,7 +658,8 @@ fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> Pass
         } else {
             let of_others: Vec<(&dyn Values, &Link)> =
                 others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
-            set.insert(pass, temporal::merge(values, &of_others));
+            let is_light = pass.quantity() == Quantity::Radiance;
+            set.insert(pass, temporal::merge(values, is_light, &of_others));
         }
     }
     set.origin = passes.origin;

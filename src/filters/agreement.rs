@@ -16,6 +16,8 @@
 
 use std::sync::LazyLock;
 
+use rayon::prelude::*;
+
 use super::{
     box_mean,
     motion::{self, Aside, Flow},
@@ -77,6 +79,14 @@ const PIXELS: f32 = 20.0;
 
 /// Squared relative difference of the light, beyond noise, that nobody sees.
 const UNSEEN: f32 = 5e-5;
+
+/// A difference in brightness counts that is more than so many of its standard errors, of at least so many places.
+const CERTAIN: f32 = 4.0;
+const FEWEST: usize = 30;
+
+/// How many times as bright as all around it a pixel of a neighbour may be before it counts for less. Fireflies are
+/// rarely as much brighter than noise.
+const OUTSHINES: f32 = 16.0;
 
 /// Rows and columns of a square.
 const SQUARE: usize = 2;
@@ -189,14 +199,61 @@ impl Look {
         Self { size: (width, height), squares }
     }
 
-    /// What the perceptron reads of every pixel and of the one to which the flow leads: [`FEATURES`] lines for
-    /// each row, (H, FEATURES, W) as one plane. `own` and `there` are the guides that both looks were made of.
+    /// How many times as bright a frame is as another, as a whole: the median over what both show, as far as guides
+    /// agree; 1 where that is no more than noise may be. Lamps that flicker, a sun behind clouds and an exposure that
+    /// changes leave such a difference, which single places hide in their noise.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn features(&self, other: &Self, flow: &Flow, own: &Guides, there: &Guides) -> Planes {
+    pub fn brightness(&self, other: &Self, flow: &Flow) -> f32 {
+        assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
+        let (columns, rows) = (self.squares.width, self.squares.height);
+        let mut differences = Vec::new();
+        // Means over 3x3 squares, each square in one.
+        for row in (1..rows).step_by(3) {
+            let places = flow.row((row * SQUARE).min(self.size.1 - 1));
+            for column in (1..columns).step_by(3) {
+                let pixel = (column * SQUARE).min(self.size.0 - 1);
+                let (x, y) = (places.0[pixel], places.1[pixel]);
+                if x.is_nan() {
+                    continue;
+                }
+                let nearest = |place: f32, most: usize| (place.max(0.0) as usize / SQUARE).min(most - 1);
+                let there = nearest(y, rows) * columns + nearest(x, columns);
+                let (here, there) = (self.at(row * columns + column), other.at(there));
+                if alike(&here, &there)
+                    && let [here, there] = [here, there].map(|of| of[LIGHT..VARIANCE].iter().sum::<f32>())
+                    && here.min(there) > 0.0
+                {
+                    differences.push(4.0 * ln(here / there));
+                }
+            }
+        }
+        let Some((middle, error)) = median(&mut differences) else { return 1.0 };
+        if middle.abs() > CERTAIN * error { exp(middle) } else { 1.0 }
+    }
+
+    /// The means of a square, all but the spreads.
+    fn at(&self, square: usize) -> [f32; SPREAD_OF_ALBEDO] {
+        std::array::from_fn(|line| self.squares.channel(line)[square])
+    }
+
+    /// What the perceptron reads of every pixel and of the one to which the flow leads: [`FEATURES`] lines for
+    /// each row, (H, FEATURES, W) as one plane. `own` and `there` are the guides that both looks were made of,
+    /// `brightness` how many times as bright this frame is.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn features(
+        &self,
+        other: &Self,
+        flow: &Flow,
+        brightness: f32,
+        own: &Guides,
+        there: &Guides,
+    ) -> Planes {
         let (width, height) = self.size;
-        let of_squares = self.features_of_squares(other, flow);
+        let of_squares = self.features_of_squares(other, flow, brightness);
         Planes::from_rows(1, (FEATURES * width, height), |_, y, out| {
             self.features_of_row(y, &of_squares, flow, [own, there], out);
         })
@@ -204,12 +261,19 @@ impl Look {
 
     /// How far each pixel may be averaged with that of `other` to which the flow leads, beside 1 for its own:
     /// from 0 to 1, (1, H, W), and 0 where the flow leads outside. `own` and `there` are the guides that both
-    /// looks were made of.
+    /// looks were made of, `brightness` how many times as bright this frame is.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn agreement(&self, other: &Self, flow: &Flow, own: &Guides, there: &Guides) -> Planes {
-        let of_squares = self.features_of_squares(other, flow);
+    pub fn agreement(
+        &self,
+        other: &Self,
+        flow: &Flow,
+        brightness: f32,
+        own: &Guides,
+        there: &Guides,
+    ) -> Planes {
+        let of_squares = self.features_of_squares(other, flow, brightness);
         let width = self.size.0;
         // A row at a time: features of a whole frame would take many times its memory.
         Planes::from_rows(1, self.size, |_, y, out| {
@@ -274,7 +338,7 @@ impl Look {
     ///
     /// # Panics
     /// If sizes differ.
-    fn features_of_squares(&self, other: &Self, flow: &Flow) -> Planes {
+    fn features_of_squares(&self, other: &Self, flow: &Flow, brightness: f32) -> Planes {
         assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
         let size = (self.squares.width, self.squares.height);
         Planes::from_rows(1, (OF_SQUARES * size.0, size.1), |_, row, out| {
@@ -289,12 +353,86 @@ impl Look {
             let mut there = vec![0.0; SPREAD_OF_ALBEDO * size.0];
             for (line, out) in there.chunks_exact_mut(size.0).enumerate() {
                 let plane = other.squares.channel(line);
-                out.iter_mut().zip(&places).for_each(|(out, place)| *out = place.of(plane));
+                let factor = match line {
+                    LIGHT..VARIANCE => brightness.sqrt().sqrt(),
+                    VARIANCE..ALBEDO => brightness.sqrt(),
+                    _ => 1.0,
+                };
+                out.iter_mut().zip(&places).for_each(|(out, place)| *out = factor * place.of(plane));
             }
             let here = std::array::from_fn(|line| row_of(&self.squares, line, row));
             vectorised::run(CompareSquares { here, there: &there, columns: &columns, out });
         })
     }
+}
+
+/// Lowers the weights of pixels of another frame, (1, H, W), that outshine all of this one around the place where they
+/// count, so that a lamp a thousand times as bright leaves nothing where it was a frame ago: squares, which weights are
+/// made of, are too coarse to tell the pixels at its edge. `own` and `there` are the light of both frames, `floor` what
+/// counts as dark.
+///
+/// # Panics
+/// If sizes differ.
+pub fn dim(weights: &mut Planes, flow: &Flow, own: &dyn Values, there: &dyn Values, floor: f32) {
+    let (channels, width, height) = own.extent();
+    assert!(there.extent() == own.extent() && flow.size() == (width, height), "frames of one size");
+    assert!((weights.width, weights.height) == (width, height), "weights of the frame's size");
+    let brightest = |of: &dyn Values, c: usize, first: usize, line: &mut [f32], most: &mut [f32]| {
+        of.read(c, first, line);
+        most.iter_mut().zip(&*line).for_each(|(most, v)| *most = most.max(*v));
+    };
+    let here = Planes::from_rows(1, (width, height), |_, y, most| {
+        most.fill(floor);
+        let line = &mut vec![0.0; width];
+        (0..channels).for_each(|c| brightest(own, c, y * width, line, most));
+    });
+    weights.data.par_chunks_mut(width).enumerate().for_each(|(y, weights)| {
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let columns: Vec<f32> = (0..width)
+            .map(|x| rows.clone().map(|row| here.data[row * width + x]).fold(floor, f32::max))
+            .collect();
+        for stretch in flow.nearest_of_row(y) {
+            let (line, most) = (&mut vec![0.0; stretch.pixels], &mut vec![floor; stretch.pixels]);
+            (0..channels).for_each(|c| brightest(there, c, stretch.there, line, most));
+            let weights = stretch.of_mut(weights).iter_mut().zip(most.iter());
+            for (x, (weight, there)) in (stretch.here..).zip(weights) {
+                let around =
+                    columns[x.saturating_sub(1)..(x + 2).min(width)].iter().copied().fold(floor, f32::max);
+                *weight *= (OUTSHINES * around / there).min(1.0);
+            }
+        }
+    });
+}
+
+/// Whether the guides of two squares agree.
+fn alike(here: &[f32; SPREAD_OF_ALBEDO], there: &[f32; SPREAD_OF_ALBEDO]) -> bool {
+    let mut differences = [[0.0]; OF_GUIDES];
+    let guides = |of: &[f32; SPREAD_OF_ALBEDO]| -> [[f32; 1]; GUIDES] {
+        std::array::from_fn(|line| [of[ALBEDO + line]])
+    };
+    let (here, there) = (guides(here), guides(there));
+    let [normal, albedo, depth] = &mut differences;
+    compare_guides(
+        here.each_ref().map(|v| &v[..]),
+        there.each_ref().map(|v| &v[..]),
+        [normal, albedo, depth],
+    );
+    let most = [NORMAL_DIFFERS, ALBEDO_DIFFERS, DEPTH_DIFFERS];
+    differences.iter().zip(most).all(|([difference], most)| *difference < most)
+}
+
+/// The median of values and its standard error, by their median distance from it; none of few.
+fn median(values: &mut [f32]) -> Option<(f32, f32)> {
+    if values.len() < FEWEST {
+        return None;
+    }
+    let middle = values.len() / 2;
+    let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
+    values.iter_mut().for_each(|v| *v = (*v - median).abs());
+    let distance = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
+    // Of a normal distribution the deviation is 1.48 times the median distance, and the error of the median 1.25 times
+    // that of the mean.
+    Some((median, 1.48 * 1.25 * distance / (values.len() as f32).sqrt()))
 }
 
 /// A row of a channel.
@@ -582,7 +720,7 @@ mod tests {
             let guides = guides(frame);
             (Look::of(&frame[0], &guides), guides)
         });
-        look.agreement(&other, flow, &own, &there)
+        look.agreement(&other, flow, look.brightness(&other, flow), &own, &there)
     }
 
     fn mean(weights: &Planes, columns: std::ops::Range<usize>) -> f32 {
@@ -597,11 +735,52 @@ mod tests {
         let lit = frame(1, |_| 1.0);
         let same = agreement(&lit, &frame(2, |_| 1.0), &still);
         assert!(mean(&same, 0..SIZE.0) > AGREED, "{}", mean(&same, 0..SIZE.0));
-        // A shadow has fallen on the right half.
-        let shadow = frame(3, |x| if x < 30 { 1.0 } else { 0.4 });
+        // A shadow has fallen on the right.
+        let shadow = frame(3, |x| if x < 35 { 1.0 } else { 0.4 });
         let weights = agreement(&lit, &shadow, &still);
-        assert!(mean(&weights, 0..26) > AGREED && mean(&weights, 36..SIZE.0) < 0.05);
+        assert!(mean(&weights, 0..31) > AGREED && mean(&weights, 41..SIZE.0) < 0.05);
         assert!(weights.data.iter().all(|w| (0.0..=1.0).contains(w)));
+    }
+
+    #[test]
+    fn light_that_changes_as_a_whole_is_told_from_noise_and_agrees() {
+        let still = Flow::still(SIZE.0, SIZE.1);
+        let look = |frame: &[Planes; 4]| Look::of(&frame[0], &guides(frame));
+        let lit = frame(1, |_| 1.0);
+        for (factor, expected) in [(1.0, 1.0), (0.98, 1.0), (0.8, 1.25), (0.5, 2.0), (4.0, 0.25)] {
+            let other = frame(2, |_| factor);
+            let found = look(&lit).brightness(&look(&other), &still);
+            assert!((found / expected - 1.0).abs() < 0.05, "{factor}: {found}");
+            assert_eq!(found == 1.0, expected == 1.0, "what may be noise is none: {factor}: {found}");
+            let weights = agreement(&lit, &other, &still);
+            assert!(mean(&weights, 0..SIZE.0) > AGREED, "{factor}: {}", mean(&weights, 0..SIZE.0));
+        }
+        // A shadow over less than half of a frame is none of it, nor is what other surfaces show.
+        let shadow = frame(3, |x| if x < 40 { 1.0 } else { 0.4 });
+        assert_eq!(look(&lit).brightness(&look(&shadow), &still), 1.0);
+        let mut elsewhere = frame(4, |_| 0.5);
+        elsewhere[3].data.fill(6.0);
+        assert_eq!(look(&lit).brightness(&look(&elsewhere), &still), 1.0);
+    }
+
+    #[test]
+    fn what_outshines_all_around_it_counts_for_less() {
+        let flow = Flow::still(5, 5);
+        let own = Planes::from_vec(1, 5, 5, vec![1.0; 25]);
+        let mut there = own.clone();
+        for (value, expected) in [(2.0, 0.5), (16.0, 0.5), (1600.0, 0.005)] {
+            there.data[12] = value;
+            let mut weights = Planes::from_vec(1, 5, 5, vec![0.5; 25]);
+            dim(&mut weights, &flow, &own, &there, 0.02);
+            assert!((weights.data[12] - expected).abs() < 1e-6, "{value}: {}", weights.data[12]);
+            assert!(weights.data.iter().enumerate().all(|(i, weight)| i == 12 || *weight == 0.5), "{value}");
+        }
+        // Beside as bright a pixel of its own.
+        let mut own = own;
+        own.data[8] = 5000.0;
+        let mut weights = Planes::from_vec(1, 5, 5, vec![0.5; 25]);
+        dim(&mut weights, &flow, &own, &there, 0.02);
+        assert_eq!(weights.data[12], 0.5);
     }
 
     #[test]
@@ -657,7 +836,9 @@ mod tests {
         for (w, h) in [(1, 1), (1, 5), (2, 2), (3, 1)] {
             let none = Guides::default();
             let look = Look::of(&Planes::new(3, w, h), &none);
-            let weights = look.agreement(&look, &Flow::still(w, h), &none, &none);
+            let still = Flow::still(w, h);
+            assert_eq!(look.brightness(&look, &still), 1.0, "{w}x{h}");
+            let weights = look.agreement(&look, &still, 1.0, &none, &none);
             assert!(weights.data.iter().all(|v| *v > 0.5), "{w}x{h}: {:?}", weights.data.to_vec());
         }
     }

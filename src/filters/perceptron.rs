@@ -49,8 +49,8 @@ impl Perceptron {
     }
 
     /// The weights of a row of places of a neighbour of a frame: the exponential of what the perceptron, which
-    /// has one output, makes of `features`, kept between `least` and 0, and with `gate`, if there is one,
-    /// added to it; 0 where `columns`, those of the places, are NaN.
+    /// has one output, makes of `features`, kept between `least` and 0, less the exponential of `least`, and times that
+    /// of `gate`, if there is one; 0 where `columns`, those of the places, are NaN.
     pub fn weigh(
         &self,
         features: &[f32],
@@ -82,14 +82,13 @@ impl Vectorised for Weights<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { least, gate, columns, out } = self;
-        out.iter_mut().for_each(|v| *v = v.clamp(least, 0.0));
+        // The least weight is none: of a lamp of a thousand times the light around it, any share would show.
+        let none = exp(least);
+        out.iter_mut().for_each(|v| *v = exp(v.clamp(least, 0.0)) - none);
         if let Some(gate) = gate {
-            out.iter_mut().zip(gate).for_each(|(v, gate)| *v += gate);
+            out.iter_mut().zip(gate).for_each(|(v, gate)| *v *= exp(*gate));
         }
-        out.iter_mut().zip(columns).for_each(|(v, column)| {
-            let weight = exp(*v);
-            *v = if column.is_nan() { 0.0 } else { weight };
-        });
+        out.iter_mut().zip(columns).for_each(|(v, column)| *v = if column.is_nan() { 0.0 } else { *v });
     }
 }
 

@@ -43,9 +43,11 @@ const MARK: &str = "demc";
 const EXPECTED_ERROR: &str = "demcExpectedError";
 /// Attribute that lists the frames by number that results were made without.
 const LACKED: &str = "demcLacked";
+/// Attribute that tells how many frames before and after a result was made with.
+const REACH: &str = "demcNeighbours";
 /// Attributes that another part of the same picture does not take over; nor does it take those of
 /// cryptomattes.
-const OWN: [&str; 7] = [MARK, EXPECTED_ERROR, LACKED, "name", "preview", "chunkCount", "idManifest"];
+const OWN: [&str; 8] = [MARK, EXPECTED_ERROR, LACKED, REACH, "name", "preview", "chunkCount", "idManifest"];
 /// The name that a part without one gets in a file of several parts, where each must have a name.
 const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
@@ -182,6 +184,24 @@ impl Frame {
         attributes.set_text(LACKED, &frames.join(" "));
     }
 
+    /// Notes how many frames before and after the layer `name`, which demc made, was made with, as far as they are
+    /// there; or forgets what is noted of an earlier result.
+    ///
+    /// # Panics
+    /// If demc made no such layer.
+    pub fn set_reach(&mut self, name: &str, reach: usize) {
+        let attributes = self.attributes_beside(name);
+        if reach > 0 || attributes.text(REACH).is_some() {
+            attributes.set_text(REACH, &reach.to_string());
+        }
+    }
+
+    /// How many frames before and after all its results were made with.
+    pub fn reach(&self) -> usize {
+        let noted = self.stored.iter().filter_map(|stored| stored.attributes.text(REACH)?.parse().ok());
+        noted.min().unwrap_or(0)
+    }
+
     /// The frames by number that its results were made without.
     pub fn lacked(&self) -> BTreeSet<i64> {
         let lists = self.stored.iter().filter_map(|stored| stored.attributes.text(LACKED));
@@ -289,6 +309,12 @@ impl Frame {
     }
 
     fn add_part(&mut self, beside: usize, name: &str, channels: &Named<'_>) -> Result<()> {
+        if self.parts.iter().any(|part| part.name.as_deref() == Some(name)) {
+            let why = format!(
+                "has a part '{name}' already, which demc did not make; choose another name for the result (--layer NAME)"
+            );
+            return Err(Error::invalid(&self.path, why));
+        }
         let Stored { attributes: old, layout: like } = &self.stored[beside];
         let blocks = match like.blocks {
             BlockDescription::ScanLines => BlockDescription::ScanLines,
@@ -339,7 +365,8 @@ impl Frame {
     /// Adds channels to a part, or replaces those of the same name.
     fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
         self.refuse_undecodable(part)?;
-        if chroma::is_subsampled(&self.stored[part].layout) {
+        let is_chroma = new.iter().any(|(name, _)| chroma::is_chroma(name));
+        if is_chroma || chroma::is_subsampled(&self.stored[part].layout) {
             let why = "holds luminance and chroma, which no colours can replace; leave out --replace, and they are added";
             return Err(Error::invalid(&self.path, why));
         }

@@ -38,6 +38,10 @@ const LARGEST: f32 = 4.0;
 const TINY: f32 = 1e-5;
 const TINY_NOISE: f32 = 1e-4;
 
+/// How many times as bright as the frame's own result a neighbour's may be before it counts for less: what perceptrons
+/// leave of a lamp's light where it was a frame ago would show.
+const OUTSHINES: f32 = 8.0;
+
 /// The least agreement whose logarithm is told from none.
 const LEAST_AGREEMENT: f32 = 1e-3;
 
@@ -105,6 +109,11 @@ impl<'a> Own<'a> {
             let mut features = vec![0.0; FEATURES * width];
             self.features_of_row(y, &differences, link, &mut features);
             PERCEPTRON.weigh(&features, LEAST, None, link.flow.row(y).0, out);
+            for (x, weight) in out.iter_mut().enumerate() {
+                let [own, there] = [self.image, &there]
+                    .map(|of| (0..3).map(|c| of.channel(c)[y * width + x]).fold(self.floor, f32::max));
+                *weight *= link.share * (OUTSHINES * own / there).min(1.0);
+            }
         });
         (there, weights)
     }
@@ -218,7 +227,7 @@ fn fetch(own: &Planes, other: &Planes, link: &Link) -> Planes {
             let colours = if columns[x].is_nan() {
                 [0, 1, 2].map(|c| own.channel(c)[y * width + x])
             } else {
-                sharp(other, (columns[x], rows[x]))
+                sharp(other, (columns[x], rows[x])).map(|colour| link.brightness * colour)
             };
             out.iter_mut().zip(colours).for_each(|(out, colour)| out[x] = colour);
         }

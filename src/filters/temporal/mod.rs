@@ -17,6 +17,10 @@ pub struct Link {
     pub flow: Flow,
     /// From 0 to 1, (1, H, W).
     pub weights: Planes,
+    /// How many times as bright the frame is as the neighbour: its light is multiplied by that.
+    pub brightness: f32,
+    /// From 0 to 1: how far the neighbour's result counts beside what is seen of it, since its samples are fewer.
+    pub share: f32,
 }
 
 impl Link {
@@ -45,11 +49,11 @@ impl Link {
 
 /// The weighted mean of `own`, a pass of (C, H, W), and of its neighbours'. Of a neighbour, each pixel
 /// takes the nearest one: noise stays the noise of single pixels, as denoisers know it, and is not smeared.
-/// Where that is outside of the neighbour, its weight is 0.
+/// Where that is outside of the neighbour, its weight is 0. `is_light` if the pass is as bright as the frame.
 ///
 /// # Panics
 /// If sizes differ.
-pub fn merge(own: &dyn Values, neighbours: &[(&dyn Values, &Link)]) -> Planes {
+pub fn merge(own: &dyn Values, is_light: bool, neighbours: &[(&dyn Values, &Link)]) -> Planes {
     let (channels, width, height) = own.extent();
     let size = (width, height);
     for (values, link) in neighbours {
@@ -67,13 +71,14 @@ pub fn merge(own: &dyn Values, neighbours: &[(&dyn Values, &Link)]) -> Planes {
         let mut there = vec![0.0; size.0];
         for (c, out) in rows.iter_mut().enumerate() {
             own.read(c, y * size.0, out);
-            for (((values, _), stretches), weights) in neighbours.iter().zip(&stretches).zip(&weights) {
+            for (((values, link), stretches), weights) in neighbours.iter().zip(&stretches).zip(&weights) {
+                let factor = if is_light { link.brightness } else { 1.0 };
                 for stretch in stretches {
                     let there = &mut there[..stretch.pixels];
                     values.read(c, stretch.there, there);
                     let both = there.iter().zip(stretch.of(weights));
                     let out = stretch.of_mut(out).iter_mut();
-                    out.zip(both).for_each(|(out, (value, weight))| *out += weight * value);
+                    out.zip(both).for_each(|(out, (value, weight))| *out += weight * (factor * value));
                 }
             }
             out.iter_mut().zip(&sums).for_each(|(out, sum)| *out /= sum);
@@ -141,21 +146,21 @@ mod tests {
             let columns = flow.row(y).0;
             out.iter_mut().zip(columns).for_each(|(out, x)| *out = if x.is_nan() { 0.0 } else { weight });
         });
-        Link { flow, weights }
+        Link { flow, weights, brightness: 1.0, share: 1.0 }
     }
 
     #[test]
     fn merging_follows_the_motion_and_the_weights() {
         let own = grey(|x, y| (x + 2 * y) as f32);
         let moved = grey(|x, y| x as f32 - 3.0 + 2.0 * y as f32 + 1.0);
-        let merged = merge(&own, &[(&moved, &link(3.0, 0.5))]);
+        let merged = merge(&own, true, &[(&moved, &link(3.0, 0.5))]);
         for x in 0..SIZE.0 {
             // One brighter, at half the weight; what leaves the frame is left as it was.
             let weight = if x + 3 < SIZE.0 { 0.5 } else { 0.0 };
             let more = weight / (1.0 + weight);
             assert!((merged.channel(1)[x] - x as f32 - more).abs() < 1e-4, "{x}");
         }
-        assert_eq!(merge(&own, &[]), own);
+        assert_eq!(merge(&own, true, &[]), own);
     }
 
     #[test]
