@@ -18,7 +18,8 @@ use crate::{Error, Result};
 /// A noisy render and the converged render of the same view.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Pair {
-    /// Scene name; frames of one sequence share it.
+    /// Scene name, with its folder where scenes of other folders are called alike; frames of one sequence share
+    /// it.
     pub scene: String,
     /// The noisy multilayer EXR.
     pub noisy: PathBuf,
@@ -209,7 +210,7 @@ fn match_files(files: impl IntoIterator<Item = PathBuf>, report_references: bool
         let unused = references.into_values().filter(|r| !used.contains(r));
         set.unmatched.extend(unused.map(Unmatched::Reference));
     }
-    set.sort();
+    set.finish();
     set
 }
 
@@ -234,12 +235,51 @@ impl TestSet {
         }
     }
 
-    fn sort(&mut self) {
+    /// Names scenes apart and sorts, once all files are in.
+    fn finish(&mut self) {
+        self.name_apart();
         sort(&mut self.pairs);
         self.unmatched.sort_by_cached_key(|u| match u {
             Unmatched::Noisy(Pair { noisy: path, .. }) | Unmatched::Reference(path) => path.clone(),
         });
     }
+
+    /// Adds to the names of scenes that are alike in different folders as much of the folder as tells them apart,
+    /// such as `room (day)` and `room (night)`. Noise seeds of one scene share its reference, and so the name.
+    fn name_apart(&mut self) {
+        let lacking = self.unmatched.iter_mut().filter_map(|unmatched| match unmatched {
+            Unmatched::Noisy(pair) => Some(pair),
+            Unmatched::Reference(_) => None,
+        });
+        let mut pairs: Vec<&mut Pair> = self.pairs.iter_mut().chain(lacking).collect();
+        let mut folders: HashMap<String, BTreeSet<PathBuf>> = HashMap::new();
+        for pair in &pairs {
+            folders.entry(pair.scene.clone()).or_default().insert(folder(&pair.reference).to_owned());
+        }
+        for pair in &mut pairs {
+            let alike = &folders[&pair.scene];
+            if alike.len() > 1 {
+                pair.scene = format!("{} ({})", pair.scene, end_of(folder(&pair.reference), alike).display());
+            }
+        }
+    }
+}
+
+/// The folder of a file; that of a bare name is the present one.
+fn folder(file: &Path) -> &Path {
+    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// The shortest end of a path that none of the others has, or the whole of it.
+fn end_of(path: &Path, all: &BTreeSet<PathBuf>) -> PathBuf {
+    let end = |path: &Path, length: usize| -> PathBuf {
+        let parts = path.components();
+        parts.clone().skip(parts.count().saturating_sub(length)).collect()
+    };
+    let is_unique =
+        |length: &usize| all.iter().filter(|other| end(other, *length) == end(path, *length)).count() == 1;
+    let length = (1..path.components().count()).find(is_unique);
+    length.map_or_else(|| path.to_owned(), |length| end(path, length))
 }
 
 /// Sorts by scene, frame number, spp and path. Frames go by number, so that 0099 comes before 0100 and -0001
@@ -299,7 +339,7 @@ fn manifest(path: &Path) -> Result<TestSet> {
         let is_complete = reference.is_file();
         set.add(Pair { scene: row.scene, noisy, reference, spp: row.spp, frame }, is_complete);
     }
-    set.sort();
+    set.finish();
     Ok(set)
 }
 
@@ -398,6 +438,34 @@ mod tests {
         assert!(set.unmatched.is_empty());
         let set = read(dir.path().join("b_0004spp.exr").to_str().unwrap()).unwrap();
         assert_eq!(ids(&set), ["b_0004spp"]);
+    }
+
+    #[test]
+    fn scenes_of_one_name_are_told_apart_by_their_folders() {
+        let dir = tempfile::tempdir().unwrap();
+        let files = ["a_0004spp.exr", "a_0016spp.exr", "a_ref.exr", "b_0004spp.exr", "b_ref.exr"];
+        for (folder, count) in [("day/main", 5), ("night/main", 3), ("night/wide", 2)] {
+            let folder = dir.path().join(folder);
+            std::fs::create_dir_all(&folder).unwrap();
+            files[..count].iter().for_each(|file| std::fs::write(folder.join(file), b"").unwrap());
+        }
+        let set = read(&format!("{}/*/*/*.exr", dir.path().display())).unwrap();
+        let expected = [
+            "a (day/main)_0004spp",
+            "a (day/main)_0016spp",
+            "a (night/main)_0004spp",
+            "a (night/main)_0016spp",
+        ];
+        assert_eq!(ids(&set), [&expected[..], &["b_0004spp"]].concat());
+        let lacking =
+            set.all_noisy().iter().map(|pair| pair.scene.clone()).filter(|s| s == "a (wide)").count();
+        assert_eq!(lacking, 2, "those without a reference too: {:?}", set.unmatched);
+        // Noise seeds that share a reference are one scene.
+        let manifest = dir.path().join("set.csv");
+        let text = "scene,noisy,reference,spp\nx,day/main/a_0004spp.exr,day/main/a_ref.exr,4\n\
+                    x,night/main/a_0004spp.exr,day/main/a_ref.exr,4\n";
+        std::fs::write(&manifest, text).unwrap();
+        assert_eq!(ids(&read(manifest.to_str().unwrap()).unwrap()), ["x_0004spp", "x_0004spp"]);
     }
 
     #[test]

@@ -127,6 +127,80 @@ fn expected(folder: &Path) -> [Vec<f32>; 3] {
 }
 
 #[test]
+fn light_passes_beside_the_guides_leave_a_file_its_renderers() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let rgb = |layer: &str, first: usize| -> Vec<(String, usize)> {
+        (0..3)
+            .map(|c| {
+                (
+                    format!("{layer}{}{}", if layer.is_empty() { "" } else { "." }, ["R", "G", "B"][c]),
+                    first + c,
+                )
+            })
+            .collect()
+    };
+    let xyz = |layer: &str, first: usize| -> Vec<(String, usize)> {
+        (0..3).map(|c| (format!("{layer}.{}", ["X", "Y", "Z"][c]), first + c)).collect()
+    };
+    // Planes 0 to 2 are the beauty, then come albedo and normal. What is no guide holds the beauty.
+    let files = [
+        (
+            "arnold",
+            vec![
+                rgb("", 0),
+                rgb("albedo", 3),
+                xyz("N", 6),
+                rgb("diffuse_direct", 0),
+                rgb("diffuse_indirect", 0),
+                rgb("emission", 0),
+                rgb("transmission_direct", 0),
+            ],
+        ),
+        (
+            "octane",
+            vec![
+                rgb("Beauty", 0),
+                rgb("Denoise albedo", 3),
+                rgb("Denoise normal", 6),
+                rgb("Diffuse direct", 0),
+                rgb("Diffuse indirect", 0),
+                rgb("Environment", 0),
+            ],
+        ),
+        (
+            "redshift",
+            vec![
+                rgb("", 0),
+                rgb("DiffuseFilter", 3),
+                rgb("Normals", 6),
+                rgb("Emission", 0),
+                rgb("Environment", 0),
+            ],
+        ),
+        ("pbrt", vec![rgb("", 0), rgb("Albedo", 3), xyz("Ns", 6), xyz("N", 0)]),
+        (
+            "blender by nuke",
+            vec![
+                rgb("ViewLayer_Combined", 0),
+                rgb("ViewLayer_Denoising_Albedo", 3),
+                xyz("ViewLayer_Denoising_Normal", 6),
+                rgb("ViewLayer_Diffuse_Direct", 0),
+            ],
+        ),
+    ];
+    for (renderer, layers) in files {
+        let path = dir.path().join(format!("{renderer}.exr"));
+        let names: Vec<(String, usize)> = layers.concat();
+        let of_planes: Vec<(&str, usize)> =
+            names.iter().map(|(name, plane)| (name.as_str(), *plane)).collect();
+        Render::new().write(&path, &of_planes);
+        let name = if renderer == "blender by nuke" { "ViewLayer.Denoised" } else { "Denoised" };
+        assert!(layer(&denoise(&path, &[]), name) == expected, "{renderer}");
+    }
+}
+
+#[test]
 fn every_renderers_names_are_known() {
     let dir = tempfile::tempdir().unwrap();
     let expected = expected(dir.path());

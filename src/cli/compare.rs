@@ -73,16 +73,33 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Coordinates of primaries that differ by no more than this are the same ones, rounded.
+const SAME_PRIMARIES: f32 = 1e-3;
+
 /// The scores, and the image that is the reference. `say` is told what was compared where that might surprise.
 ///
 /// # Errors
 /// As [`run`].
 pub fn scores(args: &Args, say: &dyn Fn(&str)) -> Result<(Scores, Planes)> {
     let image = judged(args, say)?;
-    let reference = reference(args, &image.view_layer)?;
+    let reference = reference(args, &image)?;
     if image.view_layer != reference.view_layer {
         let [a, b] = [&image.view_layer, &reference.view_layer];
         say(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
+    }
+    let views = [&image, &reference]
+        .map(|set| set.view.as_deref().map_or("the only view".into(), |view| format!("view '{view}'")));
+    if image.view.is_some() || reference.view.is_some() {
+        let [a, b] = views;
+        say(&format!("note: compares {a} of A with {b} of B; other views are not looked at"));
+    }
+    let primaries = [&args.image, &args.reference].map(|path| Frame::read_headers(path).ok()?.primaries());
+    if let [Some(a), Some(b)] = primaries
+        && a.iter().zip(b).any(|(a, b)| (a - b).abs() > SAME_PRIMARIES)
+    {
+        say(
+            "note: A and B tell of different primaries (chromaticities): their numbers mean different colours",
+        );
     }
     image.check_same_pixels(&reference, "its reference")?;
     let [image, reference] =
@@ -118,15 +135,18 @@ fn judged(args: &Args, say: &dyn Fn(&str)) -> Result<PassSet> {
     combined(&frame, &layer)
 }
 
-/// The reference, of the view layer of that name if there is one.
-fn reference(args: &Args, view_layer: &str) -> Result<PassSet> {
+/// The reference, of the view layer and view that the image is of if there is one.
+fn reference(args: &Args, image: &PassSet) -> Result<PassSet> {
     let frame = Frame::read(&args.reference)?;
     let layers = passes::layers(&frame);
     let layer = match args.reference_layer.as_str() {
-        COMBINED => passes::choose_like(&frame, &layers, view_layer)?.clone(),
+        COMBINED => passes::choose_like(&frame, &layers, &image.view_layer, image.view.as_deref())?.clone(),
         name => {
-            let namesake = layers.iter().any(|l| l.name == view_layer).then_some(view_layer);
-            named(&frame, namesake, name)?
+            let namesake = layers.iter().any(|l| l.name == image.view_layer).then_some(&*image.view_layer);
+            let found = named(&frame, namesake, name)?;
+            let of_view =
+                passes::rgb_layers(&frame, namesake, name).into_iter().find(|l| l.view == image.view);
+            of_view.unwrap_or(found)
         }
     };
     combined(&frame, &layer)

@@ -19,6 +19,12 @@ pub const DISTANCE: usize = 2;
 /// the filter of OpenEXR's `RgbaYca`.
 const WEIGHTS: [f32; 7] = [0.627_123, -0.186_077, 0.087_929, -0.043_159, 0.019_597, -0.007_540, 0.002_128];
 
+/// Whether a channel of that name holds chroma: the differences of red and blue from luminance, over luminance.
+pub fn is_chroma(name: &[u8]) -> bool {
+    let component = name.rsplit(|byte| *byte == b'.').next().unwrap_or(name);
+    component == b"RY" || component == b"BY"
+}
+
 /// Whether some channels are stored at less than full resolution.
 pub fn is_subsampled(header: &Header) -> bool {
     header.channels.list.iter().any(|channel| channel.sampling != Vec2(1, 1))

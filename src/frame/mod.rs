@@ -177,6 +177,11 @@ impl Frame {
         self.stored.iter().any(|stored| stored.attributes.value("envmap", "envmap") == Some(&[0]))
     }
 
+    /// x and y of red, green, blue and white in the CIE 1931 diagram, of the first part that tells them.
+    pub fn primaries(&self) -> Option<[f32; 8]> {
+        self.stored.iter().find_map(|stored| stored.attributes.chromaticities())
+    }
+
     /// The weights of red, green and blue in the luminance of a part, by its primaries, or those of Rec. 709
     /// where it names none.
     ///
@@ -286,7 +291,8 @@ impl Part {
         } else if self.compression.starts_with("htj2k") {
             Some(format!(
                 "is compressed as {}, which demc does not read; convert it with OpenImageIO on \
-                 OpenEXR 3.4 or newer: oiiotool IN.exr --compression zip -o OUT.exr",
+                 OpenEXR 3.4 or newer (whole numbers of 32 bits are rounded in that): oiiotool IN.exr --compression \
+                 zip -o OUT.exr",
                 self.compression.to_uppercase()
             ))
         } else {
@@ -298,6 +304,13 @@ impl Part {
                 self.compression.to_uppercase()
             ))
         }
+    }
+}
+
+impl Channel {
+    /// Whether it holds chroma beside luminance (`RY`, `BY`).
+    pub fn is_chroma(&self) -> bool {
+        chroma::is_chroma(self.name.as_bytes())
     }
 }
 

@@ -159,13 +159,17 @@ impl Denoiser for Learned {
             return Some(format!("{}: {note}", self.name));
         }
         let PassSet { view_layer, renderer, .. } = &shot.passes;
-        // Passes that are there but blank are left to `demc inspect`.
-        let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none();
+        let is_blank = |planes: &Planes| planes.data.iter().all(|v| *v == 0.0);
+        let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none_or(is_blank);
         let missed: Vec<Pass> = self.dispensable().iter().copied().filter(is_missing).collect();
-        let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
+        let name = |pass: &Pass| match shot.passes.get(*pass) {
+            Some(_) => format!("{pass}, which holds nothing,"),
+            None => pass.to_string(),
+        };
+        let names: Vec<String> = missed.iter().map(name).collect();
         (!missed.is_empty()).then(|| {
             format!(
-                "done without {}, at a loss of detail; {}",
+                "done without {} at a loss of detail; {}",
                 names.join(" and "),
                 remedy(view_layer, renderer, &missed)
             )

@@ -6,7 +6,9 @@
 
 use std::collections::BTreeMap;
 
-use super::names::{BARE_DEPTH, COMBINED, RENDERERS, is_bare, is_blender, is_known, light_group, plain};
+use super::names::{
+    BARE_DEPTH, BLENDER, COMBINED, RENDERERS, is_bare, is_blender, is_known, light_group, plain,
+};
 use crate::{
     frame::{Frame, Part},
     passes::Pass,
@@ -14,6 +16,8 @@ use crate::{
 
 /// Names of components that are words.
 const WORDS: [(&str, &str); 4] = [("red", "R"), ("green", "G"), ("blue", "B"), ("alpha", "A")];
+/// What Blender calls the beauty.
+const BLENDER_COMBINED: &str = "Combined";
 /// Nuke's name of the view in files that have only one.
 const MAIN: &str = "main";
 
@@ -68,6 +72,9 @@ struct Holder<'a> {
     views: &'a [String],
     /// Whether it holds colours as CIE X, Y, Z, whose Z is no depth.
     is_xyz: bool,
+    /// View layers whose names are joined to those of their passes by an underscore, as Nuke writes what Blender wrote:
+    /// `ViewLayer_Denoising_Albedo.red`.
+    joined: &'a [String],
 }
 
 impl ChannelName {
@@ -77,7 +84,11 @@ impl ChannelName {
             None => undotted(channel, part),
         };
         let (prefix, view) = without_view(prefix, part);
-        let (view_layer, pass) = prefix.rsplit_once('.').unwrap_or(("", prefix));
+        let joined = part.joined.iter().find_map(|layer| {
+            let pass = prefix.strip_prefix(layer.as_str())?.strip_prefix('_')?;
+            (is_alike_blender(pass) || light_group(pass).is_some()).then_some((layer.as_str(), pass))
+        });
+        let (view_layer, pass) = joined.or(prefix.rsplit_once('.')).unwrap_or(("", prefix));
         // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a
         // pass's: a view layer may be called like a pass.
         let is_rendered = |name: &str| is_blender(name) || light_group(name).is_some();
@@ -136,10 +147,10 @@ fn without_view<'a>(prefix: &'a str, part: Holder<'_>) -> (&'a str, Option<Strin
 
 /// The channels of each view layer and stereo view, in file order, by the names of their passes.
 pub fn by_pass(frame: &Frame) -> Vec<(LayerKey, ByPass)> {
-    let views = frame.views();
+    let (views, joined) = (frame.views(), joined(frame));
     let mut found: Vec<(LayerKey, ByPass)> = Vec::new();
     for (p, part) in frame.parts().iter().enumerate() {
-        let holder = holder(frame, part, &views);
+        let holder = Holder { joined: &joined, ..holder(frame, part, &views) };
         // Deep samples are no image.
         let flat = if part.deep { &[] } else { part.channels.as_slice() };
         for (c, channel) in flat.iter().enumerate() {
@@ -165,7 +176,27 @@ fn holder<'a>(frame: &Frame, part: &'a Part, views: &'a [String]) -> Holder<'a> 
     // A single part's name is the name of the file's only image, unless it ends in that of a pass.
     let name = part.name.as_deref().filter(|name| frame.is_multi_part() || ends_in_pass(name));
     let has = |wanted: &str| part.channels.iter().any(|channel| channel.name.eq_ignore_ascii_case(wanted));
-    Holder { name, view: part.view.as_deref(), views, is_xyz: has("X") && has("Y") }
+    Holder { name, view: part.view.as_deref(), views, is_xyz: has("X") && has("Y"), joined: &[] }
+}
+
+/// Whether a name is one of Blender's passes' but for spaces, underscores and case.
+fn is_alike_blender(name: &str) -> bool {
+    let name = plain(name);
+    BLENDER.rows.iter().flat_map(|row| row.names).any(|known| plain(known) == name)
+}
+
+/// The view layers whose Combined is called `<view layer>_Combined`, longest names first.
+fn joined(frame: &Frame) -> Vec<String> {
+    let layers = frame.parts().iter().flat_map(|part| {
+        let prefixes = part.channels.iter().filter_map(|channel| Some(channel.name.rsplit_once('.')?.0));
+        prefixes.chain(part.name.as_deref())
+    });
+    let heads = layers.filter_map(|layer| layer.strip_suffix(BLENDER_COMBINED)?.strip_suffix('_'));
+    let mut heads: Vec<String> =
+        heads.filter(|head| !head.is_empty() && !head.contains('.')).map(str::to_owned).collect();
+    heads.sort_by_key(|head| std::cmp::Reverse(head.len()));
+    heads.dedup();
+    heads
 }
 
 /// Whether a part is called `<view layer>.<pass>`.
@@ -195,7 +226,13 @@ fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
         if layers().any(|(_, passes)| passes.keys().any(|pass| beauty.contains(&plain(pass)))) {
             continue;
         }
-        let first = layers().flat_map(|(_, passes)| passes.values().flatten()).map(|place| place.part).min();
+        // Cryptomattes hold numbers in R, G and B.
+        let is_matte = |place: &&Place| {
+            let name = frame.parts()[place.part].name.as_deref().unwrap_or_default();
+            name.to_lowercase().contains("crypto")
+        };
+        let places = layers().flat_map(|(_, passes)| passes.values().flatten());
+        let first = places.filter(|place| !is_matte(place)).map(|place| place.part).min();
         // It is R, G and B without a pass, in a part whose name means nothing.
         let is_it = |name: &str, places: &[Place]| {
             let has = |wanted: &str| {

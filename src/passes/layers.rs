@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 use super::{
-    Mapping, Pass, PassSet,
+    Mapping, Pass, PassSet, Quantity,
     channels::{ByPass, LayerKey, Place, by_pass, is_component},
     names::{
         BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_bare, is_common,
@@ -106,23 +106,27 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
     };
     // Bare channels have the same names in all renderers, so they tell nothing.
     let is_telling = |name: &str| !(layer.name.is_empty() && name == COMBINED) && name != BARE_DEPTH;
-    let told = |passes: &BTreeMap<Pass, PassChannels>| {
-        passes
-            .values()
-            .map(|at| at.name.as_str())
-            .filter(|name| is_telling(name))
-            .collect::<HashSet<_>>()
-            .len()
+    // The names that a renderer knows, all those of a pass among them. Without a view layer's name, a renderer that
+    // knows the albedo comes before others: light passes are called alike in many.
+    let told = |renderer: &'static Renderer, passes: &BTreeMap<Pass, PassChannels>| {
+        let names = Pass::ALL.iter().flat_map(|&pass| renderer.names(pass).map(move |name| (name, pass)));
+        let found = names.filter_map(|(name, pass)| Some(index.find(name, pass)?.name));
+        let count = found.filter(|name| is_telling(name)).collect::<HashSet<_>>().len();
+        let albedo = passes.get(&Pass::DenoisingAlbedo);
+        let knows_albedo = albedo.is_some_and(|at| is_telling(&at.name) && is_common(&at.name));
+        (layer.name.is_empty() && knows_albedo, count)
     };
     let by_all = RENDERERS.map(|renderer| (renderer, known_by(renderer)));
-    let best = by_all.iter().rev().max_by_key(|(_, passes)| told(passes)); // `max_by_key` keeps the last of equals
+    let best = by_all.iter().rev().max_by_key(|(renderer, passes)| told(renderer, passes)); // keeps the last of equals
     let (renderer, passes) = best.expect("there are renderers");
     (layer.renderer, layer.passes) = (renderer, passes.clone());
     // A file that a compositor wrote may have names of several renderers. Passes that Blender leaves out stay
-    // out, since its passes differ from those of the same name in other renderers.
+    // out, since its passes differ from those of the same name in other renderers. Light, which Blender alone divides by
+    // the surface's colour, stays out for the same reason.
+    let is_light = |pass: &Pass| pass.quantity() == Quantity::Radiance && *pass != Pass::Combined;
     if !renderer.is_blender() {
         for (pass, at) in by_all.iter().flat_map(|(_, passes)| passes) {
-            if is_common(&at.name) && *pass != Pass::Normal {
+            if is_common(&at.name) && *pass != Pass::Normal && !is_light(pass) {
                 layer.passes.entry(*pass).or_insert_with(|| at.clone());
             }
         }
@@ -275,6 +279,10 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
                     frame.parts().iter().filter(|part| part.channels.iter().any(|c| c.subsampled));
                 let why = subsampled.find_map(Part::undecodable).unwrap_or_else(|| {
                     let setting = BLENDER.setting(Pass::Combined);
+                    let is_grey = |part: &Part| part.channels.iter().all(|c| is_component(&c.name, "Y") || is_component(&c.name, "A"));
+                    if frame.parts().iter().all(is_grey) {
+                        return "holds one channel of luminance and no colours, which no model reads; save it with R, G and B".into();
+                    }
                     format!(
                         "no layer has a Combined pass; {}; {setting}; in other renderers' files say which layer it is: \
                          --map beauty=NAME",
@@ -288,15 +296,24 @@ pub fn choose<'a>(frame: &Frame, layers: &'a [Layer], view_layer: Option<&str>) 
 
 /// The view layer to compare with one called `name` in another file: the one of the same name, or else the
 /// only one with Combined besides the compositor's. An empty `name`, as in files without view layers, tells
-/// nothing to choose by, and the view layer is that of [`choose`].
+/// nothing to choose by, and the view layer is that of [`choose`]. Of stereo views it is that of the same name, where
+/// there is one, or else the first.
 ///
 /// # Errors
 /// There is no such view layer; the message lists what there is.
-pub fn choose_like<'a>(frame: &Frame, layers: &'a [Layer], name: &str) -> Result<&'a Layer> {
+pub fn choose_like<'a>(
+    frame: &Frame,
+    layers: &'a [Layer],
+    name: &str,
+    view: Option<&str>,
+) -> Result<&'a Layer> {
+    let of_view = |like: &'a Layer| {
+        layers.iter().find(|l| l.name == like.name && l.view.as_deref() == view).unwrap_or(like)
+    };
     if let Some(namesake) = layers.iter().find(|l| l.name == name) {
-        return Ok(namesake);
+        return Ok(of_view(namesake));
     }
-    let first = choose(frame, layers, None)?;
+    let first = of_view(choose(frame, layers, None)?);
     let mut rendered =
         layers.iter().filter(|l| l.name != COMPOSITE && l.passes.contains_key(&Pass::Combined));
     if !name.is_empty() && rendered.any(|l| l.name != first.name) {
@@ -343,6 +360,7 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     let mut set = PassSet::new(frame.path(), &layer.name, window.width, window.height);
     set.origin = (window.x, window.y);
     set.renderer = layer.renderer;
+    set.view.clone_from(&layer.view);
     // Blender's metadata tells the samples; with adaptive sampling, the most that a pixel may have had.
     // Programs that write a render anew leave it out; then the file's name may tell, as that of render pairs.
     let told = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
@@ -384,7 +402,7 @@ fn decode<'a, K>(
     for (part, (keys, channels)) in by_part {
         let stored = frame.parts()[part].data_window;
         let images = frame.decode(part, &channels)?;
-        let is_chroma = |channel: usize| frame.parts()[part].channels[channel].subsampled;
+        let is_chroma = |channel: usize| frame.parts()[part].channels[channel].is_chroma();
         for ((key, channels), mut image) in keys.into_iter().zip(channels).zip(images) {
             if let [_, red, blue] = *channels
                 && is_chroma(red)

@@ -184,6 +184,8 @@ pub struct PassSet {
     pub path: PathBuf,
     /// The view layer they belong to.
     pub view_layer: String,
+    /// Its stereo view, where the file has views.
+    pub view: Option<String>,
     /// Pixels in a row.
     pub width: usize,
     /// Rows.
@@ -202,13 +204,14 @@ impl PassSet {
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
         let (path, view_layer) = (path.into(), view_layer.into());
-        let (origin, samples, renderer) = ((0, 0), None, &BLENDER);
-        Self { path, view_layer, width, height, origin, samples, renderer, planes: BTreeMap::new() }
+        let (view, origin, samples, renderer) = (None, (0, 0), None, &BLENDER);
+        Self { path, view_layer, view, width, height, origin, samples, renderer, planes: BTreeMap::new() }
     }
 
     /// A set without passes, of another size, that tells the same facts of the render.
     pub fn empty(&self, (width, height): (usize, usize)) -> Self {
         Self {
+            view: self.view.clone(),
             samples: self.samples,
             renderer: self.renderer,
             ..Self::new(&self.path, &self.view_layer, width, height)
@@ -358,13 +361,13 @@ pub fn load(path: impl AsRef<Path>, view_layer: Option<&str>) -> Result<PassSet>
     read(&Frame::read(path)?, view_layer)
 }
 
-/// Reads a file and the passes of the view layer that is to be compared with one of that name in another
-/// file, see [`choose_like`].
+/// Reads a file and the passes of the view layer that is to be compared with another file's, see [`choose_like`].
 ///
 /// # Errors
 /// The file is unusable, or has no such view layer.
-pub fn load_like(path: impl AsRef<Path>, view_layer: &str) -> Result<PassSet> {
+pub fn load_like(path: impl AsRef<Path>, other: &PassSet) -> Result<PassSet> {
     let frame = Frame::read(path)?;
     let layers = layers(&frame);
-    read_layer(&frame, choose_like(&frame, &layers, view_layer)?, &Pass::ALL)
+    let layer = choose_like(&frame, &layers, &other.view_layer, other.view.as_deref())?;
+    read_layer(&frame, layer, &Pass::ALL)
 }

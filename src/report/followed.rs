@@ -5,7 +5,7 @@ use std::{collections::HashMap, path::Path};
 
 use super::{
     Contender, NOISY,
-    run::{Loaded, load},
+    pair::{Loaded, load},
 };
 use crate::{
     denoise::follows,

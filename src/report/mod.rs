@@ -18,6 +18,7 @@ mod labels;
 #[cfg(feature = "train")]
 mod loss;
 mod page;
+mod pair;
 mod palette;
 mod picture;
 mod provenance;
@@ -36,10 +37,11 @@ pub use heat::{HeatCell, HeatMap};
 #[cfg(feature = "train")]
 pub use loss::loss_chart;
 pub(crate) use page::{document, picture_of, sheet_text};
+pub use pair::{Loaded, load, load_listed};
 pub use palette::is_own;
 pub use provenance::Provenance;
 pub use rows::{COLUMNS, Row, append_row, read_rows, to_csv, write_file, write_json};
-pub use run::{EvalEvent, Loaded, evaluate, load, load_listed, remove_chart, sheet_name};
+pub use run::{EvalEvent, evaluate, remove_chart, sheet_name};
 pub use settings::file_stamp;
 pub use summary::{MethodSummary, geometric_mean, mean, summarise};
 

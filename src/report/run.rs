@@ -1,8 +1,4 @@
-//! The run itself: every method on every pair, interleaved, scored, timed and stored as it finishes.
-//!
-//! On a pair, each method first runs once to be scored. Then the methods take turns for the timed runs, so
-//! that a machine that slows down slows them all, and each timed run follows an untimed one of the same
-//! method. Memory is measured apart, once for each method and size of frame.
+//! The run itself: every method on every pair, each row stored as it finishes, and then the report.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -14,27 +10,18 @@ use super::{
     bars::Bars,
     chart::Chart,
     figure::Figure,
-    followed::{Followed, NO_FLICKER, is_next},
+    followed::{NO_FLICKER, is_next},
     page::Page,
+    pair::{Carried, PairRun},
     provenance::Provenance,
     rows::{Key, Row, Table, read_rows, write_file},
     samples::Samples,
     sequences,
     settings::{self, Settings},
-    sheet::{self, Shown},
-    summary,
+    sheet,
+    summary::{self, MethodSummary},
 };
-use crate::{
-    Error, Result, denoise,
-    error::attempt,
-    frame::prepare_folder,
-    metrics::{self, pairing},
-    models::{Denoiser, Run},
-    passes::{self, Pass},
-    planes::Planes,
-    shot::{self, Shot},
-    testset::Pair,
-};
+use crate::{Error, Result, frame::prepare_folder, testset::Pair};
 
 /// What a run tells while it goes on.
 #[derive(Debug)]
@@ -65,148 +52,251 @@ pub fn evaluate(
     options: &EvalOptions,
     on: &mut dyn FnMut(EvalEvent),
 ) -> Result<Vec<Row>> {
-    let out = &options.out;
-    let sheets = out.join("sheets");
-    prepare_folder(out)?;
-    if options.sheets {
-        prepare_folder(&sheets)?;
+    let mut evaluation = Evaluation::begin(pairs, methods, options, on)?;
+    let mut carried = Carried::new(pairs, options);
+    for (pair, sheet) in pairs.iter().zip(sheet_names(pairs)) {
+        evaluation.run(pair, &sheet, &mut carried, on)?;
     }
-    let (scores, stored) = (out.join("scores.csv"), out.join("run.json"));
-    let provenance = Provenance::now();
-    let (before, mut now) = (Settings::read(&stored), Settings::of(pairs, methods, options, &provenance));
-    let keys: Vec<Key> =
-        pairs.iter().flat_map(|p| methods.iter().map(|m| Row::new(p, &m.name).key())).collect();
-    let asked: HashSet<&Key> = keys.iter().collect();
-    let rows = match read_rows(&scores) {
-        Err(_) if options.overwrite => Vec::new(),
-        rows => rows?,
-    };
-    let by_key: HashMap<(PathBuf, PathBuf), &Pair> =
-        pairs.iter().map(|pair| (Row::new(pair, NOISY).files(), pair)).collect();
-    let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
-        rows.into_iter().partition(|row| asked.contains(&row.key()));
-    // A row that failed is tried again, and one without flicker, if the test set now holds the frame before.
-    let wants_flicker = |row: &Row, pair: &Pair| {
-        row.flicker.is_none()
-            && !row.note.contains(NO_FLICKER)
-            && pairs.iter().any(|other| is_next(pair, other))
-    };
-    kept.retain_mut(|row| {
-        let pair = by_key[&row.files()];
-        let is_whole = row.reason.is_empty() && !wants_flicker(row, pair);
-        let holds = !options.overwrite && is_whole && before.still_holds(row, &now);
-        row.rename(pair);
-        holds
-    });
-    let count = others.len();
-    others.retain(|row| before.still_holds(row, &now));
-    others.iter().for_each(|row| now.keep(row, &before));
-    others.iter_mut().for_each(|row| {
-        if let Some(pair) = by_key.get(&row.files()) {
-            row.rename(pair);
+    evaluation.report()
+}
+
+/// A run under way.
+struct Evaluation<'a> {
+    pairs: &'a [Pair],
+    methods: &'a [Contender],
+    options: &'a EvalOptions,
+    provenance: Provenance,
+    /// What the rows in the folder are made with; stored in `run.json`.
+    settings: Settings,
+    table: Table,
+}
+
+impl<'a> Evaluation<'a> {
+    /// Takes up what earlier runs left in the folder and what of it holds.
+    fn begin(
+        pairs: &'a [Pair],
+        methods: &'a [Contender],
+        options: &'a EvalOptions,
+        on: &mut dyn FnMut(EvalEvent),
+    ) -> Result<Self> {
+        prepare_folder(&options.out)?;
+        if options.sheets {
+            prepare_folder(&options.out.join("sheets"))?;
         }
-    });
-    if others.len() < count {
-        on(EvalEvent::Note(&format!(
-            "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor or files \
-             have changed",
-            scores.display(),
-            count - others.len()
-        )));
+        let scores = options.out.join("scores.csv");
+        let provenance = Provenance::now();
+        let mut settings = Settings::of(pairs, methods, options, &provenance);
+        let before = Settings::read(&options.out.join(STORED));
+        let rows = match read_rows(&scores) {
+            Err(_) if options.overwrite => Vec::new(),
+            rows => rows?,
+        };
+        let earlier = Earlier::sort_out(rows, pairs, methods, options, (&before, &settings));
+        earlier.others.iter().for_each(|row| settings.keep(row, &before));
+        settings.sheets = before.sheets;
+        if earlier.dropped > 0 {
+            on(EvalEvent::Note(&format!(
+                "{}: {} rows of other methods or renders are dropped: since they were made, options, program, processor \
+                 or files have changed",
+                scores.display(),
+                earlier.dropped
+            )));
+        }
+        on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept: earlier.kept.len() });
+        let table = Table::create(scores, earlier.kept, earlier.others)?;
+        let mut evaluation = Self { pairs, methods, options, provenance, settings, table };
+        for (pair, sheet) in pairs.iter().zip(sheet_names(pairs)) {
+            // It is noted again when it is drawn. If this run is killed before that, the old sheet is not taken
+            // for one of the new rows.
+            let is_finished = evaluation.finished(pair).iter().all(|finished| *finished);
+            if !is_finished || evaluation.settings.sheets.get(&sheet) != Some(&evaluation.content(pair)) {
+                evaluation.settings.sheets.remove(&sheet);
+            }
+        }
+        evaluation.store_settings()?;
+        Ok(evaluation)
     }
 
-    on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept: kept.len() });
-    let mut table = Table::create(scores, kept, others)?;
-    let names: Vec<String> = methods.iter().map(|m| m.name.clone()).collect();
-    let shows =
-        |pair: &Pair| format!("{} of {}", names.join(", "), settings::name(&pair.noisy, &pair.reference));
-    let sheet_names: Vec<String> = pairs.iter().map(|pair| sheet_name(pairs, pair)).collect();
-    now.sheets = before.sheets;
-    for (pair, sheet) in pairs.iter().zip(&sheet_names) {
-        let is_finished = methods.iter().all(|m| table.get(&Row::new(pair, &m.name).key()).is_some());
-        // It is noted again when it is drawn. If this run is killed before that, the old sheet is not taken
-        // for one of the new rows.
-        if !is_finished || now.sheets.get(sheet) != Some(&shows(pair)) {
-            now.sheets.remove(sheet);
-        }
-    }
-    now.write(&stored)?;
-    let mut peaks = Peaks::new();
-    let mut followed = Followed::new(pairs, options.view_layer.as_deref());
-    for (pair, name) in pairs.iter().zip(&sheet_names) {
-        let finished: Vec<bool> =
-            methods.iter().map(|m| table.get(&Row::new(pair, &m.name).key()).is_some()).collect();
-        let sheet = options.sheets.then(|| sheets.join(name));
-        let sheet = sheet.filter(|path| !(now.sheets.contains_key(name) && path.is_file()));
-        if finished.iter().all(|f| *f) && sheet.is_none() {
-            continue;
+    /// Runs the methods on a pair that lack their row or their image on the pair's sheet.
+    fn run(
+        &mut self,
+        pair: &Pair,
+        sheet: &str,
+        carried: &mut Carried<'_>,
+        on: &mut dyn FnMut(EvalEvent),
+    ) -> Result<()> {
+        let finished = self.finished(pair);
+        let shown = self.options.sheets && self.drawn(sheet).is_none();
+        if finished.iter().all(|finished| *finished) && !shown {
+            return Ok(());
         }
         on(EvalEvent::Pair(pair));
-        let done = run_pair(pair, methods, &finished, sheet.is_some(), options, (&mut peaks, &mut followed));
+        let run = PairRun { pair, methods: self.methods, finished: &finished, shown, options: self.options };
+        let done = run.run(carried);
         for row in done.rows {
             if !row.note.is_empty() {
                 on(EvalEvent::Note(&row.note));
             }
             on(EvalEvent::Row(&row));
-            table.push(row)?;
+            self.table.push(row)?;
         }
-        if let (Some(path), Some(scene)) = (sheet, done.scene) {
-            let rows: HashMap<&str, &Row> = methods
-                .iter()
-                .filter_map(|m| Some((m.name.as_str(), table.get(&Row::new(pair, &m.name).key())?)))
-                .collect();
-            sheet::write(&path, pair, &scene.reference, &scene.images, &rows)?;
-            if pair.frame.is_some() {
-                sequences::store(out, name, &scene.images, &scene.reference)?;
-            }
-            now.sheets.insert(name.clone(), shows(pair));
-            now.write(&stored)?;
+        let Some(scene) = done.scene else { return Ok(()) };
+        let rows =
+            self.methods.iter().filter_map(|method| Some((method.name.as_str(), self.row(pair, method)?)));
+        sheet::write(&self.sheet_path(sheet), pair, &scene.reference, &scene.images, &rows.collect())?;
+        if pair.frame.is_some() {
+            sequences::store(&self.options.out, sheet, &scene.images, &scene.reference)?;
         }
+        self.settings.sheets.insert(sheet.into(), self.content(pair));
+        self.store_settings()
     }
 
-    let rows = table.finish(keys)?;
-    let summaries = summary::summarise(&rows, &names, &options.baseline);
-    write_file(&out.join("summary.csv"), summary::to_text(&summaries, &options.baseline).as_bytes())?;
+    /// Writes summary, charts and page.
+    fn report(self) -> Result<Vec<Row>> {
+        let out = &self.options.out;
+        let names = self.names();
+        let sheets: Vec<Option<PathBuf>> = sheet_names(self.pairs)
+            .iter()
+            .map(|sheet| self.drawn(sheet).filter(|_| self.options.sheets))
+            .collect();
+        let scenes: Vec<(&Pair, Option<PathBuf>)> = self.pairs.iter().zip(sheets).collect();
+        let rows = self.table.finish(keys(self.pairs, self.methods))?;
+        let summaries = summary::summarise(&rows, &names, &self.options.baseline);
+        let summary = summary::to_text(&summaries, &self.options.baseline);
+        write_file(&out.join("summary.csv"), summary.as_bytes())?;
+        let charts = write_charts(&rows, &summaries, &names, self.options)?;
+        for slice in std::fs::read_dir(out.join("slices")).into_iter().flatten().flatten() {
+            if slice.path().extension().is_some_and(|extension| extension == "png") {
+                std::fs::remove_file(slice.path()).map_err(Error::io("remove", slice.path()))?;
+            }
+        }
+        let sequences = if self.options.sheets { sequences::section(out, self.pairs, &names)? } else { None };
+        Page {
+            sequences: sequences.as_ref(),
+            rows: &rows,
+            summaries: &summaries,
+            charts: &charts,
+            scenes: &scenes,
+            options: self.options,
+            provenance: &self.provenance,
+        }
+        .write()?;
+        Ok(rows)
+    }
+
+    /// The names of the methods.
+    fn names(&self) -> Vec<String> {
+        self.methods.iter().map(|method| method.name.clone()).collect()
+    }
+
+    /// The row of a method on a pair, where it is finished.
+    fn row(&self, pair: &Pair, method: &Contender) -> Option<&Row> {
+        self.table.get(&Row::new(pair, &method.name).key())
+    }
+
+    /// Which methods have their row on a pair.
+    fn finished(&self, pair: &Pair) -> Vec<bool> {
+        self.methods.iter().map(|method| self.row(pair, method).is_some()).collect()
+    }
+
+    fn sheet_path(&self, sheet: &str) -> PathBuf {
+        self.options.out.join("sheets").join(sheet)
+    }
+
+    /// The sheet's file, if it shows what this run asks for.
+    fn drawn(&self, sheet: &str) -> Option<PathBuf> {
+        let is_known = self.settings.sheets.contains_key(sheet);
+        is_known.then(|| self.sheet_path(sheet)).filter(|path| path.is_file())
+    }
+
+    /// What the sheet of a pair shows, as `run.json` notes it.
+    fn content(&self, pair: &Pair) -> String {
+        format!("{} of {}", self.names().join(", "), settings::name(&pair.noisy, &pair.reference))
+    }
+
+    fn store_settings(&self) -> Result<()> {
+        self.settings.write(&self.options.out.join(STORED))
+    }
+}
+
+/// Name of the file with the settings of what is in the folder.
+const STORED: &str = "run.json";
+
+/// What identifies the rows that are asked for, in order.
+fn keys(pairs: &[Pair], methods: &[Contender]) -> Vec<Key> {
+    pairs.iter().flat_map(|pair| methods.iter().map(|method| Row::new(pair, &method.name).key())).collect()
+}
+
+/// The rows of earlier runs.
+struct Earlier {
+    /// Those that are asked for and hold.
+    kept: Vec<Row>,
+    /// Those that are not asked for and hold.
+    others: Vec<Row>,
+    /// How many are not asked for and do not hold.
+    dropped: usize,
+}
+
+impl Earlier {
+    /// Tells which rows hold. They get the names that their pairs have now.
+    fn sort_out(
+        rows: Vec<Row>,
+        pairs: &[Pair],
+        methods: &[Contender],
+        options: &EvalOptions,
+        (before, now): (&Settings, &Settings),
+    ) -> Self {
+        let asked: HashSet<Key> = keys(pairs, methods).into_iter().collect();
+        let by_files: HashMap<(PathBuf, PathBuf), &Pair> =
+            pairs.iter().map(|pair| (Row::new(pair, NOISY).files(), pair)).collect();
+        // A row that failed is tried again, and one without flicker, if the test set now holds the frame before.
+        let wants_flicker = |row: &Row, pair: &Pair| {
+            row.flicker.is_none()
+                && !row.note.contains(NO_FLICKER)
+                && pairs.iter().any(|other| is_next(pair, other))
+        };
+        let (mut kept, mut others): (Vec<Row>, Vec<Row>) =
+            rows.into_iter().partition(|row| asked.contains(&row.key()));
+        kept.retain(|row| {
+            let is_whole = row.reason.is_empty() && !wants_flicker(row, by_files[&row.files()]);
+            !options.overwrite && is_whole && before.still_holds(row, now)
+        });
+        let count = others.len();
+        others.retain(|row| before.still_holds(row, now));
+        let dropped = count - others.len();
+        for row in kept.iter_mut().chain(&mut others) {
+            if let Some(pair) = by_files.get(&row.files()) {
+                row.rename(pair);
+            }
+        }
+        Self { kept, others, dropped }
+    }
+}
+
+/// Writes the charts that the rows give, and removes those of an earlier run that they do not give. Returns them as
+/// SVG with their titles.
+fn write_charts(
+    rows: &[Row],
+    summaries: &[MethodSummary],
+    methods: &[String],
+    options: &EvalOptions,
+) -> Result<Vec<(&'static str, String)>> {
+    let out = &options.out;
     let mut charts = vec![
-        ("Speed and accuracy", Chart::new(&summaries, options.threads).write(out, "speed_vs_accuracy")?),
-        ("RelMSE of every scene", Bars::relmse(&rows, &summaries).write(out, "bars_relmse")?),
-        ("SSIM of every scene", Bars::ssim(&rows, &summaries).write(out, "bars_ssim")?),
+        ("Speed and accuracy", Chart::new(summaries, options.threads).write(out, "speed_vs_accuracy")?),
+        ("RelMSE of every scene", Bars::relmse(rows, summaries).write(out, "bars_relmse")?),
+        ("SSIM of every scene", Bars::ssim(rows, summaries).write(out, "bars_ssim")?),
     ];
-    // What this run has nothing for is not left over from another.
     for name in ["bars_flicker", "error_over_samples"] {
         remove_chart(out, name)?;
     }
     if rows.iter().any(|row| row.flicker.is_some()) {
-        charts.push(("Flicker of every frame", Bars::flicker(&rows, &summaries).write(out, "bars_flicker")?));
+        charts.push(("Flicker of every frame", Bars::flicker(rows, summaries).write(out, "bars_flicker")?));
     }
-    if let Some(samples) = Samples::new(&rows, &names) {
+    if let Some(samples) = Samples::new(rows, methods) {
         charts.push(("Error over samples", samples.write(out, "error_over_samples")?));
     }
-    let scenes: Vec<(&Pair, Option<PathBuf>)> = pairs
-        .iter()
-        .zip(&sheet_names)
-        .map(|(pair, name)| {
-            let is_known = options.sheets && now.sheets.contains_key(name);
-            (pair, is_known.then(|| sheets.join(name)).filter(|path| path.is_file()))
-        })
-        .collect();
-    for slice in std::fs::read_dir(out.join("slices")).into_iter().flatten().flatten() {
-        if slice.path().extension().is_some_and(|extension| extension == "png") {
-            std::fs::remove_file(slice.path()).map_err(Error::io("remove", slice.path()))?;
-        }
-    }
-    let sequences = if options.sheets { sequences::section(out, pairs, &names)? } else { None };
-    Page {
-        sequences: sequences.as_ref(),
-        rows: &rows,
-        summaries: &summaries,
-        charts: &charts,
-        scenes: &scenes,
-        options,
-        provenance: &provenance,
-    }
-    .write()?;
-    Ok(rows)
+    Ok(charts)
 }
 
 /// Removes a chart of an earlier run, where there is one.
@@ -225,6 +315,11 @@ pub fn remove_chart(out: &Path, name: &str) -> Result<()> {
     Ok(())
 }
 
+/// The file names of the pairs' sheets.
+fn sheet_names(pairs: &[Pair]) -> Vec<String> {
+    pairs.iter().map(|pair| sheet_name(pairs, pair)).collect()
+}
+
 /// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
 pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     let file_name = |pair: &Pair| pair.id().replace(['/', '\\'], "_");
@@ -238,225 +333,17 @@ pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     }
 }
 
-/// What running a pair gave.
-struct Done {
-    /// Rows of the methods that were not finished.
-    rows: Vec<Row>,
-    /// Images for the sheet, where the pair could be read.
-    scene: Option<Scene>,
-}
-
-struct Scene {
-    reference: Planes,
-    images: Vec<Shown>,
-}
-
-/// The decoded pair.
-pub struct Loaded {
-    /// What methods are given; its half buffers are not read yet.
-    pub shot: Shot,
-    /// The reference's radiance, of the same size.
-    pub reference: Planes,
-}
-
-impl Loaded {
-    /// The render as it is stored in the file, which is scored as the method `noisy`.
-    pub fn noisy(&self) -> &Planes {
-        self.shot.as_stored().expect("a pair without Combined is not loaded")
-    }
-
-    /// Reads the frames around the noisy one that lie beside it, for methods that make use of them; those
-    /// that cannot be read are left out.
-    pub fn read_neighbours(&mut self, reach: usize, view_layer: Option<&str>) {
-        for (offset, path) in denoise::neighbours(&self.shot.passes.path, reach) {
-            if let Ok(shot) = shot::prepare(&path, view_layer) {
-                self.shot.neighbours.insert(offset, shot.passes);
-            }
-        }
-    }
-}
-
-/// Reads a pair of frames. Of the noisy one it reads the named view layer, or by default the one with the
-/// most passes, and of the reference the view layer that corresponds to it, see [`passes::load_like`].
-///
-/// # Errors
-/// A file is unusable or lacks Combined, or they do not hold the same pixels.
-pub fn load(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
-    let shot = shot::prepare(&pair.noisy, view_layer)?;
-    shot.passes.require(Pass::Combined, NOISY)?;
-    let mut reference = passes::load_like(&pair.reference, &shot.passes.view_layer)?;
-    shot.passes.check_same_pixels(&reference, "its reference")?;
-    reference.require(Pass::Combined, "a reference")?;
-    let reference = reference.remove(Pass::Combined).expect("it is there");
-    Ok(Loaded { shot, reference })
-}
-
-/// As [`load`], of a pair whose reference may be missing.
-///
-/// # Errors
-/// As [`load`], or there is no reference.
-pub fn load_listed(pair: &Pair, view_layer: Option<&str>) -> Result<Loaded> {
-    if !pair.reference.is_file() {
-        return Err(pair.no_reference());
-    }
-    attempt(&pair.noisy, || load(pair, view_layer))
-}
-
-/// Memory peaks known so far, by method, width and height.
-type Peaks = HashMap<(String, usize, usize), Option<f64>>;
-
-fn run_pair(
-    pair: &Pair,
-    methods: &[Contender],
-    finished: &[bool],
-    shown: bool,
-    options: &EvalOptions,
-    (peaks, followed): (&mut Peaks, &mut Followed),
-) -> Done {
-    let open = || methods.iter().zip(finished).filter(|(_, finished)| !**finished).map(|(m, _)| m);
-    let new_row = |method: &Contender| {
-        let mut row = Row::new(pair, &method.name);
-        row.threads = options.threads;
-        row
-    };
-    let mut loaded = match load_listed(pair, options.view_layer.as_deref()) {
-        Ok(loaded) => loaded,
-        Err(error) => {
-            let fail = |method| Row { reason: error.to_string(), ..new_row(method) };
-            return Done { rows: open().map(fail).collect(), scene: None };
-        }
-    };
-    let (width, height) = (loaded.noisy().width, loaded.noisy().height);
-    // If half buffers are unusable, only the methods that read them fail.
-    let halves = if methods.iter().any(|method| method.denoiser.reads_halves()) {
-        attempt(&pair.noisy, || loaded.shot.read_halves()).map_err(|error| error.to_string())
-    } else {
-        Ok(())
-    };
-    let reach = methods.iter().map(|method| method.denoiser.reach()).max().unwrap_or(0);
-    loaded.read_neighbours(reach, options.view_layer.as_deref());
-    let mut before = followed.before(pair);
-    let mut rows: Vec<Option<Row>> = Vec::new();
-    let mut images = Vec::new();
-    for (method, &finished) in methods.iter().zip(finished) {
-        if finished && !shown {
-            rows.push(None);
-            continue;
-        }
-        let mut row = new_row(method);
-        (row.width, row.height) = (Some(width), Some(height));
-        let image = match &halves {
-            Err(why) if method.denoiser.reads_halves() => {
-                row.reason.clone_from(why);
-                None
-            }
-            _ => first_run(method, pair, &loaded, &mut row),
-        };
-        if !finished {
-            method.denoiser.notes(&loaded.shot).iter().for_each(|note| row.say(note));
-        }
-        if !finished && method.name == NOISY {
-            let warning = pairing::warning(pair.id(), loaded.noisy(), &loaded.reference);
-            warning.iter().for_each(|warning| row.say(warning));
-        }
-        if !finished && row.is_valid() && row.peak_mib.is_none() && method.name != NOISY {
-            let measure = || (method.peak_mib)(&pair.noisy);
-            row.peak_mib = *peaks.entry((method.name.clone(), width, height)).or_insert_with(measure);
-        }
-        if !finished && let (Some(image), Some(before)) = (&image, before.as_mut()) {
-            match before.flicker(method, image, &loaded) {
-                Ok(Some(flicker)) => row.flicker = Some(flicker),
-                Ok(None) => row.say(&format!("{NO_FLICKER}: no pixel can be followed from the frame before")),
-                Err(why) => row.say(&why),
-            }
-        }
-        if let Some(image) = &image {
-            followed.keep(pair, &loaded.reference, &method.name, image);
-        }
-        if shown && let Some(image) = &image {
-            images.push(Shown::new(&method.name, image, &loaded.reference));
-        }
-        rows.push((!finished).then_some(row));
-    }
-    let mut times: Vec<Vec<f64>> = vec![Vec::new(); methods.len()];
-    for _ in 0..options.repeats {
-        for (i, method) in methods.iter().enumerate() {
-            let Some(row) = rows[i].as_mut().filter(|row| row.is_valid() && method.name != NOISY) else {
-                continue;
-            };
-            match attempt(&pair.noisy, || timed_run(&*method.denoiser, &loaded.shot)) {
-                Ok(run) => times[i].push(run.seconds),
-                Err(error) => {
-                    let (width, height) = (row.width, row.height);
-                    *row = Row { reason: error.to_string(), width, height, ..new_row(method) };
-                    times[i].clear();
-                }
-            }
-        }
-    }
-    for (row, times) in rows.iter_mut().zip(&mut times) {
-        if let Some(row) = row {
-            row.repeats = times.len();
-            row.set_time(times, width * height);
-        }
-    }
-    Done {
-        rows: rows.into_iter().flatten().collect(),
-        scene: shown.then_some(Scene { reference: loaded.reference, images }),
-    }
-}
-
-/// A timed run, right after an untimed one unless the method needs none. Cores that have waited for another
-/// process are slow for some 20 ms (twice as slow in a virtual machine), and that must not count against the
-/// method that comes next.
-fn timed_run(denoiser: &dyn Denoiser, shot: &Shot) -> Result<Run> {
-    if !denoiser.is_warm() {
-        denoiser.denoise(shot)?;
-    }
-    denoiser.denoise_timed(shot)
-}
-
-/// The run that is scored. None, with a reason in the row, where it fails.
-fn first_run(method: &Contender, pair: &Pair, loaded: &Loaded, row: &mut Row) -> Option<Planes> {
-    let image = if method.name == NOISY {
-        loaded.noisy().clone()
-    } else {
-        match attempt(&pair.noisy, || method.denoiser.denoise_timed(&loaded.shot)) {
-            Ok(run) => {
-                row.peak_mib = run.peak_mib;
-                run.image
-            }
-            Err(error) => {
-                row.reason = error.to_string();
-                return None;
-            }
-        }
-    };
-    row.non_finite = Some(image.non_finite());
-    match metrics::score(&image, &loaded.reference) {
-        Ok(scores) => {
-            row.set_scores(&scores);
-            let undefined = scores.named().into_iter().filter(|(_, score)| score.is_none());
-            let undefined = undefined.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
-            if !undefined.is_empty() {
-                let why = metrics::why_undefined(&loaded.reference);
-                row.say(&format!("{}: no {undefined}: {why}", pair.id()));
-            }
-            Some(image)
-        }
-        Err(why) => {
-            row.reason = why.to_string();
-            None
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
-    use crate::{Error, models::Noisy, report::Contender};
+    use crate::{
+        models::{Denoiser, Noisy},
+        passes::Pass,
+        planes::Planes,
+        shot::Shot,
+    };
 
     /// Fails as no method should.
     struct Panics;

@@ -49,7 +49,7 @@ impl Samples {
     /// count.
     pub fn new(rows: &[Row], methods: &[String]) -> Option<Self> {
         type Scores = Vec<(f64, f64)>;
-        // Scenes of one name in different folders are different scenes; noise seeds share a reference.
+        // Scenes of one name with different references are different scenes; noise seeds share theirs.
         type Scene<'a> = (&'a str, &'a Path);
         let mut scored: BTreeMap<(Scene, u32, &str), Scores> = BTreeMap::new();
         for row in rows {

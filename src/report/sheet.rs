@@ -7,11 +7,11 @@
 use std::{collections::HashMap, path::Path};
 
 use image::{Rgb, RgbImage, imageops};
-use plotters::prelude::RGBColor;
+use plotters::prelude::{DrawingBackend, RGBColor};
 
 use super::{
     NOISY,
-    canvas::{Anchor, Style, draw_on, write_png},
+    canvas::{Anchor, Canvas, Style, draw_on, write_png},
     rows::Row,
 };
 use crate::{
@@ -178,106 +178,160 @@ pub fn write(
     images: &[Shown],
     rows: &HashMap<&str, &Row>,
 ) -> Result<()> {
-    let details = details(images, reference.width, reference.height);
-    let cell_height =
-        (CELL as usize * reference.height / reference.width).clamp(24, 3 * CELL as usize) as u32;
-    let columns = images.len() + 1;
-    let lines = 2 + details.len() as u32;
-    let band_height = NAME + lines * (cell_height + GAP) + SCORES;
-    let per_band = columns.min(BAND);
-    let width = per_band as u32 * (CELL + GAP) + GAP;
-    let height = TITLE + columns.div_ceil(BAND) as u32 * band_height;
-    let mut sheet = RgbImage::from_pixel(width, height, BACKGROUND);
-    let corner = |column: usize, line: u32| {
-        let x = GAP + (column % BAND) as u32 * (CELL + GAP);
-        let y = TITLE + (column / BAND) as u32 * band_height + NAME + line * (cell_height + GAP);
-        (x, y)
-    };
-
-    let reference_frame = display_image(reference, reference);
-    let frames = images.iter().map(|i| &i.frame).chain([&reference_frame]);
-    for (column, frame) in frames.enumerate() {
-        let mut paste = |line: u32, image: &RgbImage| {
-            let (x, y) = corner(column, line);
-            imageops::replace(&mut sheet, &to_cell(image, CELL, cell_height), x.into(), y.into());
-        };
-        paste(0, frame);
-        for (i, d) in details.iter().enumerate() {
-            let [x, y, w, h] = [d.x, d.y, d.width, d.height].map(|v| v as u32);
-            paste(2 + i as u32, &imageops::crop_imm(frame, x, y, w, h).to_image());
-        }
-        if let Some(image) = images.get(column) {
-            let (w, h) = (reference.width as u32, reference.height as u32);
-            paste(1, &RgbImage::from_fn(w, h, |x, y| error_colour(image.errors[(y * w + x) as usize])));
-        }
-    }
-    // The reference has no error: the scale stands in its place.
-    let (legend_x, legend_y) = corner(columns - 1, 1);
-    let bar = (legend_x + 20, legend_y + cell_height / 2 - 14, CELL - 40, 18);
-    for x in 0..bar.2 {
-        let share = f64::from(x) / f64::from(bar.2 - 1);
-        let error =
-            10f64.powf(ERROR_RANGE.0.log10() + share * (ERROR_RANGE.1.log10() - ERROR_RANGE.0.log10()));
-        for y in 0..bar.3 {
-            sheet.put_pixel(bar.0 + x, (bar.1 + y).min(height - 1), error_colour(error));
-        }
-    }
-
+    let layout = Layout::new(images, reference);
+    let mut sheet = RgbImage::from_pixel(layout.size().0, layout.size().1, BACKGROUND);
+    layout.paste(&mut sheet, images, &display_image(reference, reference));
+    layout.paste_scale(&mut sheet);
     draw_on(&mut sheet, |canvas| {
-        let text = |size: u32, colour: RGBColor, bold: bool| Style { colour, bold, ..Style::new(size) };
         let frame = pair.frame.as_ref().map(|f| format!(", frame {f}")).unwrap_or_default();
         let title = format!("{}{frame}, {} samples per pixel", pair.scene, pair.spp);
-        canvas.text(&title, (GAP as i32 + 2, TITLE as i32 / 2), Anchor::Left, text(20, TEXT, true))?;
+        canvas.text(&title, (GAP as i32 + 2, TITLE as i32 / 2), Anchor::Left, style(20, TEXT, true))?;
+        layout.label_scale(canvas)?;
+        for (column, image) in images.iter().enumerate() {
+            layout.label(canvas, column, &image.name, rows.get(image.name.as_str()).copied())?;
+        }
+        layout.label(canvas, images.len(), "reference", None)
+    })?;
+    write_png(path, &sheet)
+}
 
-        let (x, y, w, h) = (bar.0 as i32, bar.1 as i32, bar.2 as i32, bar.3 as i32);
-        canvas.text(
-            "squared relative error of a pixel",
-            (x + w / 2, y - 14),
-            Anchor::Centre,
-            text(13, TEXT, false),
-        )?;
+fn style(size: u32, colour: RGBColor, bold: bool) -> Style {
+    Style { colour, bold, ..Style::new(size) }
+}
+
+/// Where things are on a sheet.
+struct Layout {
+    /// Images, and the reference in the last column.
+    columns: usize,
+    details: Vec<Detail>,
+    /// Width and height of the frame.
+    frame: (usize, usize),
+    cell_height: u32,
+}
+
+impl Layout {
+    fn new(images: &[Shown], reference: &Planes) -> Self {
+        let (width, height) = (reference.width, reference.height);
+        Self {
+            columns: images.len() + 1,
+            details: details(images, width, height),
+            frame: (width, height),
+            cell_height: (CELL as usize * height / width).clamp(24, 3 * CELL as usize) as u32,
+        }
+    }
+
+    /// Lines of cells in a band: frames, error maps and details.
+    fn lines(&self) -> u32 {
+        2 + self.details.len() as u32
+    }
+
+    fn band_height(&self) -> u32 {
+        NAME + self.lines() * (self.cell_height + GAP) + SCORES
+    }
+
+    /// Width and height of the sheet.
+    fn size(&self) -> (u32, u32) {
+        let width = self.columns.min(BAND) as u32 * (CELL + GAP) + GAP;
+        (width, TITLE + self.columns.div_ceil(BAND) as u32 * self.band_height())
+    }
+
+    /// The left upper corner of a cell.
+    fn corner(&self, column: usize, line: u32) -> (u32, u32) {
+        let x = GAP + (column % BAND) as u32 * (CELL + GAP);
+        let band = TITLE + (column / BAND) as u32 * self.band_height();
+        (x, band + NAME + line * (self.cell_height + GAP))
+    }
+
+    /// Left, top, width and height of the scale of errors. The reference has no error map: the scale stands in its
+    /// place.
+    fn scale(&self) -> (u32, u32, u32, u32) {
+        let (x, y) = self.corner(self.columns - 1, 1);
+        (x + 20, y + self.cell_height / 2 - 14, CELL - 40, 18)
+    }
+
+    /// Fills the cells: every frame with its error map and details.
+    fn paste(&self, sheet: &mut RgbImage, images: &[Shown], reference: &RgbImage) {
+        let frames = images.iter().map(|image| &image.frame).chain([reference]);
+        for (column, frame) in frames.enumerate() {
+            let mut paste = |line: u32, image: &RgbImage| {
+                let (x, y) = self.corner(column, line);
+                imageops::replace(sheet, &to_cell(image, CELL, self.cell_height), x.into(), y.into());
+            };
+            paste(0, frame);
+            for (line, d) in (2..).zip(&self.details) {
+                let [x, y, w, h] = [d.x, d.y, d.width, d.height].map(|v| v as u32);
+                paste(line, &imageops::crop_imm(frame, x, y, w, h).to_image());
+            }
+            if let Some(image) = images.get(column) {
+                let (w, h) = (self.frame.0 as u32, self.frame.1 as u32);
+                let colour = |x, y| error_colour(image.errors[(y * w + x) as usize]);
+                paste(1, &RgbImage::from_fn(w, h, colour));
+            }
+        }
+    }
+
+    fn paste_scale(&self, sheet: &mut RgbImage) {
+        let (left, top, width, height) = self.scale();
+        let (low, high) = (ERROR_RANGE.0.log10(), ERROR_RANGE.1.log10());
+        let last = self.size().1 - 1;
+        for x in 0..width {
+            let share = f64::from(x) / f64::from(width - 1);
+            let colour = error_colour(10f64.powf(low + share * (high - low)));
+            (0..height).for_each(|y| sheet.put_pixel(left + x, (top + y).min(last), colour));
+        }
+    }
+
+    fn label_scale<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Result<()> {
+        let (x, y, w, h) = self.scale();
+        let (x, y, w, h) = (x as i32, y as i32, w as i32, h as i32);
+        let said = "squared relative error of a pixel";
+        canvas.text(said, (x + w / 2, y - 14), Anchor::Centre, style(13, TEXT, false))?;
         let decades = (ERROR_RANGE.1 / ERROR_RANGE.0).log10().round() as i32;
         for i in 0..=decades {
             let label = format!("{}", ERROR_RANGE.0 * 10f64.powi(i));
             let label = label.chars().take(6).collect::<String>();
-            canvas.text(&label, (x + i * w / decades, y + h + 12), Anchor::Centre, text(11, FAINT, false))?;
-        }
-
-        let names = images.iter().map(|i| i.name.as_str()).chain(["reference"]);
-        for (column, name) in names.enumerate() {
-            let (left, top) = corner(column, 0);
-            let (left, top) = (left as i32, top as i32);
             canvas.text(
-                &fit(name, 16),
-                (left + 2, top - NAME as i32 / 2),
-                Anchor::Left,
-                text(16, TEXT, true),
+                &label,
+                (x + i * w / decades, y + h + 12),
+                Anchor::Centre,
+                style(11, FAINT, false),
             )?;
-            for (i, (d, colour)) in details.iter().zip(DETAIL_COLOURS).enumerate() {
-                let at = |v: usize, size: usize, cell: u32| (v * cell as usize / size) as i32;
-                let (x, y) = (at(d.x, reference.width, CELL), at(d.y, reference.height, cell_height));
-                let (w, h) =
-                    (at(d.width, reference.width, CELL), at(d.height, reference.height, cell_height));
-                canvas.frame([(left + x, top + y), (left + x + w - 1, top + y + h - 1)], colour, 2)?;
-                let (x, y) = corner(column, 2 + i as u32);
-                let (x, y) = (x as i32, y as i32);
-                canvas.frame([(x, y), (x + CELL as i32 - 1, y + cell_height as i32 - 1)], colour, 2)?;
-            }
-            // The last column is the reference's, which has no scores.
-            let Some(row) = images.get(column).and_then(|_| rows.get(name)) else { continue };
-            let below = top + (lines * (cell_height + GAP)) as i32;
-            let value = |v: Option<f64>, digits: usize| v.map_or("-".into(), |v| format!("{v:.digits$}"));
-            let first = format!("RelMSE {}   SSIM {}", value(row.relmse, 4), value(row.ssim, 4));
-            let second = match row.seconds {
-                Some(seconds) => format!("FLIP {}   {}", value(row.flip, 3), duration(seconds)),
-                None => format!("FLIP {}", value(row.flip, 3)),
-            };
-            canvas.text(&first, (left + 2, below + 12), Anchor::Left, text(15, TEXT, false))?;
-            canvas.text(&second, (left + 2, below + 34), Anchor::Left, text(15, FAINT, false))?;
         }
         Ok(())
-    })?;
-    write_png(path, &sheet)
+    }
+
+    /// Writes a column's name and scores, and outlines its details.
+    fn label<B: DrawingBackend>(
+        &self,
+        canvas: &Canvas<B>,
+        column: usize,
+        name: &str,
+        row: Option<&Row>,
+    ) -> Result<()> {
+        let (left, top) = self.corner(column, 0);
+        let (left, top) = (left as i32, top as i32);
+        let place = (left + 2, top - NAME as i32 / 2);
+        canvas.text(&fit(name, 16), place, Anchor::Left, style(16, TEXT, true))?;
+        for (line, (d, colour)) in (2..).zip(self.details.iter().zip(DETAIL_COLOURS)) {
+            let across = |v: usize| (v * CELL as usize / self.frame.0) as i32;
+            let down = |v: usize| (v * self.cell_height as usize / self.frame.1) as i32;
+            let (x, y) = (left + across(d.x), top + down(d.y));
+            canvas.frame([(x, y), (x + across(d.width) - 1, y + down(d.height) - 1)], colour, 2)?;
+            let (x, y) = self.corner(column, line);
+            let (x, y) = (x as i32, y as i32);
+            canvas.frame([(x, y), (x + CELL as i32 - 1, y + self.cell_height as i32 - 1)], colour, 2)?;
+        }
+        let Some(row) = row else { return Ok(()) };
+        let below = top + (self.lines() * (self.cell_height + GAP)) as i32;
+        let value = |v: Option<f64>, digits: usize| v.map_or("-".into(), |v| format!("{v:.digits$}"));
+        let first = format!("RelMSE {}   SSIM {}", value(row.relmse, 4), value(row.ssim, 4));
+        let second = match row.seconds {
+            Some(seconds) => format!("FLIP {}   {}", value(row.flip, 3), duration(seconds)),
+            None => format!("FLIP {}", value(row.flip, 3)),
+        };
+        canvas.text(&first, (left + 2, below + 12), Anchor::Left, style(15, TEXT, false))?;
+        canvas.text(&second, (left + 2, below + 34), Anchor::Left, style(15, FAINT, false))
+    }
 }
 
 /// A time in milliseconds, or in seconds from ten on.

@@ -145,7 +145,7 @@ pub fn run(
             let mut before = None;
             for &trial in &options.trials {
                 let mut row = TrialRow {
-                    scene: scene_name(pairs, pair),
+                    scene: pair.label(),
                     model: method.name.clone(),
                     spp: pair.spp,
                     noisy: pair.noisy.clone(),
@@ -229,17 +229,6 @@ fn show(
     page::write(options, &maps, cases, &worst, provenance)
 }
 
-/// What a table calls a pair's scene. Those of one name in different folders are different scenes, while the noise
-/// seeds of one share their reference.
-fn scene_name(pairs: &[Pair], pair: &Pair) -> String {
-    let label = pair.label();
-    let is_same = |other: &Pair| other.reference == pair.reference || other.label() != label;
-    match pair.reference.parent() {
-        Some(folder) if !pairs.iter().all(is_same) => format!("{label} ({})", folder.display()),
-        _ => label,
-    }
-}
-
 /// A map whose rows are trials and whose values are ratios: RelMSE over that of the frame as rendered.
 fn map_of_trials(methods: Vec<String>, trials: &[Trial], summaries: &[Summary]) -> HeatMap {
     let cells = |trial: Trial| {
@@ -271,8 +260,7 @@ fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair
     let mut chosen: Vec<Pair> = Vec::new();
     for (_, case) in ranked {
         let pair = pairs.iter().find(|pair| case.seeds.first() == Some(&pair.noisy));
-        let name = |pair: &Pair| scene_name(pairs, pair);
-        let is_new = |pair: &&Pair| chosen.iter().all(|other| name(other) != name(pair));
+        let is_new = |pair: &&Pair| chosen.iter().all(|other| other.label() != pair.label());
         if chosen.len() < options.worst {
             chosen.extend(pair.filter(is_new).cloned());
         }
@@ -377,21 +365,6 @@ impl Summary {
 mod tests {
     use super::*;
     use crate::{models::Denoiser, passes::Pass};
-
-    #[test]
-    fn scenes_of_one_name_are_told_apart_by_their_folders() {
-        let pair = |folder: &str, seed: u32| Pair {
-            scene: "beauty".into(),
-            noisy: format!("{folder}/beauty_{seed}.exr").into(),
-            reference: format!("{folder}/beauty_ref.exr").into(),
-            spp: 4,
-            frame: None,
-        };
-        let pairs = [pair("A", 0), pair("A", 1), pair("B", 0)];
-        let names = |pairs: &[Pair]| pairs.iter().map(|pair| scene_name(pairs, pair)).collect::<Vec<_>>();
-        assert_eq!(names(&pairs), ["beauty (A)", "beauty (A)", "beauty (B)"]);
-        assert_eq!(names(&pairs[..2]), ["beauty", "beauty"]);
-    }
 
     /// Fails on fireflies as no method should.
     struct Delicate;
