@@ -11,7 +11,7 @@ use std::{
 
 use common::python::{self, run};
 use demc::passes::{self, Pass, PassSet};
-use predicates::str::contains;
+use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
 
 /// A folder with renders of one scene with all light passes: before a sky, and before nothing of 4, 64 and 256
@@ -116,6 +116,55 @@ fn light_passes_and_light_groups_add_up_to_the_denoised_beauty() {
             assert_adds_up(&groups, &beauty, &format!("light groups, {what}"));
         }
     }
+}
+
+#[test]
+fn light_passes_add_up_around_pixels_below_zero() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut frame = demc::frame::Frame::read(render("sky.exr")).unwrap();
+    let part =
+        frame.parts().iter().position(|part| part.channels.iter().any(|c| c.name.contains(".Combined.R")));
+    let part = part.unwrap();
+    let channel = |c: &str| {
+        let full = format!("ViewLayer.Combined.{c}");
+        frame.parts()[part].channels.iter().position(|channel| channel.name == full).unwrap()
+    };
+    let channels = ["R", "G", "B"].map(channel);
+    let below = channels.map(|channel| {
+        let mut values = frame.decode(part, &[&[channel]]).unwrap().remove(0).to_vec();
+        [700, 701, 1500].into_iter().for_each(|at| values[at] = -values[at].abs() - 0.1);
+        values
+    });
+    let changed: Vec<(usize, &[f32])> = channels.into_iter().zip(below.iter().map(Vec::as_slice)).collect();
+    frame.replace(part, "ViewLayer.Combined", &changed).unwrap();
+    let input = folder.path().join("sky.exr");
+    frame.write(&input).unwrap();
+    let mut command = common::demc();
+    command.arg("denoise").arg(&input).arg("--out").arg(folder.path().join("out"));
+    let said = command.args(["--model", "demc-m", "--passes"]).assert().success();
+    said.stderr(
+        contains("Combined is below zero in 3 of the pixels").and(contains("already denoised by demc")),
+    );
+    let done = folder.path().join("out/sky.exr");
+    assert_adds_up(
+        &sum_of_passes("sky.exr", |pass| layer(&done, &format!("{pass}.Denoised"))),
+        &layer(&done, "Denoised"),
+        "around pixels below zero",
+    );
+}
+
+#[test]
+fn light_passes_do_not_outlive_the_result_that_they_add_up_to() {
+    let out = tempfile::tempdir().unwrap();
+    let done = denoise("sky.exr", out.path(), "--model demc-s --passes");
+    let again = |arguments: &str| {
+        let mut command = common::demc();
+        command.arg("denoise").arg(&done).arg("--out").arg(out.path().join("again"));
+        command.args(arguments.split_whitespace()).assert()
+    };
+    again("--model demc-m").code(1).stderr(contains("belongs to the result that would be replaced"));
+    again("--model demc-m --layer Other").success();
+    again("--model demc-m --passes --overwrite").success();
 }
 
 #[test]

@@ -25,6 +25,29 @@ const BLOCK: usize = 8;
 /// A squared relative error that is none: what a frame without noise must come back within.
 const NO_ERROR: f64 = 1e-4;
 
+#[test]
+fn a_part_of_an_all_round_frame_has_errors_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let (width, height) = (96, 40);
+    // All columns of some rows, and some columns of all rows.
+    for (name, columns, rows) in [("rows", 0..width, 10..30), ("columns", 20..70, 0..height)] {
+        let path = folder.path().join(format!("{name}_0004spp.exr"));
+        common::files::write_render(&path, width, height, |channel, i| {
+            let noise = (i * 2_654_435_761 % 1000) as f32 / 1000.0;
+            let is_inside = columns.contains(&(i % width)) && rows.contains(&(i / width));
+            if !is_inside || channel.starts_with("Normal") { 0.0 } else { 0.2 + noise }
+        });
+        let out = folder.path().join("out");
+        let arguments = ["--model", "demc-s", "--wrap", "x", "--confidence", "--out"];
+        demc().arg("denoise").arg(&path).args(arguments).arg(&out).assert().success();
+        let done = read_exr(out.join(path.file_name().unwrap()));
+        for (i, error) in values(&done, "ViewLayer.Denoised Error.X").into_iter().enumerate() {
+            let is_inside = columns.contains(&(i % width)) && rows.contains(&(i / width));
+            assert_eq!(error > 0.0, is_inside, "{name}, pixel {i}: {error}");
+        }
+    }
+}
+
 fn kept_frames() -> [(PathBuf, PathBuf); 2] {
     let example = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("eval/example").join(name);
     let pair = |name: &str| data("no_harm").join(name);

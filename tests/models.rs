@@ -14,6 +14,10 @@ use demc::{
     planes::Planes,
     rng::Rng,
 };
+use dfdx::{
+    shapes::Rank0,
+    tensor_ops::{Backward, SumTo},
+};
 
 fn parameters(network: &mut dyn Network) -> usize {
     network.params().iter().filter(|p| p.trainable).map(|p| p.values().len()).sum()
@@ -88,6 +92,33 @@ fn random_passes(width: usize, height: usize, seed: u64) -> PassSet {
         passes.insert(pass, Planes::from_vec(pass.channels(), width, height, values));
     }
     passes
+}
+
+#[test]
+fn every_trained_parameter_has_a_gradient_and_ships_alive() {
+    for (name, config) in models::trainable() {
+        let mut network = models::build(&config, 1);
+        let inputs = network.inputs(&random_passes(64, 64, 4)).expect("all passes are there");
+        let output = network.forward_taped(&stack(&[inputs]), &mut Stats::Batch(Vec::new()));
+        let mut gradients = output.square().sum::<Rank0, _>().backward();
+        for param in network.params().into_iter().filter(|param| param.trainable) {
+            let gradient = gradients.get_or_alloc_mut(&param.tensor).expect("the CPU allocates or aborts");
+            assert!(gradient.iter().any(|g| *g != 0.0), "{name}: {} has no gradient", param.name);
+        }
+    }
+    // A layer through whose ReLUs nothing passes is cut off for good, with all that leads to it.
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let folders =
+        ["eval/rivals/weights", "src/models/weights"].map(|folder| root.join(folder).read_dir().unwrap());
+    let files = folders.into_iter().flatten().map(|entry| entry.unwrap().path());
+    let files: Vec<_> = files.filter(|path| path.extension().is_some_and(|e| e == "safetensors")).collect();
+    assert!(files.len() >= 7, "{files:?}");
+    for path in files {
+        let ranges = weights_file::read(&path).unwrap().1.ranges;
+        for (layer, range) in ranges {
+            assert!(range > 0.0, "{}: {layer} gives nothing", path.display());
+        }
+    }
 }
 
 #[test]
@@ -381,6 +412,7 @@ fn facts() -> Facts {
         raw_references: false,
         guide_dropout: 0.0,
         tint: 0.0,
+        leak: 0.0,
         optimizer: "adam".into(),
         weight_decay: 0.0,
         precision: None,

@@ -401,6 +401,29 @@ fn a_lamp_leaves_nothing_where_it_was_nor_where_it_will_be() {
 }
 
 #[test]
+fn nothing_comes_into_what_was_not_rendered() {
+    let dir = tempfile::tempdir().unwrap();
+    let is_inside = |i: usize, n: i64| (8 + 4 * n as usize..28 + 4 * n as usize).contains(&(i % SIZE.0));
+    for n in 0..=3 {
+        let channels = SHOT.channels("ViewLayer", "", n).into_iter().map(|mut channel| {
+            if let FlatSamples::F32(values) = &mut channel.sample_data {
+                let outside = values.iter_mut().enumerate().filter(|(i, _)| !is_inside(*i, n));
+                outside.for_each(|(_, v)| *v = 0.0);
+            }
+            channel
+        });
+        write_channels(&named(&dir, n), SIZE, channels.collect(), &[]);
+    }
+    let out = dir.path().join("out");
+    demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+    for n in 0..=3 {
+        let image = read_exr(result(&out, n));
+        let got = values(&image, "ViewLayer.Denoised.G");
+        assert!((0..got.len()).all(|i| (got[i] != 0.0) == is_inside(i, n)), "frame {n}");
+    }
+}
+
+#[test]
 fn a_frame_of_more_samples_takes_little_of_those_of_fewer() {
     let dir = sequence(SHOT, 1..=5);
     // A noisier render of fewer samples would take from the noiseless one what it can.

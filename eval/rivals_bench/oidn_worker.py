@@ -26,7 +26,7 @@ def filter_(program, quality, width, height, threads, folder):
     for seed, name in enumerate(names):
         write_pfm(folder / f"{name}_{width}x{height}.pfm", width, height, seed)
     color, albedo, normal = (str(folder / f"{name}_{width}x{height}.pfm") for name in names)
-    command = [program, "--hdr", color, "--alb", albedo, "--nrm", normal, "-q", quality]
+    command = [program, "-d", "cpu", "--hdr", color, "--alb", albedo, "--nrm", normal, "-q", quality]
     # The second of its runs is warm.
     command += ["-n", "2", "--threads", str(threads)]
 

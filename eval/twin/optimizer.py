@@ -40,6 +40,8 @@ class Optimizer:
         self.adam.step()
         for p, momentum in zip(self.hidden, self.momenta):
             momentum.mul_(_MOMENTUM).add_(p.grad)
+            if not p.grad.any():  # cut off by ReLUs: momentum alone moves nothing
+                continue
             rows, columns = p.shape[0], p[0].numel()
             direction = orthogonal((momentum * _MOMENTUM + p.grad).reshape(rows, columns))
             p.mul_(1 - lr * self.weight_decay)

@@ -35,8 +35,10 @@ impl Ranking {
         Self { wish, frames: Vec::new() }
     }
 
-    /// Adds a frame by its file, the expected RelMSE of its result and the samples of its render.
+    /// Adds a frame by its file, the expected RelMSE of its result and the samples of its render. What was known of the
+    /// same file is forgotten: it was rendered again.
     pub fn add(&mut self, input: String, error: f64, samples: Option<u32>) {
+        self.frames.retain(|frame| frame.input != input);
         self.frames.push(Ranked { error, input, samples });
     }
 

@@ -76,6 +76,10 @@ pub struct Args {
     /// saturated ones
     #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
     tint: f64,
+    /// Share of the gradient that passes a ReLU where it gives nothing, so that layers through which nothing passes may
+    /// come back: 0.01 for deep networks at high rates
+    #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
+    leak: f64,
     /// How gradients become updates: adam, or muon, which needs fewer steps
     #[arg(long, default_value = "adam", value_parser = parse_rule)]
     optimizer: Rule,
@@ -112,7 +116,7 @@ pub struct Args {
     /// Go on from the run folder's checkpoint, with its config.json, which decides all but --threads; for
     /// more steps, edit them there
     #[arg(long, conflicts_with_all = [
-        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "tint", "optimizer",
+        "data", "model", "widths", "steps", "batch", "patch", "lr", "loss", "raw_references", "guide_dropout", "tint", "leak", "optimizer",
         "weight_decay", "precision", "average", "val", "every", "seed", "init", "only", "prefilter",
     ])]
     resume: bool,
@@ -319,6 +323,7 @@ impl Args {
             raw_references: self.raw_references,
             guide_dropout: self.guide_dropout,
             tint: self.tint,
+            leak: self.leak,
             optimizer: self.optimizer,
             precision: self.precision.unwrap_or_else(Precision::fastest_trained),
             weight_decay: self.weight_decay,

@@ -17,7 +17,9 @@ use crate::{
     companion::Companion,
     frame::{Frame, NewChannel, Recoded, SampleKind, UNSTORABLE},
     models::{Denoiser, ExpectedError, check_expects},
-    passes::{self, COMBINED, COMPOSITE, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare},
+    passes::{
+        self, COMBINED, COMPOSITE, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare, light_group,
+    },
     planes::Planes,
     shot::{self, Shot},
     sources::Sources,
@@ -91,7 +93,11 @@ pub fn check_layer_name(name: &str) -> Result<(), &'static str> {
     let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
     if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
         Err("wants 1 to 100 characters in one line, without a dot")
-    } else if name == NOISY_IMAGE || is_bare(name) || Pass::ALL.iter().any(reserved) {
+    } else if name == NOISY_IMAGE
+        || light_group(name).is_some()
+        || is_bare(name)
+        || Pass::ALL.iter().any(reserved)
+    {
         Err("is a pass of the renderer; choose another name, or --replace for Combined")
     } else {
         Ok(())
@@ -179,6 +185,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     }
     let mut views = Vec::new();
     for layer in eyes {
+        refuse_stale(&frame, layer, options)?;
         options.sources.mapping.check(input, layer)?;
         let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
         shot.wraps = options.wrap.of(&frame);
@@ -189,6 +196,19 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
             report.notes.push(
                 "Combined was already denoised by Blender; its Noisy Image pass is used instead".into(),
             );
+        }
+        let beauty = layer_name(&layer.name, &layer.passes[&Pass::Combined].name);
+        if frame.is_own_layer(&beauty) && !shot.was_denoised {
+            report
+                .notes
+                .push("Combined was already denoised by demc (--replace), and is denoised once more".into());
+        }
+        let values = 3 * shot.passes.width * shot.passes.height;
+        if let Some(count) = shot.repaired.get(&Pass::Combined).filter(|count| **count > values / 2) {
+            let why = format!(
+                "{count} of the {values} values of Combined are NaN or infinite; render the frame again"
+            );
+            return Err(Error::invalid(input, why));
         }
         // Before any work: a missing pass is the user's commonest mistake.
         model.check(&shot.passes)?;
@@ -210,6 +230,18 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     }
     report.notes.dedup(); // stereo views repeat them
     Ok(Views { frame, views, report })
+}
+
+/// Refuses to replace a result whose light passes would stay, as they add up to that result alone.
+fn refuse_stale(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
+    let Some(added) = options.layer.as_ref().filter(|_| !options.passes) else { return Ok(()) };
+    let is_own = |at: &&PassChannels| frame.is_own_layer(&added_name(layer, &at.name, added));
+    let Some(light) = denoised_lights(layer).into_iter().find(is_own) else { return Ok(()) };
+    let name = added_name(layer, &light.name, added);
+    let why = format!(
+        "holds '{name}', which belongs to the result that would be replaced; say --passes, or --layer NAME for one beside it"
+    );
+    Err(Error::invalid(frame.path(), why))
 }
 
 /// Refuses layers to add whose names are no layer's, or those of others.

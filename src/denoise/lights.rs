@@ -6,6 +6,8 @@
 //! without its colour is denoised with it and divided by the denoised colour afterwards, so that the same sum
 //! over the results is the denoised Combined.
 
+use std::collections::HashSet;
+
 use half::f16;
 
 use super::Options;
@@ -114,13 +116,26 @@ impl Along {
     }
 
     fn take_lights(&mut self, shot: &mut Shot, notes: &mut Vec<String>) {
-        let below = shot.passes.get(Pass::Combined).map_or(0, |beauty| {
-            let is_below = |pixel: &usize| (0..beauty.channels).any(|c| beauty.channel(c)[*pixel] < 0.0);
-            (0..beauty.pixels()).filter(is_below).count()
+        let beauty = shot.passes.get(Pass::Combined);
+        // The beauty counts as black where it is below zero, and so does the light that makes it.
+        let below: Vec<usize> = beauty.map_or_else(Vec::new, |beauty| {
+            let values = beauty.data.iter().enumerate();
+            values.filter(|(_, v)| **v < 0.0).map(|(at, _)| at).collect()
         });
-        if below > 0 {
+        if !below.is_empty() {
+            let pixels = beauty.map_or(1, Planes::pixels);
+            let count = below.iter().map(|at| at % pixels).collect::<HashSet<_>>().len();
             notes.push(format!(
-                "Combined is below zero in {below} pixels, and is denoised to zero there: the light passes do not add up to it"
+                "Combined is below zero in {count} of the pixels: there it and its light are denoised as black"
+            ));
+        }
+        let is_summand = |pass: &Pass| *pass == Pass::Combined || light_passes().contains(pass);
+        let broken: usize =
+            shot.repaired.iter().filter(|(pass, _)| is_summand(pass)).map(|(_, count)| count).sum();
+        if broken > 0 {
+            notes.push(format!(
+                "of the values of Combined and of light passes {broken} are NaN or infinite: around them the denoised light \
+                 passes do not add up to the result"
             ));
         }
         for (lights, colour) in LIT {
@@ -154,6 +169,9 @@ impl Along {
         }
         for (name, planes) in std::mem::take(&mut shot.light_groups) {
             self.push(Source::LightGroup(name), Kind::Light, planes);
+        }
+        for companion in self.companions.iter_mut().filter(|companion| companion.kind == Kind::Light) {
+            below.iter().for_each(|at| companion.planes.data[*at] = 0.0);
         }
         if !self.sources.iter().any(|source| *source != Source::Pass(Pass::Alpha)) {
             notes.push(

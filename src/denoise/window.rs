@@ -88,6 +88,8 @@ struct Moment {
     /// These passes, which half floats hold exactly: a frame that stays alone is denoised to the same bits.
     waiting: BTreeMap<Pass, HalfFloats>,
     look: Look,
+    /// The part of the frame that was [rendered](PassSet::rendered).
+    region: ((usize, usize), (usize, usize)),
     /// How neighbours belong together with it, by how many frames later these are.
     links: BTreeMap<i32, Result<Found, Gap>>,
     /// What the model makes of it and its neighbours' renders.
@@ -314,7 +316,7 @@ impl Window {
         let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
         let results: Vec<(&Planes, &Link)> =
             others.iter().map(|other| (other.moment.result(), &other.link)).collect();
-        Ok(temporal::blend(own.result(), &radiance, exposure(&radiance), &results))
+        Ok(own.inside(temporal::blend(own.result(), &radiance, exposure(&radiance), &results)))
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
@@ -555,6 +557,7 @@ impl Window {
 
 impl Moment {
     fn new(mut shot: Shot, model: &dyn Denoiser) -> Self {
+        let region = shot.passes.rendered();
         let passes = &mut shot.passes;
         // Of two passes that tell the same, the first is enough.
         for [first, second] in [NORMALS, DEPTHS] {
@@ -572,7 +575,7 @@ impl Moment {
             Some((pass, halves))
         });
         let waiting = waiting.collect();
-        Self { shot, waiting, look, links: BTreeMap::new(), result: None, lacked: BTreeSet::new() }
+        Self { shot, waiting, look, region, links: BTreeMap::new(), result: None, lacked: BTreeSet::new() }
     }
 
     fn values(&self, pass: Pass) -> Option<&dyn Values> {
@@ -604,6 +607,12 @@ impl Moment {
         let mut shot = self.shot.clone();
         self.waiting.iter().for_each(|(pass, planes)| shot.passes.insert(*pass, planes.planes()));
         shot
+    }
+
+    /// Planes of the frame, which are zero outside of what was rendered: a neighbour may have been rendered there.
+    fn inside(&self, planes: Planes) -> Planes {
+        let (whole, (place, size)) = ((planes.width, planes.height), self.region);
+        if size == whole { planes } else { planes.window(place, size).placed_in(whole, place) }
     }
 
     /// Whether all else was let go of.
@@ -659,7 +668,7 @@ fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> Pass
             let of_others: Vec<(&dyn Values, &Link)> =
                 others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
             let is_light = pass.quantity() == Quantity::Radiance;
-            set.insert(pass, temporal::merge(values, is_light, &of_others));
+            set.insert(pass, own.inside(temporal::merge(values, is_light, &of_others)));
         }
     }
     set.origin = passes.origin;

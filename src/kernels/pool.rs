@@ -82,14 +82,18 @@ pub fn max_pool_gradient(input: View, output_gradient: View, input_gradient: Vie
     });
 }
 
-/// Zeroes the gradient where the ReLU's output was zero. Works on borders too, which are zero anyway.
-pub fn relu_mask(output: View, gradient: ViewMut) {
+/// Multiplies the gradient by `leak` where the ReLU's output was zero; 0 is the derivative. Works on borders too, which
+/// are zero anyway.
+pub fn relu_mask(output: View, leak: f32, gradient: ViewMut) {
     assert_eq!(output.shape, gradient.shape);
     gradient.data.par_chunks_mut(4096).zip(output.data.par_chunks(4096)).for_each(|(g, o)| {
         for (g, o) in g.iter_mut().zip(o) {
             // Without copies and bit masks the compiler would work lane by lane.
             let (old, output) = (g.0, o.0);
-            *g = Block(std::array::from_fn(|l| f32::from_bits(old[l].to_bits() & mask(output[l] > 0.0))));
+            *g = Block(std::array::from_fn(|l| {
+                let passes = mask(output[l] > 0.0);
+                f32::from_bits((old[l].to_bits() & passes) | ((leak * old[l]).to_bits() & !passes))
+            }));
         }
     });
 }

@@ -3,7 +3,8 @@
 //! Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A Difference Evaluator for
 //! Alternating Images" (2020), and Andersson, Nilsson, Shirley, Akenine-Moller, "Visualizing Errors in
 //! Rendered High Dynamic Range Images" (2021): the maximum of FLIP over exposures that span the
-//! reference, tone mapped, averaged over pixels.
+//! reference, tone mapped, averaged over pixels. Radiance below zero counts as black, where the authors' program lets
+//! the tone mapping make of it what it does.
 
 use rayon::prelude::*;
 

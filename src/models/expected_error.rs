@@ -35,12 +35,13 @@ impl ExpectedError {
         Self { whole, place, ..self }
     }
 
-    /// These errors without `columns` columns at either edge, which on the left must be whole squares.
+    /// These errors, of all columns of a frame or of some rows of it, without `columns` columns at either edge, which on
+    /// the left must be whole squares.
     pub(crate) fn without_margins(self, columns: usize) -> Self {
         let width = self.size.0 - 2 * columns;
         let at = (columns / SQUARE, 0);
         let squares = self.squares.window(at, (width.div_ceil(SQUARE), self.squares.height));
-        Self::new(squares, (width, self.size.1))
+        Self { squares, size: (width, self.size.1), whole: (width, self.whole.1), place: self.place }
     }
 
     /// The mean over the frame: its expected RelMSE.
@@ -112,5 +113,8 @@ mod tests {
     fn margins_come_off() {
         let narrow = counted((2 * 8 + 5, 4)).without_margins(8);
         assert_eq!((&narrow.squares.data[..], narrow.size), (&[3.0, 4.0][..], (5, 4)));
+        // Of rows that are a part of the frame.
+        let rows = counted((2 * 8 + 5, 4)).placed_in((2 * 8 + 5, 8), (0, 4)).without_margins(8);
+        assert_eq!((rows.whole, rows.place, rows.mean()), ((5, 8), (0, 4), (3.0 * 16.0 + 4.0 * 4.0) / 40.0));
     }
 }

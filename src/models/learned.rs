@@ -226,7 +226,7 @@ impl Learned {
             refuse_companions(&self.name, companions)?;
             return Ok((self.network.infer(passes, tile)?, None));
         }
-        let (place, size) = rendered(passes);
+        let (place, size) = passes.rendered();
         let whole = (passes.width, passes.height);
         if size == whole {
             return self.restrained(passes, companions, tile, expects);
@@ -313,38 +313,4 @@ impl Learned {
 /// Replaces planes by the mean of two.
 fn average(first: &mut Planes, second: &Planes) {
     first.data.iter_mut().zip(&second.data).for_each(|(first, second)| *first = 0.5 * (*first + second));
-}
-
-/// Least share of the pixels along the edge of a part of a frame that must hold something for the part to be
-/// a rendered region.
-const FILLED: f64 = 0.9;
-
-/// Column and row, width and height of the part of a frame that was rendered. Where only a region was
-/// rendered, all else is zero in every pass. That is no black wall, since what lies beyond a region is
-/// unknown. Things before a transparent background also fill a part of the frame, but not all along the edges
-/// of that part; such a frame is taken whole.
-fn rendered(passes: &PassSet) -> ((usize, usize), (usize, usize)) {
-    let (width, height) = (passes.width, passes.height);
-    let whole = ((0, 0), (width, height));
-    let is_filled = |x: usize, y: usize| {
-        passes.iter().any(|(_, planes)| (0..planes.channels).any(|c| planes.channel(c)[y * width + x] != 0.0))
-    };
-    let row_is_filled = |y: &usize| (0..width).any(|x| is_filled(x, *y));
-    let Some(top) = (0..height).find(row_is_filled) else { return whole };
-    let bottom = (top..height).rfind(row_is_filled).expect("the first such row is one");
-    let column_is_filled = |x: &usize| (top..=bottom).any(|y| is_filled(*x, y));
-    let left = (0..width).find(column_is_filled).expect("some row holds something");
-    let right = (left..width).rfind(column_is_filled).expect("the first such column is one");
-    let (columns, rows) = (right + 1 - left, bottom + 1 - top);
-    if (columns, rows) == (width, height) {
-        return whole;
-    }
-    let level = (left..=right).flat_map(|x| [(x, top), (x, bottom)]);
-    let upright = (top..=bottom).flat_map(|y| [(left, y), (right, y)]);
-    let filled = level.chain(upright).filter(|&(x, y)| is_filled(x, y)).count();
-    if filled as f64 >= FILLED * (2 * (columns + rows)) as f64 {
-        ((left, top), (columns, rows))
-    } else {
-        whole
-    }
 }

@@ -77,7 +77,7 @@ impl Oidn {
         let result = Command::new(&self.program)
             .current_dir(folder)
             .args(arguments)
-            .args(["-o", output, "-q", self.quality(), "-v", "2"])
+            .args(["-d", "cpu", "-o", output, "-q", self.quality(), "-v", "2"])
             .args(["-n", &RUNS.to_string(), "--threads", &rayon::current_num_threads().to_string()])
             .output();
         let run = result.map_err(|e| {

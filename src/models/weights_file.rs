@@ -41,6 +41,9 @@ pub struct Facts {
     /// Share of the crops that were in coloured light.
     #[serde(default)]
     pub tint: f64,
+    /// Share of the gradient that passed ReLUs where they gave nothing.
+    #[serde(default)]
+    pub leak: f64,
     /// How gradients became updates; files from before there was a choice do not say.
     #[serde(default = "adam")]
     pub optimizer: String,
@@ -159,8 +162,11 @@ pub fn read_as(path: &Path, config: &Config, seed: u64) -> Result<Box<dyn Networ
         return Ok(network);
     }
     Err(misfit.unwrap_or_else(|| {
-        let reason = "choose --model and --widths alike";
-        Error::invalid(path, format!("holds {held}, which is neither {config} nor narrower; {reason}"))
+        let why = match all || held.architecture != config.architecture {
+            true => format!("which is neither {config} nor narrower"),
+            false => format!("and is not {config}, for a network with batch norms is not widened"),
+        };
+        Error::invalid(path, format!("holds {held}, {why}; choose --model and --widths alike"))
     }))
 }
 

@@ -37,6 +37,8 @@ pub struct Conv {
     pub range: Option<f32>,
     arithmetic: Arithmetic,
     relu: bool,
+    /// See [`Conv::set_leak`].
+    leak: f32,
     /// The packed weights of a frozen layer.
     frozen: Option<Arc<Packed>>,
     /// The bits of the largest output so far, while outputs are observed.
@@ -82,6 +84,7 @@ impl Conv {
             arithmetic: Arithmetic { inputs: inputs.into(), outputs, geometry, precision: Precision::F32 },
             range: None,
             relu: true,
+            leak: 0.0,
             frozen: None,
             observed: None,
         }
@@ -172,6 +175,13 @@ impl Conv {
     /// What the layer computes, apart from its weights.
     pub fn arithmetic(&self) -> &Arithmetic {
         &self.arithmetic
+    }
+
+    /// Lets a share of the gradient pass where the ReLU gives nothing, as a leaky one would, in training. What the layer
+    /// computes stays the same. A ReLU that gives nothing anywhere has no gradient of its own and would never give
+    /// anything again.
+    pub fn set_leak(&mut self, leak: f32) {
+        self.leak = leak;
     }
 
     /// Chooses the arithmetic of the layer and of its gradients.
@@ -284,11 +294,11 @@ impl Conv {
         }
         if T::OWNS_TAPE && learns {
             let (weight, bias) = (self.weight.tensor.clone(), self.bias.tensor.clone());
-            let (arithmetic, relu) = (self.arithmetic.clone(), self.relu);
+            let (arithmetic, relu, leak) = (self.arithmetic.clone(), self.relu, self.leak);
             activation.tape.add_backward_op(move |gradients| {
                 let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
                 if relu {
-                    relu_mask(out.data.view(), gradient.view_mut());
+                    relu_mask(out.data.view(), leak, gradient.view_mut());
                 }
                 if bias_learns {
                     bias_gradient(gradient.view(), gradients.get_or_alloc_mut(&bias)?);
@@ -505,7 +515,7 @@ impl BatchNorm {
             let (scale_tensor, shift_tensor) = (self.scale.tensor.clone(), self.shift.tensor.clone());
             activation.tape.add_backward_op(move |gradients| {
                 let Some(mut gradient) = out.take_gradient() else { return Ok(()) };
-                relu_mask(out.data.view(), gradient.view_mut());
+                relu_mask(out.data.view(), 0.0, gradient.view_mut());
                 let inverse: Vec<f32> = moments.iter().map(|(_, variance)| inverse(*variance)).collect();
                 // Sums of g and of g * normalised input, each channel.
                 let mut sums = vec![(0.0f64, 0.0f64); shape.c];

@@ -361,14 +361,17 @@ pub fn read_layer(frame: &Frame, layer: &Layer, wanted: &[Pass]) -> Result<PassS
     set.origin = (window.x, window.y);
     set.renderer = layer.renderer;
     set.view.clone_from(&layer.view);
-    // Blender's metadata tells the samples; with adaptive sampling, the most that a pixel may have had.
-    // Programs that write a render anew leave it out; then the file's name may tell, as that of render pairs.
-    let told = frame.text_attribute(&format!("cycles.{}.samples", layer.name));
-    let told = told.and_then(|count| count.trim().parse().ok());
-    set.samples = told.or_else(|| samples(frame.path()));
+    set.samples = told_samples(frame, &layer.name);
 
     decode(frame, window, held().map(|(pass, at)| (*pass, at)), |pass, planes| set.insert(pass, planes))?;
     Ok(set)
+}
+
+/// The samples of a pixel in a view layer: Blender's metadata tell them, with adaptive sampling the most that a pixel may
+/// have had. Programs that write a render anew leave them out; then the file's name may tell, as that of render pairs.
+pub fn told_samples(frame: &Frame, view_layer: &str) -> Option<u32> {
+    let told = frame.text_attribute(&format!("cycles.{view_layer}.samples"));
+    told.and_then(|count| count.trim().parse().ok()).or_else(|| samples(frame.path()))
 }
 
 /// The light groups of a view layer, cut as [`read_layer`] cuts its passes, each (3, H, W).

@@ -20,9 +20,10 @@ use std::{
 
 pub use layers::{
     COMPOSITE, Layer, PassChannels, choose, choose_like, layers, layers_by, layers_of, read, read_layer,
-    read_light_groups, rgb_layers,
+    read_light_groups, rgb_layers, told_samples,
 };
 pub use mapping::Mapping;
+pub(crate) use names::light_group;
 pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
 pub use normals::{Change, Turn, to_camera_space};
 
@@ -200,6 +201,10 @@ pub struct PassSet {
     planes: BTreeMap<Pass, Planes>,
 }
 
+/// Least share of the pixels along the edge of a part of a frame that must hold something for the part to be
+/// a rendered region.
+const FILLED: f64 = 0.9;
+
 impl PassSet {
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
@@ -337,6 +342,37 @@ impl PassSet {
     /// Every pass held.
     pub fn iter(&self) -> impl Iterator<Item = (Pass, &Planes)> {
         self.planes.iter().map(|(p, v)| (*p, v))
+    }
+
+    /// Column and row, width and height of the part of a frame that was rendered. Where only a region was
+    /// rendered, all else is zero in every pass. That is no black wall, since what lies beyond a region is
+    /// unknown. Things before a transparent background also fill a part of the frame, but not all along the edges
+    /// of that part; such a frame is taken whole.
+    pub fn rendered(&self) -> ((usize, usize), (usize, usize)) {
+        let (width, height) = (self.width, self.height);
+        let whole = ((0, 0), (width, height));
+        let is_filled = |x: usize, y: usize| {
+            self.iter()
+                .any(|(_, planes)| (0..planes.channels).any(|c| planes.channel(c)[y * width + x] != 0.0))
+        };
+        let row_is_filled = |y: &usize| (0..width).any(|x| is_filled(x, *y));
+        let Some(top) = (0..height).find(row_is_filled) else { return whole };
+        let bottom = (top..height).rfind(row_is_filled).expect("the first such row is one");
+        let column_is_filled = |x: &usize| (top..=bottom).any(|y| is_filled(*x, y));
+        let left = (0..width).find(column_is_filled).expect("some row holds something");
+        let right = (left..width).rfind(column_is_filled).expect("the first such column is one");
+        let (columns, rows) = (right + 1 - left, bottom + 1 - top);
+        if (columns, rows) == (width, height) {
+            return whole;
+        }
+        let level = (left..=right).flat_map(|x| [(x, top), (x, bottom)]);
+        let upright = (top..=bottom).flat_map(|y| [(left, y), (right, y)]);
+        let filled = level.chain(upright).filter(|&(x, y)| is_filled(x, y)).count();
+        if filled as f64 >= FILLED * (2 * (columns + rows)) as f64 {
+            ((left, top), (columns, rows))
+        } else {
+            whole
+        }
     }
 
     /// Puts `Noisy Image` in the place of Combined: where Blender denoised the render itself, Combined is the

@@ -51,26 +51,29 @@ impl Samples {
         type Scores = Vec<(f64, f64)>;
         // Scenes of one name with different references are different scenes; noise seeds share theirs.
         type Scene<'a> = (&'a str, &'a Path);
+        let scores = |row: &Row| Some((row.relmse.filter(|e| *e > 0.0)?, row.ssim?));
+        // Methods without any score do not limit the scenes.
+        let is_drawn = |method: &&str| rows.iter().any(|row| row.model == *method && scores(row).is_some());
+        let methods: Vec<&str> = methods.iter().map(String::as_str).collect();
+        let drawn: Vec<&str> = methods.iter().copied().filter(is_drawn).collect();
+        // A render that one of them could not do counts for none: noise seeds differ.
+        let is_lacking = |row: &&Row| drawn.contains(&row.model.as_str()) && scores(row).is_none();
+        let lacking: BTreeSet<&Path> =
+            rows.iter().filter(is_lacking).map(|row| row.noisy.as_path()).collect();
         let mut scored: BTreeMap<(Scene, u32, &str), Scores> = BTreeMap::new();
-        for row in rows {
-            if let (Some(relmse), Some(ssim)) = (row.relmse.filter(|e| *e > 0.0), row.ssim) {
-                scored
-                    .entry(((&row.scene, &row.reference), row.spp, &row.model))
-                    .or_default()
-                    .push((relmse, ssim));
+        for row in rows.iter().filter(|row| !lacking.contains(row.noisy.as_path())) {
+            if let Some(scores) = scores(row) {
+                let key = ((row.scene.as_str(), row.reference.as_path()), row.spp, row.model.as_str());
+                scored.entry(key).or_default().push(scores);
             }
         }
         let counts: Vec<u32> = rows.iter().map(|row| row.spp).collect::<BTreeSet<_>>().into_iter().collect();
-        // Methods without any score do not limit the scenes.
-        let methods: Vec<&str> = methods.iter().map(String::as_str).collect();
-        let drawn: Vec<&str> =
-            methods.iter().copied().filter(|m| scored.keys().any(|(_, _, model)| model == m)).collect();
         let is_whole = |scene: &Scene| {
             counts.iter().all(|spp| drawn.iter().all(|model| scored.contains_key(&(*scene, *spp, model))))
         };
         let all = rows.iter().map(|row| (row.scene.as_str(), row.reference.as_path()));
         let scenes: BTreeSet<Scene> = all.filter(is_whole).collect();
-        if counts.len() < 2 || scenes.is_empty() {
+        if counts.len() < 2 || drawn.is_empty() || scenes.is_empty() {
             return None;
         }
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
@@ -178,6 +181,7 @@ mod tests {
             scene: scene.into(),
             spp,
             model: model.into(),
+            noisy: format!("{scene}_{spp:04}spp.exr").into(),
             relmse,
             ssim: relmse.map(|e| 1.0 - e),
             ..Row::default()
@@ -207,9 +211,14 @@ mod tests {
                     let is_lacking = scene == "half" && spp == 16 && model == "demc-m";
                     let error = error * share / f64::from(spp);
                     rows.push(row(scene, spp, model, (!is_lacking).then_some(error)));
-                    // A second seed.
+                    // A second seed, and a third that one method cannot do.
                     if scene == "a" {
-                        rows.push(row(scene, spp, model, Some(error)));
+                        let of_seed = |seed: u32, error: Option<f64>| Row {
+                            noisy: format!("a_n{seed}_{spp:04}spp.exr").into(),
+                            ..row(scene, spp, model, error)
+                        };
+                        rows.push(of_seed(1, Some(error)));
+                        rows.push(of_seed(2, (model == "noisy").then_some(9.0)));
                     }
                 }
             }

@@ -47,6 +47,9 @@ pub struct TrainOptions {
     /// Share of the crops in coloured light, see [`Augment::tinted`](crate::augment::Augment::tinted).
     #[serde(default)]
     pub tint: f64,
+    /// Share of the gradient that passes ReLUs where they give nothing, see [`Conv::set_leak`](crate::nn::Conv::set_leak).
+    #[serde(default)]
+    pub leak: f64,
     /// How gradients become updates.
     #[serde(default)]
     pub optimizer: Rule,
@@ -115,7 +118,9 @@ impl TrainOptions {
             let reason = "cannot do without its guides; leave it out";
             return refuse("guide_dropout", format!("{name} {reason}"));
         }
-        for (setting, share) in [("guide_dropout", self.guide_dropout), ("tint", self.tint)] {
+        for (setting, share) in
+            [("guide_dropout", self.guide_dropout), ("tint", self.tint), ("leak", self.leak)]
+        {
             if !(0.0..=1.0).contains(&share) {
                 return refuse(setting, format!("{share}: must be from 0 to 1"));
             }

@@ -160,7 +160,10 @@ impl<'a> Run<'a> {
         if !resume {
             set_prefilter(&mut *network, options)?;
         }
-        network.convolutions().into_iter().for_each(|conv| conv.set_precision(options.precision));
+        for conv in network.convolutions() {
+            conv.set_precision(options.precision);
+            conv.set_leak(options.leak as f32);
+        }
         train_only(&mut *network, &options.only)?;
         let mut average = network.duplicate();
         let mut optimizer = Optimizer::new(options.optimizer, options.weight_decay);
@@ -285,8 +288,7 @@ impl<'a> Run<'a> {
     fn report_silent(&mut self, on: &mut dyn FnMut(TrainEvent)) {
         let convolutions = self.average.convolutions().into_iter();
         let found = convolutions.filter(|conv| conv.range == Some(0.0));
-        let found: Vec<String> =
-            found.map(|conv| conv.weight.name.trim_end_matches(".weight").into()).collect();
+        let found: Vec<String> = found.map(|conv| conv.name().to_owned()).collect();
         let new: Vec<String> = found.into_iter().filter(|name| self.silent.insert(name.clone())).collect();
         if !new.is_empty() {
             on(TrainEvent::Warning(format!(
@@ -471,6 +473,7 @@ fn facts(options: &TrainOptions, row: &log::LogRow) -> Facts {
         raw_references: options.raw_references,
         guide_dropout: options.guide_dropout,
         tint: options.tint,
+        leak: options.leak,
         optimizer: options.optimizer.to_string(),
         weight_decay: options.weight_decay,
         precision: Some(options.precision),

@@ -28,7 +28,7 @@ use crate::{
     Error, Result,
     denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, Wrap, preview},
     frame::{Frame, prepare_folder},
-    models,
+    models, passes,
 };
 
 /// Arguments of `demc denoise`.
@@ -203,7 +203,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     }
 
     let options = Options {
-        view_layer: args.view_layer,
+        view_layer: args.view_layer.clone(),
         layer: (!args.replace).then_some(args.layer),
         tile: args.tile.map(|t| t as usize),
         preview: args.preview.then_some(preview::write),
@@ -243,7 +243,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
             (progress, Batch::watching(watch, model.into(), options)?)
         }
     };
-    if usize::from(args.jobs) > rayon::current_num_threads() {
+    if usize::from(args.jobs) > rayon::current_num_threads() && !args.quiet {
         let threads = rayon::current_num_threads();
         warn_line(&format!(
             "demc: note: --jobs {}: one for each of the {threads} threads is used",
@@ -256,7 +256,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let end = batch.run(|job, outcome| {
         progress.report(job, outcome);
         if let Some(ranking) = &mut ranking {
-            rank(ranking, job, outcome);
+            rank(ranking, job, outcome, args.view_layer.as_deref());
         }
     });
     let failed = progress.finish(end == End::Stopped);
@@ -271,11 +271,11 @@ pub fn run(args: Args) -> Result<ExitCode> {
 }
 
 /// Adds a frame to the list of expected errors. A result that existed already has noted its own.
-fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
+fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome, view_layer: Option<&str>) {
     let (errors, samples): (Vec<f64>, _) = match outcome {
         Outcome::Done(report) => (report.expected_error.into_iter().collect(), report.samples),
-        Outcome::Skipped => match Frame::read_headers(&job.output) {
-            Ok(result) => (result.expected_errors().into_iter().map(|(_, error)| error).collect(), None),
+        Outcome::Skipped => match noted(&job.output, view_layer) {
+            Ok(noted) => noted,
             Err(_) => return,
         },
         Outcome::Failed(_) => return,
@@ -284,6 +284,19 @@ fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
         ranking.add(job.input.display().to_string(), mean, samples);
     }
+}
+
+/// The expected errors that a result notes for a view layer, of each stereo view, and the samples of its render.
+fn noted(result: &Path, view_layer: Option<&str>) -> Result<(Vec<f64>, Option<u32>)> {
+    let result = Frame::read_headers(result)?;
+    let layers = passes::layers(&result);
+    let name = &passes::choose(&result, &layers, view_layer)?.name;
+    let is_of_layer = |noted: &str| {
+        let rest = noted.strip_prefix(name.as_str());
+        name.is_empty() || rest.is_some_and(|view| view.is_empty() || view.starts_with('.'))
+    };
+    let errors = result.expected_errors().into_iter().filter(|(noted, _)| is_of_layer(noted));
+    Ok((errors.map(|(_, error)| error).collect(), passes::told_samples(&result, name)))
 }
 
 /// The work of a batch.
