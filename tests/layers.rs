@@ -185,6 +185,27 @@ fn gradients_reach_trained_layers_alone() {
     assert_eq!(gradients([true, false]), [both[0].clone(), none]);
 }
 
+/// What a layer gives is the same; where its ReLU gives nothing, a share of the gradient passes.
+#[test]
+fn a_leak_lets_a_share_of_the_gradient_pass() {
+    let shape = Shape::new(1, 5, 6, 8);
+    let values: Vec<f32> = (0..5 * 6 * 8).map(|v| (v % 13) as f32 / 13.0).collect();
+    let run = |bias: f32, leak: f32| {
+        let mut layer = same(&[5], 5, 3).with_bias(bias);
+        layer.set_leak(leak);
+        let output = layer.forward(vec![Activation::<Taped>::input(shape, &values)]).into_images();
+        let given = output.as_vec();
+        let mut gradients = output.sum::<Rank0, _>().backward();
+        (given, gradients.get_or_alloc_mut(&layer.bias.tensor).unwrap().to_vec())
+    };
+    // So far below zero that nothing passes, and so far above that all does.
+    let (open, closed) = (run(50.0, 0.0), run(-50.0, 0.0));
+    assert!(closed.0.iter().chain(&closed.1).all(|v| *v == 0.0));
+    assert_eq!(open.1, [48.0; 5]);
+    assert_eq!(run(50.0, 0.25), open);
+    assert_eq!(run(-50.0, 0.25), (closed.0, vec![12.0; 5]));
+}
+
 #[test]
 fn max_pool() {
     let case = Case::new("max_pool");

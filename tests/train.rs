@@ -320,8 +320,51 @@ fn refuses_what_cannot_be_trained() {
     run(train(&out, 4).args(["--lr", "fast"])).code(2).stderr(says("FIRST:LAST"));
     run(train(&out, 4).args(["--optimizer", "sgd"])).code(2).stderr(says("adam or muon"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
+    run(train(&out, 4).args(["--leak", "2"])).code(2).stderr(says("a share from 0 to 1"));
+    run(train_with("demc", "64", &out, 4).args(["--prefilter", "x"])).code(2).stderr(says("demc has no prefilter"));
     run(&mut train(&out, 4)).success();
     run(&mut train(&out, 4)).code(1).stderr(says("--resume"));
+    // Without its configuration it is no run, but its weights may be somebody's.
+    fs::remove_file(out.join("config.json")).expect("it was written");
+    run(&mut train(&out, 4)).code(1).stderr(says("best.safetensors").and(says("would be replaced")));
+}
+
+#[test]
+fn a_folder_takes_one_run_at_a_time() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(&mut train(&out, 2)).success();
+    let mut longer = options(&out);
+    longer.steps = 4;
+    let mut second = None;
+    let stop = AtomicBool::new(false);
+    train::run(&longer, &out, true, &stop, &mut |event| {
+        if matches!(event, TrainEvent::Step { step: 3, .. }) {
+            second = train::run(&longer, &out, true, &stop, &mut |_| {}).err();
+        }
+    })
+    .expect("the first run goes on");
+    assert!(second.expect("it is refused").to_string().contains("another demc train works in this folder"));
+}
+
+#[test]
+fn pairs_count_once_however_they_are_named() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    let twice = data("s0000_room").replace("tests/data", "tests/data/../data");
+    let told = run(train(&out, 2).args(["--data", &twice])).success();
+    told.stderr(predicate::str::contains("1 pairs to train on").or(predicate::str::contains("1 pair to train on")));
+}
+
+#[test]
+fn settings_that_do_not_exist_are_refused() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    run(&mut train(&out, 2)).success();
+    let config = out.join("config.json");
+    let text = fs::read_to_string(&config).expect("a configuration");
+    fs::write(&config, text.replace("weight_decay", "weight-decay")).expect("a folder");
+    run(&mut resume(&out)).code(1).stderr(predicate::str::contains("weight-decay"));
 }
 
 #[test]

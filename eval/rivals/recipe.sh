@@ -8,7 +8,7 @@ recipe() {
     tint=0.25 decay=0.1 leak=0
     case $1 in
         demc) rate=900 loss=relmse lr=5e-3 decay=0.2 leak=0.01 patch=64 batch=8 ;;
-        demc-nofusion) rate=1050 loss=relmse lr=5e-3 decay=0.2 leak=0.01 patch=64 batch=8 ;;
+        demc-nofusion) rate=1050 loss=relmse lr=5e-3 decay=0.5 leak=0.01 patch=64 batch=8 ;;
         semc) rate=720 loss=relmse lr=5e-3 decay=0.2 leak=0.01 patch=64 batch=8 ;;
         kpcn) rate=250 loss=smape lr=2e-3 patch=32 batch=8 ;;
         lbf) rate=350 loss=both lr=3e-2 patch=128 batch=1 ;;
