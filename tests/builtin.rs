@@ -155,7 +155,7 @@ fn guides_may_be_missing() {
         blank.insert(pass, Planes::new(3, all.width, all.height));
     }
     let job = Job::new(&blank);
-    job.command().assert().success();
+    job.command().assert().success().stderr(contains("Denoising Normal, which hold nothing, at a loss"));
     assert_eq!(job.denoised(), image, "blank guides are as good as none");
     for (pass, kept) in [(Pass::DenoisingAlbedo, "Normal"), (Pass::DenoisingNormal, "Albedo")] {
         let (image, said) = without(&[pass]);
@@ -253,8 +253,15 @@ fn nan_and_infinity_in_any_pass_are_reported_and_never_spread() {
 }
 
 #[test]
-fn passes_without_a_single_number_still_make_a_finite_image() {
-    for pass in [Pass::Combined, Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
+fn guides_without_a_single_number_still_make_a_finite_image_and_such_a_beauty_fails() {
+    let mut broken = window(40, 24);
+    edit(&mut broken, Pass::Combined, |v| v.fill(f32::NAN));
+    Job::new(&broken)
+        .command()
+        .assert()
+        .code(1)
+        .stderr(contains("2880 of the 2880 values of Combined are NaN"));
+    for pass in [Pass::DenoisingAlbedo, Pass::DenoisingNormal] {
         let mut broken = window(40, 24);
         edit(&mut broken, pass, |v| v.fill(f32::NAN));
         let job = Job::new(&broken);

@@ -321,7 +321,9 @@ fn refuses_what_cannot_be_trained() {
     run(train(&out, 4).args(["--optimizer", "sgd"])).code(2).stderr(says("adam or muon"));
     run(&mut resume(&out)).code(1).stderr(says("config.json"));
     run(train(&out, 4).args(["--leak", "2"])).code(2).stderr(says("a share from 0 to 1"));
-    run(train_with("demc", "64", &out, 4).args(["--prefilter", "x"])).code(2).stderr(says("demc has no prefilter"));
+    run(train_with("demc", "64", &out, 4).args(["--prefilter", "x"]))
+        .code(2)
+        .stderr(says("demc has no prefilter"));
     run(&mut train(&out, 4)).success();
     run(&mut train(&out, 4)).code(1).stderr(says("--resume"));
     // Without its configuration it is no run, but its weights may be somebody's.
@@ -353,7 +355,9 @@ fn pairs_count_once_however_they_are_named() {
     let out = dir.path().join("run");
     let twice = data("s0000_room").replace("tests/data", "tests/data/../data");
     let told = run(train(&out, 2).args(["--data", &twice])).success();
-    told.stderr(predicate::str::contains("1 pairs to train on").or(predicate::str::contains("1 pair to train on")));
+    told.stderr(
+        predicate::str::contains("1 pairs to train on").or(predicate::str::contains("1 pair to train on")),
+    );
 }
 
 #[test]

@@ -2,7 +2,8 @@
 
     python curves.py OUT [NAME...]
 
-reads OUT/NAME/log.csv of each method and writes, beside this script, curves.csv (run, step, seconds, lr,
+reads OUT/NAME/log.csv of each method, and OUT/NAME.seconds, the processor time of the whole run, over which the log's
+seconds are spread where it is there (a run may have waited for others); and writes, beside this script, curves.csv (run, step, seconds, lr,
 train_loss, val_relmse, val_ssim) and curves.svg: RelMSE of the scenes that were held out, over steps and over
 minutes of one thread. Needs matplotlib.
 """
@@ -22,10 +23,16 @@ METHODS = ("demc", "demc-nofusion", "semc", "kpcn", "lbf")
 COLUMNS = ("step", "seconds", "lr", "train_loss", "val_relmse", "val_ssim")
 
 
-def read(path):
+def read(out, name):
     """The rows of a run's log."""
-    with open(path, encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    with open(os.path.join(out, name, "log.csv"), encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    try:
+        with open(os.path.join(out, name + ".seconds"), encoding="utf-8") as file:
+            factor = float(file.read()) / float(rows[-1]["seconds"])
+    except FileNotFoundError:
+        return rows
+    return [row | {"seconds": f"{factor * float(row['seconds']):.1f}"} for row in rows]
 
 
 def draw(logs, path):
@@ -52,7 +59,7 @@ def main():
     if len(sys.argv) < 2:
         sys.exit("usage: python curves.py OUT [NAME...]")
     out, names = sys.argv[1], sys.argv[2:] or METHODS
-    logs = {name: read(os.path.join(out, name, "log.csv")) for name in names}
+    logs = {name: read(out, name) for name in names}
     here = os.path.dirname(os.path.abspath(__file__))
     with open(os.path.join(here, "curves.csv"), "w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")

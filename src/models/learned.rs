@@ -159,18 +159,19 @@ impl Denoiser for Learned {
             return Some(format!("{}: {note}", self.name));
         }
         let PassSet { view_layer, renderer, .. } = &shot.passes;
-        let is_blank = |planes: &Planes| planes.data.iter().all(|v| *v == 0.0);
-        let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none_or(is_blank);
-        let missed: Vec<Pass> = self.dispensable().iter().copied().filter(is_missing).collect();
-        let name = |pass: &Pass| match shot.passes.get(*pass) {
-            Some(_) => format!("{pass}, which holds nothing,"),
-            None => pass.to_string(),
-        };
-        let names: Vec<String> = missed.iter().map(name).collect();
+        let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none();
+        let is_zero =
+            |pass: &Pass| shot.passes.get(*pass).is_some_and(|planes| planes.data.iter().all(|v| *v == 0.0));
+        // A sky has no normal, but what has neither normal nor albedo and is not black was never written.
+        let wanted = self.dispensable();
+        let is_blank = !wanted.is_empty() && wanted.iter().all(is_zero) && !is_zero(&Pass::Combined);
+        let missed: Vec<Pass> = wanted.iter().copied().filter(|pass| is_blank || is_missing(pass)).collect();
+        let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
         (!missed.is_empty()).then(|| {
             format!(
-                "done without {} at a loss of detail; {}",
+                "done without {}{}, at a loss of detail; {}",
                 names.join(" and "),
+                if is_blank { ", which hold nothing" } else { "" },
                 remedy(view_layer, renderer, &missed)
             )
         })
