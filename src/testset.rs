@@ -13,7 +13,7 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Error, Result};
+use crate::{Error, Result, frame::folder_of};
 
 /// A noisy render and the converged render of the same view.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -254,20 +254,16 @@ impl TestSet {
         let mut pairs: Vec<&mut Pair> = self.pairs.iter_mut().chain(lacking).collect();
         let mut folders: HashMap<String, BTreeSet<PathBuf>> = HashMap::new();
         for pair in &pairs {
-            folders.entry(pair.scene.clone()).or_default().insert(folder(&pair.reference).to_owned());
+            folders.entry(pair.scene.clone()).or_default().insert(folder_of(&pair.reference).to_owned());
         }
         for pair in &mut pairs {
             let alike = &folders[&pair.scene];
             if alike.len() > 1 {
-                pair.scene = format!("{} ({})", pair.scene, end_of(folder(&pair.reference), alike).display());
+                pair.scene =
+                    format!("{} ({})", pair.scene, end_of(folder_of(&pair.reference), alike).display());
             }
         }
     }
-}
-
-/// The folder of a file; that of a bare name is the present one.
-fn folder(file: &Path) -> &Path {
-    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// The shortest end of a path that none of the others has, or the whole of it.

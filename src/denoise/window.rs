@@ -88,6 +88,8 @@ struct Moment {
     /// These passes, which half floats hold exactly: a frame that stays alone is denoised to the same bits.
     waiting: BTreeMap<Pass, HalfFloats>,
     look: Look,
+    /// What brings its render to middle grey.
+    exposure: f32,
     /// The part of the frame that was [rendered](PassSet::rendered).
     region: ((usize, usize), (usize, usize)),
     /// How neighbours belong together with it, by how many frames later these are.
@@ -285,7 +287,7 @@ impl Window {
         self.gather(number, &view, model, &Options::default(), &mut Report::default())?;
         let own = self.moment(number, &view).expect("it has entered");
         let (result, render) = (own.result(), own.render());
-        let likeness = likeness::Own::of(result, &render, exposure(&render));
+        let likeness = likeness::Own::of(result, &render, own.exposure);
         let neighbours = self.neighbours(number, &view, self.reaches[1]).map(|Neighbour { moment, link }| {
             let (guides, there) = (own.guides(), moment.guides());
             let features = own.look.features(&moment.look, &link.flow, link.brightness, &guides, &there);
@@ -316,7 +318,7 @@ impl Window {
         let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
         let results: Vec<(&Planes, &Link)> =
             others.iter().map(|other| (other.moment.result(), &other.link)).collect();
-        Ok(own.inside(temporal::blend(own.result(), &radiance, exposure(&radiance), &results)))
+        Ok(own.inside(temporal::blend(own.result(), &radiance, own.exposure, &results)))
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
@@ -480,7 +482,7 @@ impl Window {
         let brightness = own.look.brightness(&other.look, &flow);
         let mut weights = own.look.agreement(&other.look, &flow, brightness, &own.guides(), &other.guides());
         if let [Some(light), Some(there)] = [own, other].map(|moment| moment.values(Pass::Combined)) {
-            agreement::dim(&mut weights, &flow, light, there, DARK / exposure(&own.render()));
+            agreement::dim(&mut weights, &flow, light, there, DARK / own.exposure);
         }
         let (mut sum, mut inside) = (0.0, 0usize);
         for y in 0..weights.height {
@@ -568,6 +570,7 @@ impl Moment {
         }
         let radiance = passes.get(Pass::Combined).expect("a frame is not loaded without it");
         let look = Look::of(radiance, &guides(|pass| Some(passes.get(pass)?)));
+        let exposure = exposure(radiance);
         let averaged = Pass::ALL.into_iter().filter(|pass| !is_place(*pass));
         let waiting = averaged.filter_map(|pass| {
             let halves = HalfFloats::exactly(passes.get(pass)?)?;
@@ -575,7 +578,16 @@ impl Moment {
             Some((pass, halves))
         });
         let waiting = waiting.collect();
-        Self { shot, waiting, look, region, links: BTreeMap::new(), result: None, lacked: BTreeSet::new() }
+        Self {
+            shot,
+            waiting,
+            look,
+            exposure,
+            region,
+            links: BTreeMap::new(),
+            result: None,
+            lacked: BTreeSet::new(),
+        }
     }
 
     fn values(&self, pass: Pass) -> Option<&dyn Values> {

@@ -49,8 +49,8 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
     Ok(())
 }
 
-/// The folder that a file is in.
-fn folder_of(path: &Path) -> &Path {
+/// The folder that a file is in; that of a bare name is the present one.
+pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

@@ -54,7 +54,7 @@ pub fn evaluate(
 ) -> Result<Vec<Row>> {
     let mut evaluation = Evaluation::begin(pairs, methods, options, on)?;
     let mut carried = Carried::new(pairs, options);
-    for (pair, sheet) in pairs.iter().zip(sheet_names(pairs)) {
+    for (pair, sheet) in pairs.iter().zip(evaluation.sheets.clone()) {
         evaluation.run(pair, &sheet, &mut carried, on)?;
     }
     evaluation.report()
@@ -65,6 +65,8 @@ struct Evaluation<'a> {
     pairs: &'a [Pair],
     methods: &'a [Contender],
     options: &'a EvalOptions,
+    /// The file names of the pairs' sheets.
+    sheets: Vec<String>,
     provenance: Provenance,
     /// What the rows in the folder are made with; stored in `run.json`.
     settings: Settings,
@@ -104,8 +106,10 @@ impl<'a> Evaluation<'a> {
         }
         on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept: earlier.kept.len() });
         let table = Table::create(scores, earlier.kept, earlier.others)?;
-        let mut evaluation = Self { pairs, methods, options, provenance, settings, table };
-        for (pair, sheet) in pairs.iter().zip(sheet_names(pairs)) {
+        let sheets: Vec<String> = pairs.iter().map(|pair| sheet_name(pairs, pair)).collect();
+        let mut evaluation =
+            Self { pairs, methods, options, sheets: sheets.clone(), provenance, settings, table };
+        for (pair, sheet) in pairs.iter().zip(sheets) {
             // It is noted again when it is drawn. If this run is killed before that, the old sheet is not taken
             // for one of the new rows.
             let is_finished = evaluation.finished(pair).iter().all(|finished| *finished);
@@ -155,10 +159,8 @@ impl<'a> Evaluation<'a> {
     fn report(self) -> Result<Vec<Row>> {
         let out = &self.options.out;
         let names = self.names();
-        let sheets: Vec<Option<PathBuf>> = sheet_names(self.pairs)
-            .iter()
-            .map(|sheet| self.drawn(sheet).filter(|_| self.options.sheets))
-            .collect();
+        let sheets: Vec<Option<PathBuf>> =
+            self.sheets.iter().map(|sheet| self.drawn(sheet).filter(|_| self.options.sheets)).collect();
         let scenes: Vec<(&Pair, Option<PathBuf>)> = self.pairs.iter().zip(sheets).collect();
         let rows = self.table.finish(keys(self.pairs, self.methods))?;
         let summaries = summary::summarise(&rows, &names, &self.options.baseline);
@@ -313,11 +315,6 @@ pub fn remove_chart(out: &Path, name: &str) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// The file names of the pairs' sheets.
-fn sheet_names(pairs: &[Pair]) -> Vec<String> {
-    pairs.iter().map(|pair| sheet_name(pairs, pair)).collect()
 }
 
 /// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
