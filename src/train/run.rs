@@ -84,7 +84,7 @@ pub fn run(
     prepare_folder(out)?;
     let _lock = lock(out)?;
     let mut run = Run::begin(options, out, resume)?;
-    if run.progress.step >= options.steps {
+    if run.progress.step >= options.steps && !run.is_to_be_logged() {
         on(TrainEvent::Warning(format!(
             "{}: all {} steps are done; to go on, give \"steps\" in config.json a larger number",
             out.display(),
@@ -213,10 +213,15 @@ impl<'a> Run<'a> {
     ) -> Result<()> {
         (self.since, self.saved) = (Instant::now(), Instant::now());
         loop {
-            let finite = self.step(training, on)?;
-            let last = self.progress.step == self.options.steps;
-            if self.progress.step.is_multiple_of(self.options.every) || last {
-                self.log(validation, on)?;
+            // A run that was stopped amid a validation takes no step before that is done.
+            let finite = self.is_to_be_logged() || self.step(training, on)?;
+            let last = self.progress.step >= self.options.steps;
+            if self.is_to_be_logged() {
+                match self.log(validation, stop, on) {
+                    // What the validation took does not count as training.
+                    Err(Error::Interrupted) => self.since = Instant::now(),
+                    logged => logged?,
+                }
             }
             let stopping = stop.load(Ordering::Relaxed);
             let due = stopping || self.saved.elapsed().as_secs_f64() > CHECKPOINT_SECONDS;
@@ -224,12 +229,20 @@ impl<'a> Run<'a> {
                 self.count_seconds();
                 self.save()?;
             }
-            match (last, stopping) {
-                (true, _) => return Ok(()),
-                (false, true) => return Err(Error::Interrupted),
-                _ => {}
+            if last && !self.is_to_be_logged() {
+                return Ok(());
+            }
+            if stopping {
+                return Err(Error::Interrupted);
             }
         }
+    }
+
+    /// Whether a row of the log is due that is not there yet.
+    fn is_to_be_logged(&self) -> bool {
+        let Progress { step, .. } = self.progress;
+        let is_due = step > 0 && (step.is_multiple_of(self.options.every) || step >= self.options.steps);
+        is_due && self.rows.last().is_none_or(|row| row.step < step)
     }
 
     /// Takes a step. Returns whether it had a finite gradient; if not, nothing changed.
@@ -250,16 +263,18 @@ impl<'a> Run<'a> {
         Ok(finite)
     }
 
-    /// Validates, adds a row to the log and writes the weights.
-    fn log(&mut self, validation: &Dataset, on: &mut dyn FnMut(TrainEvent)) -> Result<()> {
+    /// Validates, adds a row to the log and writes the weights. Where `stop` is set, it may do none of that and return
+    /// [`Error::Interrupted`].
+    fn log(&mut self, validation: &Dataset, stop: &AtomicBool, on: &mut dyn FnMut(TrainEvent)) -> Result<()> {
         self.count_seconds();
+        let (sum, count) = self.progress.losses;
+        report_skipped(self.progress.skipped, count, self.out, on)?;
+        let score = validate(&mut *self.average, validation, self.out, stop)?;
         let progress = &mut self.progress;
-        let (sum, count) = std::mem::take(&mut progress.losses);
-        report_skipped(progress.skipped, count, self.out, on)?;
+        progress.losses = Default::default();
         if count > 0 {
             progress.skipped = 0;
         }
-        let score = validate(&mut *self.average, validation, self.out)?;
         let row = log::LogRow {
             step: progress.step,
             seconds: (progress.seconds * 10.0).round() / 10.0,
@@ -427,12 +442,23 @@ fn follow(average: &mut dyn Network, network: &mut dyn Network, decay: f64, step
 
 /// Geometric mean of RelMSE and mean of SSIM over whole frames; none without frames. The layers of `trained`
 /// learn what range their outputs have there.
-fn validate(trained: &mut dyn Network, frames: &Dataset, out: &Path) -> Result<Option<(f64, Option<f64>)>> {
+///
+/// # Errors
+/// An output is not finite, or `stop` is set.
+fn validate(
+    trained: &mut dyn Network,
+    frames: &Dataset,
+    out: &Path,
+    stop: &AtomicBool,
+) -> Result<Option<(f64, Option<f64>)>> {
     let (mut logs, mut ssims) = (Vec::new(), Vec::new());
     let mut network = trained.duplicate();
     network.freeze();
     network.convolutions().into_iter().for_each(Conv::observe);
     for index in 0..frames.len() {
+        if stop.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted);
+        }
         let (name, sample) = frames.frame(index);
         let image = network.infer(&sample.passes, None)?;
         let (image, reference) = (&image, &network.target(&sample.reference)?);
