@@ -214,15 +214,137 @@ fn a_resumed_run_needs_none_of_the_weights_it_began_with() {
         assert!(matches!(run_until(&options, &cut, true, stop_at), Err(Error::Interrupted)));
         let first = |row: &String| row.split(',').next().expect("a cell").to_owned();
         assert_eq!(log(&cut).iter().map(first).collect::<Vec<_>>(), rows);
+        // Killed when the row has just been written: the checkpoint does not know of it.
+        let killed = || {
+            let mut on = |event| assert!(!matches!(event, TrainEvent::Logged(_)), "killed");
+            train::run(&options, &cut, true, &AtomicBool::new(false), &mut on)
+        };
+        assert!(std::panic::catch_unwind(killed).is_err());
     }
     run_until(&options, &cut, true, 0).expect("it ends");
     assert_eq!(log(&cut), log(&whole));
     assert_eq!(tensors(&cut), tensors(&whole));
+    let best =
+        |out: &Path| weights_file::read(&out.join("best.safetensors")).expect("weights").1.training.steps;
+    assert_eq!(best(&cut), best(&whole));
     let held = |out: &Path| {
         let (_, metadata) = weights_file::read(&out.join("last.safetensors")).expect("weights");
         (metadata.network, metadata.ranges)
     };
     assert_eq!(held(&cut), held(&whole));
+}
+
+#[test]
+fn the_best_weights_are_those_of_the_best_row() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    let mut command = train_every(20, "demc-s", "32", &out, 60);
+    // Rates at which it gets worse again.
+    run(command.args(["--widths", "8,8,8,8", "--lr", "1e-2:1e-2", "--average", "0"])).success();
+    let error = |row: &String| row.split(',').nth(3).expect("a cell").parse::<f64>().expect("an error");
+    let errors: Vec<f64> = log(&out)[1..].iter().map(error).collect();
+    let best = errors.iter().copied().fold(f64::INFINITY, f64::min);
+    assert!(
+        errors.last().is_some_and(|last| *last > best),
+        "the last is the best, which shows nothing: {errors:?}"
+    );
+    let of = |name: &str| weights_file::read(&out.join(name)).expect("weights").1.training;
+    assert_eq!(of("best.safetensors").validation_relmse, Some(best));
+    assert_eq!(of("last.safetensors").validation_relmse, errors.last().copied());
+}
+
+#[test]
+fn what_batch_norms_saw_is_kept() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = dir.path().join("run");
+    let mut command = train_with("demc", "32", &out, 3);
+    run(command.args(["--widths", "8,8,16,16,16"])).success();
+    let (mut network, _) = weights_file::read(&out.join("best.safetensors")).expect("weights");
+    let norms = network.batch_norms();
+    assert!(!norms.is_empty());
+    for norm in norms {
+        assert!(norm.mean.values().iter().any(|v| *v != 0.0), "{}", norm.mean.name);
+        assert!(norm.variance.values().iter().any(|v| *v != 1.0), "{}", norm.variance.name);
+    }
+}
+
+#[test]
+fn settings_change_what_is_learned() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let learned = |name: &str, settings: &[&str]| {
+        let out = dir.path().join(name);
+        run(train_with("demc-s", "32", &out, 3).args(["--precision", "f32"]).args(settings)).success();
+        tensors(&out).into_iter().map(|tensor| (tensor.name, tensor.values)).collect::<Vec<_>>()
+    };
+    let plain = learned("plain", &[]);
+    assert!(plain == learned("again", &[]), "the same settings");
+    for settings in [
+        ["--tint", "1"],
+        ["--guide-dropout", "1"],
+        ["--leak", "0.5"],
+        ["--average", "0.2"],
+        ["--weight-decay", "0.5"],
+        ["--optimizer", "muon"],
+        ["--loss", "ssim"],
+    ] {
+        assert!(plain != learned(settings[0], &settings), "{settings:?}");
+    }
+    let rounded = dir.path().join("rounded");
+    run(train_with("demc-s", "32", &rounded, 3).args(["--precision", "bf16"])).success();
+    assert!(plain.iter().zip(tensors(&rounded)).any(|(plain, rounded)| plain.1 != rounded.values));
+}
+
+/// What is read of a row of eval's scores.
+#[derive(Debug, serde::Deserialize)]
+struct Score {
+    model: String,
+    relmse: f64,
+    ssim: f64,
+}
+
+#[test]
+fn the_log_tells_what_eval_does() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let (out, report) = (dir.path().join("run"), dir.path().join("report"));
+    let both = dir.path().join("both");
+    fs::create_dir(&both).expect("a folder");
+    // A pair of which nothing can be learned, so that errors differ and no other mean of them is the same.
+    for (from, to) in [
+        ("s0010_outdoor_0004spp", "outdoor_0004spp"),
+        ("s0010_outdoor_ref", "outdoor_ref"),
+        ("s0000_room_0004spp", "room_0004spp"),
+        ("s0000_room_0004spp", "room_ref"),
+    ] {
+        let from = format!("{}/tests/data/{from}.exr", env!("CARGO_MANIFEST_DIR"));
+        fs::copy(from, both.join(format!("{to}.exr"))).expect("a copy");
+    }
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args([
+        "train", "--model", "demc-s", "--batch", "1", "--patch", "32", "--every", "3", "--steps", "3",
+    ]);
+    command
+        .args(["--precision", "f32", "--data", &data("s0000_room"), "--val"])
+        .arg(&both)
+        .arg("--out")
+        .arg(&out);
+    run(&mut command).success();
+    let last = log(&out).pop().expect("a row");
+    let logged: Vec<f64> = last.split(',').skip(3).map(|cell| cell.parse().expect("a number")).collect();
+
+    let weights = format!("{}:f32:unrestrained", out.join("last.safetensors").display());
+    let mut command = Command::new(cargo_bin("demc"));
+    command.args(["eval", "--models", &weights, "--repeats", "1", "--no-sheets", "--test-set"]).arg(&both);
+    run(command.arg("--out").arg(&report)).success();
+    let mut scores = csv::Reader::from_path(report.join("scores.csv")).expect("scores");
+    let rows = scores.deserialize().map(|row| row.expect("a row")).filter(|row: &Score| row.model != "noisy");
+    let rows: Vec<Score> = rows.collect();
+    let [one, other] = &rows[..] else { panic!("two frames") };
+    let geomean = (one.relmse * other.relmse).sqrt();
+    let mean = (one.ssim + other.ssim) / 2.0;
+    // The two frames differ so much that another mean would be told.
+    assert!((one.relmse + other.relmse) / 2.0 > 1.05 * geomean, "{rows:?}");
+    assert!((logged[0] / geomean - 1.0).abs() < 2e-3, "{logged:?}, {geomean}");
+    assert!((logged[1] - mean).abs() < 1e-3, "{logged:?}, {mean}");
 }
 
 #[test]
@@ -240,8 +362,8 @@ fn parameters_alone_are_trained_that_were_asked_for() {
         let after = trained.iter().find(|tensor| tensor.name == before.name).expect("the same tensors");
         assert_eq!(before.values != after.values, asked_for(&before.name), "{}", before.name);
     }
-    let mut moments = trained.iter().filter_map(|tensor| tensor.name.strip_prefix("first."));
-    assert!(moments.all(asked_for));
+    let mut moments = trained.iter().filter_map(|tensor| tensor.name.strip_prefix("first.")).peekable();
+    assert!(moments.peek().is_some() && moments.all(asked_for));
     let mut refused = train_with("demc", "64", &third, 1);
     let refused = run(refused.args(["--only", "*.bias", "--init"]).arg(&begin)).code(2);
     refused.stderr(predicate::str::contains("--only: demc normalises"));

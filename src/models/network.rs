@@ -10,7 +10,7 @@ use crate::{
     companion::Companion,
     features::Inputs,
     kernels::{Shape, memory::PlaneBuffer},
-    nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers},
+    nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers, values_of},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -327,7 +327,7 @@ fn run_tiled<N: Network + ?Sized>(network: &N, passes: &PassSet, tile: Option<us
                     (Shape::new(1, seen.channels, seen.height, seen.width), seen.data)
                 })
                 .collect();
-            let output = network.forward(&batch, &mut Stats::Running).as_vec();
+            let output = values_of(&network.forward(&batch, &mut Stats::Running));
             let output = Planes::from_vec(3, seen.0, seen.1, output);
             for c in 0..3 {
                 for row in 0..size.1 {

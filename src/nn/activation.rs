@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use dfdx::tensor::{Cpu, NoneTape, PutTape, SplitTape, Tape, TensorFromVec};
 
-use super::{Images, pool::Buffer};
+use super::{Images, pool::Buffer, values_of};
 use crate::kernels::{
     Shape, View,
     layout::{from_blocked, to_blocked},
@@ -123,7 +123,7 @@ impl<T: Tape<f32, Cpu>> Activation<T> {
         let &(n, c, h, w) = dfdx::shapes::HasShape::shape(&images);
         let shape = Shape::new(n, c, h, w);
         let mut data = Buffer::new(shape);
-        to_blocked(&images.as_vec(), 1, data.view_mut());
+        to_blocked(&values_of(&images), 1, data.view_mut());
         let gradient = Gradient::<Buffer>::default();
         if T::OWNS_TAPE {
             let gradient = gradient.clone();

@@ -5,7 +5,7 @@ use dfdx::{
     tensor::{Cpu, PutTape, SplitTape, Tape, TensorFromVec},
 };
 
-use super::Images;
+use super::{Images, values_of};
 use crate::kernels::{cross_bilateral::CrossBilateral, filter::Size, simd::Tier};
 
 /// The images of a batch, to be filtered.
@@ -50,7 +50,7 @@ pub fn cross_bilateral<T: Tape<f32, Cpu>>(guides: GuidedImages, precision: Image
     let &(images, _, h, w) = precision.shape();
     let (size, tier) = (Size { h, w }, Tier::detect());
     let (mut output, mut total) = (vec![0.0; images * 3 * h * w], vec![0.0; images * h * w]);
-    let values = precision.as_vec();
+    let values = values_of(&precision);
     for (n, (output, total)) in output.chunks_mut(3 * h * w).zip(total.chunks_mut(h * w)).enumerate() {
         guides.filter(size, n, &values).apply(tier, output, total);
     }
@@ -59,7 +59,7 @@ pub fn cross_bilateral<T: Tape<f32, Cpu>>(guides: GuidedImages, precision: Image
         let out = filtered.clone();
         tape.add_backward_op(move |gradients| {
             let gradient = std::mem::take(&mut **gradients.get_or_alloc_mut(&out)?);
-            let (output, values) = (out.as_vec(), precision.as_vec());
+            let (output, values) = (values_of(&out), values_of(&precision));
             let into = gradients.get_or_alloc_mut(&precision)?;
             for (n, into) in into.chunks_mut(values.len() / images).enumerate() {
                 let of = |values: &[f32], channels: usize| {

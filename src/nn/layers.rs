@@ -14,6 +14,7 @@ use super::{
     Activation, Field, Init, Param, Precision,
     activation::{Data, Saved},
     arithmetic::{Arithmetic, Packed},
+    param::values_of,
     pool::Buffer,
 };
 use crate::kernels::{
@@ -266,7 +267,7 @@ impl Conv {
     /// If the sources do not have the layer's channels, or differ in size.
     pub fn forward<T: Tape<f32, Cpu> + Merge<T>>(&self, sources: Vec<Activation<T>>) -> Activation<T> {
         let shape_out = self.output(&sources);
-        let (weights, bias) = (self.packed(), to_blocks(&self.bias.tensor.as_vec()));
+        let (weights, bias) = (self.packed(), to_blocks(&self.bias.values()));
         let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
         // Without a tape, what the next convolution would round anyway is rounded here.
         let format = match self.arithmetic.precision {
@@ -310,7 +311,7 @@ impl Conv {
                 if saved.iter().all(|source| source.gradient.is_none()) {
                     return Ok(());
                 }
-                let weights = weight.as_vec();
+                let weights = values_of(&weight);
                 let input_gradient = arithmetic.input_gradient(gradient.view(), &weights);
                 for (index, source) in saved.iter().enumerate() {
                     source.accumulate(|into, fresh| input_gradient(index, into.view_mut(), !fresh));
@@ -330,7 +331,7 @@ impl Conv {
     pub fn forward_planes(&self, sources: &[Activation<NoneTape>], factor: usize) -> Field<NoneTape> {
         assert!(!self.relu, "what is read as planes may be negative");
         let shape = self.output(sources);
-        let (weights, bias) = (self.packed(), to_blocks(&self.bias.tensor.as_vec()));
+        let (weights, bias) = (self.packed(), to_blocks(&self.bias.values()));
         let data: Vec<&Data> = sources.iter().map(|s| &*s.saved.data).collect();
         let values = self.arithmetic.forward_planes(&data, &weights, &bias, (shape, factor));
         let Shape { n, c, h, w, .. } = shape;
@@ -351,7 +352,7 @@ impl Conv {
     fn packed(&self) -> Arc<Packed> {
         match &self.frozen {
             Some(packed) => packed.clone(),
-            None => Arc::new(self.arithmetic.pack(&self.weight.tensor.as_vec(), &[])),
+            None => Arc::new(self.arithmetic.pack(&self.weight.values(), &[])),
         }
     }
 }

@@ -20,7 +20,7 @@ pub use cross_bilateral::{GuidedImages, cross_bilateral};
 pub use field::Field;
 pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
 pub use line::{Line, Rows};
-pub use param::{Init, Param};
+pub use param::{Init, Param, values_of};
 pub use pool::clear as clear_buffers;
 
 use dfdx::tensor::Cpu;

@@ -1,6 +1,9 @@
 //! Parameters: named dfdx tensors with a shape, and how they begin.
 
-use dfdx::tensor::{Cpu, Tensor, TensorFromVec};
+use dfdx::{
+    shapes::{HasShape, Shape},
+    tensor::{Cpu, Tensor, TensorFromVec},
+};
 
 use crate::rng::Rng;
 
@@ -39,7 +42,7 @@ impl Param {
 
     /// Its values, row-major.
     pub fn values(&self) -> Vec<f32> {
-        self.tensor.as_vec()
+        values_of(&self.tensor)
     }
 
     /// Replaces its values, keeping the tensor's identity (optimiser moments stay attached).
@@ -49,6 +52,14 @@ impl Param {
     pub fn set(&mut self, values: &[f32]) {
         self.tensor.copy_from(values);
     }
+}
+
+/// The values of a tensor whose values lie in order, as those of all here do, in one copy: dfdx's `as_vec` finds the
+/// place of each.
+pub fn values_of<S: Shape, T>(tensor: &Tensor<S, f32, Cpu, T>) -> Vec<f32> {
+    let mut values = vec![0.0; tensor.shape().num_elements()];
+    tensor.copy_into(&mut values);
+    values
 }
 
 /// How the weights of a convolution begin.

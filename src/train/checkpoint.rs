@@ -24,6 +24,9 @@ pub struct Progress {
     pub step: usize,
     /// Seconds spent in all, before and after resuming.
     pub seconds: f64,
+    /// The step of the last row of the log, or 0. A row that was written after the checkpoint is not counted, and made
+    /// again.
+    pub logged: usize,
     /// Sum and number of training losses since the last line of the log.
     pub losses: (f64, usize),
     /// Steps skipped because their gradient was not finite, since the last line of the log before which some

@@ -489,6 +489,58 @@ mod tests {
     }
 
     #[test]
+    fn a_share_of_crops_lacks_albedo_normals_or_both() {
+        let mut rng = Rng::new(3, 0);
+        let mut met = std::collections::BTreeMap::new();
+        for _ in 0..1000 {
+            let mut passes = PassSet::new("a.exr", "", 4, 4);
+            let [albedo, normal] = PREFILTERED_PASSES;
+            for pass in PREFILTERED_PASSES {
+                passes.insert(pass, Planes::from_vec(3, 4, 4, vec![0.25; 48]));
+            }
+            drop_guides(&mut passes, 0.25, &mut rng);
+            let lacks = |pass| passes.get(pass).unwrap().data == stand_in(pass, (4, 4)).data;
+            *met.entry([lacks(albedo), lacks(normal)]).or_insert(0) += 1;
+        }
+        // Three standard deviations.
+        assert!((709..791).contains(&met[&[false, false]]), "{met:?}");
+        for lacking in [[true, false], [false, true], [true, true]] {
+            assert!((57..110).contains(&met[&lacking]), "{met:?}");
+        }
+    }
+
+    #[test]
+    fn references_before_they_were_denoised_are_kept_where_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut pair = room();
+        let mut frame = Frame::read(&pair.reference).unwrap();
+        let values = vec![0.75; 128 * 128];
+        let channels = ["R", "G", "B"].map(|component| NewChannel {
+            component,
+            kind: SampleKind::Float,
+            values: &values,
+        });
+        frame.set_layer(0, "ViewLayer.Noisy Image", None, &channels).unwrap();
+        pair.reference = folder.path().join("room_ref.exr");
+        frame.write(&pair.reference).unwrap();
+        for raw in [true, false] {
+            let wanted = (&[Pass::Combined][..], &[][..]);
+            let data = Dataset::load(
+                std::slice::from_ref(&pair),
+                wanted,
+                &[Pass::Combined],
+                raw,
+                1,
+                &AtomicBool::new(false),
+            );
+            let data = data.unwrap();
+            assert_eq!(data.has_raw_references(), raw);
+            let kept = data.frame(0).1.raw_reference.map(|planes| planes.channel(1).to_vec());
+            assert_eq!(kept, raw.then(|| values.clone()));
+        }
+    }
+
+    #[test]
     fn frames_that_hold_no_crop_at_all_are_named() {
         let pair = room();
         let load = |least| {

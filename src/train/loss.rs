@@ -15,7 +15,7 @@ use crate::{
         ssim,
     },
     models::network::Taped,
-    nn::Images,
+    nn::{self, Images},
     planes::Planes,
 };
 
@@ -136,7 +136,7 @@ fn geomean(
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
     let (images, values) = (scale.len(), reference.len() / scale.len());
     let mut weight = weights(reference, scale);
-    let image_values = image.as_vec();
+    let image_values = nn::values_of(&image);
     let logarithms = weight.par_chunks_mut(values).enumerate().map(|(n, weight)| {
         let of_image = n * values..(n + 1) * values;
         let pixels = image_values[of_image.clone()].iter().zip(&reference[of_image]).zip(&*weight);
@@ -249,7 +249,7 @@ fn mean_of_planes(
 ) -> Tensor<Rank0, f32, Cpu, Taped> {
     let (image, mut tape) = image.split_tape();
     let &(_, _, h, w) = image.shape();
-    let values = image.as_vec();
+    let values = nn::values_of(&image);
     let planes = values.par_chunks(h * w).zip(reference.par_chunks(h * w)).enumerate();
     let (sums, slopes): (Vec<f64>, Vec<Vec<f32>>) = planes.map(|(plane, (x, r))| of(plane, x, r)).unzip();
     // In the order of planes, whatever the threads do.
@@ -355,6 +355,60 @@ mod tests {
         assert!((value - at(&moved).0 - fall).abs() < 0.05 * fall, "{} for {fall}", value - at(&moved).0);
         let black: Images = Cpu::default().tensor_from_vec(vec![0.0; count], SHAPE);
         assert_eq!(Loss::Ssim.of(black.leaky_trace(), vec![0.0; count], None, &[1.0; 2]).array(), 0.0);
+    }
+
+    #[test]
+    fn gradients_of_all_losses_are_their_slopes() {
+        const SHAPE: (usize, usize, usize, usize) = (2, 3, 12, 13);
+        let count = 2 * 3 * 12 * 13;
+        let mut rng = Rng::new(5, 1);
+        let mut random = |from: f32, to: f32| -> Vec<f32> {
+            (0..count).map(|_| from + (to - from) * rng.uniform()).collect()
+        };
+        let (values, reference) = (random(0.1, 0.6), random(0.1, 0.6));
+        let directions = [random(-1.0, 1.0), random(-1.0, 1.0), random(-1.0, 1.0)];
+        for loss in Loss::ALL {
+            let at = |values: &[f32]| {
+                let image: Images = Cpu::default().tensor_from_vec(values.to_vec(), SHAPE);
+                let loss = loss.of(image.leaky_trace(), reference.clone(), None, &[0.5, 2.0]);
+                (f64::from(loss.array()), loss.backward().get(&image).as_vec())
+            };
+            let slope = at(&values).1;
+            for direction in &directions {
+                let moved =
+                    |by: f32| -> Vec<f32> { values.iter().zip(direction).map(|(v, d)| v + by * d).collect() };
+                // Short, as absolute values have kinks.
+                let step = 4e-4f32;
+                let numeric = (at(&moved(step)).0 - at(&moved(-step)).0) / (2.0 * f64::from(step));
+                let dot = |v: &[f32], w: &[f32]| -> f64 {
+                    v.iter().zip(w).map(|(v, w)| f64::from(*v) * f64::from(*w)).sum()
+                };
+                let analytic = dot(&slope, direction);
+                let size = (dot(&slope, &slope) * dot(direction, direction) / count as f64).sqrt();
+                assert!((numeric - analytic).abs() < 0.05 * size, "{loss}: {numeric}, not {analytic}");
+            }
+        }
+    }
+
+    #[test]
+    fn losses_are_the_metrics_of_images_in_any_scale() {
+        const SHAPE: (usize, usize, usize, usize) = (1, 3, 8, 8);
+        let mut rng = Rng::new(6, 1);
+        // So dark that the metrics' constants count.
+        let mut dark = || -> Vec<f32> { (0..3 * 8 * 8).map(|_| 0.03 * rng.uniform()).collect() };
+        let (image, reference) = (dark(), dark());
+        let planes = |values: &[f32]| Planes::from_vec(3, 8, 8, values.to_vec());
+        let want = crate::metrics::error::relmse(&planes(&image), &planes(&reference));
+        for scale in [0.1, 1.0, 7.0] {
+            let scaled = |values: &[f32]| -> Vec<f32> { values.iter().map(|v| v / scale).collect() };
+            let in_scale: Images = Cpu::default().tensor_from_vec(scaled(&image), SHAPE);
+            let loss = |loss: Loss| {
+                f64::from(loss.of(in_scale.leaky_trace(), scaled(&reference), None, &[scale]).array())
+            };
+            assert!((loss(Loss::Relmse) - want).abs() < 1e-4 * want, "{scale}");
+            let logarithm = (want / f64::from(SMALL_ERROR)).ln_1p();
+            assert!((loss(Loss::Geomean) - logarithm).abs() < 1e-4 * logarithm, "{scale}");
+        }
     }
 
     #[test]

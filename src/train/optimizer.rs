@@ -158,12 +158,20 @@ fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
     if tall {
         x = transposed(x);
     }
+    // Each iteration multiplies by `a + b G + c G^2`, `G` the matrix times its transpose, and so `G` by the square of that. All
+    // but two products are then of small square matrices.
     let [a, b, c] = COEFFICIENTS;
+    let mut gram: Matrix = x.clone().matmul(transposed(x.clone()));
+    let side = rows.min(columns);
+    let unit = (0..side * side).map(|i| if i % (side + 1) == 0 { 1.0 } else { 0.0 }).collect();
+    let mut product: Matrix = Cpu::default().tensor_from_vec(unit, (side, side));
     for _ in 0..ITERATIONS {
-        let gram: Matrix = x.clone().matmul(transposed(x.clone()));
-        let polynomial: Matrix = gram.clone() * b + gram.clone().matmul(gram) * c;
-        x = polynomial.matmul(x.clone()) + x * a;
+        let polynomial: Matrix = gram.clone() * b + gram.clone().matmul(gram.clone()) * c;
+        let apply = |m: Matrix| polynomial.clone().matmul(m.clone()) + m * a;
+        product = apply(product);
+        gram = apply(apply(gram));
     }
+    x = product.matmul(x);
     if tall { transposed(x) } else { x }.as_vec()
 }
 
@@ -201,6 +209,78 @@ mod tests {
             assert!(rest.iter().all(|v| v.abs() < 1e-3), "nothing else appears");
             let scaled = orthogonal(matrix.iter().map(|v| 1e-4 * v).collect(), rows, columns);
             assert!(scaled.iter().zip(&out).all(|(a, b)| (a - b).abs() < 1e-3));
+        }
+    }
+
+    #[test]
+    fn products_of_small_matrices_make_what_the_iteration_makes() {
+        for (rows, columns) in [(48, 432), (432, 48), (32, 32)] {
+            let mut rng = Rng::new(8, 1);
+            // Directions from much to little, as gradients have them.
+            let value = |i: usize| (rng.uniform() - 0.5) / (1 + i / columns % 40).pow(2) as f32;
+            let matrix: Vec<f32> = (0..rows * columns).map(value).collect();
+            let norm = matrix.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            let mut x: Vec<f64> = matrix.iter().map(|v| f64::from(*v) / norm).collect();
+            for _ in 0..5 {
+                // x (a + b x'x + c (x'x)^2), one product with x'x at a time.
+                let gram: Vec<f64> = (0..columns * columns)
+                    .map(|i| {
+                        (0..rows).map(|r| x[r * columns + i / columns] * x[r * columns + i % columns]).sum()
+                    })
+                    .collect();
+                let times_gram = |x: &[f64]| -> Vec<f64> {
+                    let mut product = vec![0.0; rows * columns];
+                    for (row, out) in x.chunks(columns).zip(product.chunks_mut(columns)) {
+                        for (v, gram) in row.iter().zip(gram.chunks(columns)) {
+                            out.iter_mut().zip(gram).for_each(|(out, g)| *out += v * g);
+                        }
+                    }
+                    product
+                };
+                let (once, twice) = (times_gram(&x), times_gram(&times_gram(&x)));
+                let terms = x.iter().zip(&once).zip(&twice);
+                x = terms.map(|((x, once), twice)| 3.4445 * x - 4.7750 * once + 2.0315 * twice).collect();
+            }
+            let out = orthogonal(matrix, rows, columns);
+            let most = out.iter().zip(&x).map(|(o, x)| (f64::from(*o) - x).abs()).fold(0.0, f64::max);
+            assert!(most < 5e-3, "{rows}x{columns}: {most}");
+        }
+    }
+
+    #[test]
+    fn muon_takes_steps_of_one_size_against_the_gradient_and_keeps_on() {
+        let mut param = Param::new(&Cpu::default(), "layer".into(), &[3, 4], vec![0.0; 12]);
+        param.hidden = true;
+        let mut optimizer = Optimizer::new(Rule::Muon, 0.0);
+        let mut step = |step, at: usize, gradient: f32| {
+            let before = param.values();
+            let mut gradients = Gradients::leaky();
+            gradients.get_or_alloc_mut(&param.tensor).unwrap()[at] = gradient;
+            optimizer.update(step, 0.1, vec![&mut param], &mut gradients);
+            param.values().iter().zip(before).map(|(after, before)| after - before).collect::<Vec<f32>>()
+        };
+        // As long as Adam's update of a matrix of four columns: the singular value becomes 0.7 to 1.2.
+        let full = 0.1 * UPDATE_SIZE * 2.0;
+        let change = step(1, 0, 0.5);
+        assert!((0.6 * full..1.3 * full).contains(&-change[0]), "{change:?}");
+        assert!(change[1..].iter().all(|v| v.abs() < 1e-3 * full), "{change:?}");
+        // A small gradient elsewhere leaves most of the momentum.
+        let change = step(2, 5, 0.005);
+        assert!(-change[0] > 0.6 * full, "{change:?}");
+        assert!(change[5] < 0.0, "{change:?}");
+    }
+
+    #[test]
+    fn long_gradients_are_cut_to_length_one() {
+        let mut param = Param::new(&Cpu::default(), "layer".into(), &[4], vec![0.0; 4]);
+        let mut optimizer = Optimizer::new(Rule::Adam, 0.0);
+        let mut gradients = Gradients::leaky();
+        gradients.get_or_alloc_mut(&param.tensor).unwrap().copy_from_slice(&[6e5, 0.0, 8e5, 0.0]);
+        assert!((optimizer.update(1, 0.1, vec![&mut param], &mut gradients) - 1e6).abs() < 1.0);
+        // Adam's first moment takes a tenth of it.
+        let [first, _] = optimizer.moments(&param);
+        for (moment, want) in first.iter().zip([0.06, 0.0, 0.08, 0.0]) {
+            assert!((moment - want).abs() < 1e-6, "{first:?}");
         }
     }
 

@@ -171,7 +171,7 @@ impl<'a> Run<'a> {
         if resume {
             progress = checkpoint::load(&checkpoint, &mut *network, &mut *average, &mut optimizer)?;
         }
-        let rows = log::read(&out.join(LOG), progress.step)?;
+        let rows = log::read(&out.join(LOG), progress.logged)?;
         let now = Instant::now();
         let silent = BTreeSet::new();
         Ok(Self { options, out, network, average, optimizer, progress, rows, silent, since: now, saved: now })
@@ -240,9 +240,9 @@ impl<'a> Run<'a> {
 
     /// Whether a row of the log is due that is not there yet.
     fn is_to_be_logged(&self) -> bool {
-        let Progress { step, .. } = self.progress;
+        let Progress { step, logged, .. } = self.progress;
         let is_due = step > 0 && (step.is_multiple_of(self.options.every) || step >= self.options.steps);
-        is_due && self.rows.last().is_none_or(|row| row.step < step)
+        is_due && logged < step
     }
 
     /// Takes a step. Returns whether it had a finite gradient; if not, nothing changed.
@@ -271,7 +271,7 @@ impl<'a> Run<'a> {
         report_skipped(self.progress.skipped, count, self.out, on)?;
         let score = validate(&mut *self.average, validation, self.out, stop)?;
         let progress = &mut self.progress;
-        progress.losses = Default::default();
+        (progress.logged, progress.losses) = (progress.step, Default::default());
         if count > 0 {
             progress.skipped = 0;
         }
@@ -518,6 +518,7 @@ fn facts(options: &TrainOptions, row: &log::LogRow) -> Facts {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{passes::Pass, testset::Pair};
 
     #[test]
     fn the_rate_rises_briefly_and_falls_along_a_line() {
@@ -527,6 +528,55 @@ mod tests {
         assert!((rate(1000) - 1e-5).abs() < 1e-12);
         assert!((0..99).all(|step| rate(step) < rate(step + 1)));
         assert!((99..1000).all(|step| rate(step) > rate(step + 1)));
+    }
+
+    #[test]
+    fn crops_differ_from_step_to_step_and_within_one() {
+        let file = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+        let (noisy, reference) = (file("s0000_room_0004spp.exr"), file("s0000_room_ref.exr"));
+        let pair = Pair { scene: "room".into(), noisy, reference, spp: 4, frame: None };
+        let network = models::trainable().find(|(name, _)| *name == "demc-s").unwrap().1.clone();
+        let options: TrainOptions = serde_json::from_value(serde_json::json!({
+            "network": network, "train": [pair], "validation": [], "steps": 2, "batch": 2, "patch": 32,
+            "lr": [1e-3, 1e-3], "loss": "relmse", "precision": "f32", "average": 0.5, "every": 2, "seed": 1,
+        }))
+        .unwrap();
+        let passes = (&[Pass::Combined][..], &[][..]);
+        let data =
+            Dataset::load(&options.train, passes, &[Pass::Combined], false, 1, &AtomicBool::new(false));
+        let data = data.unwrap();
+        let drawn = |step, seed| -> Vec<Vec<f32>> {
+            let samples = draw(&data, &TrainOptions { seed, ..options.clone() }, 16, step);
+            samples.iter().map(|sample| sample.passes.get(Pass::Combined).unwrap().data.to_vec()).collect()
+        };
+        let first = drawn(0, 1);
+        assert_eq!(first, drawn(0, 1));
+        assert_ne!(first[0], first[1], "crops of a step");
+        assert_ne!(first, drawn(1, 1), "the next step");
+        assert_ne!(first, drawn(0, 2), "another seed");
+    }
+
+    #[test]
+    fn the_average_follows_faster_at_first_and_takes_statistics_as_they_are() {
+        let network = |value: f32| {
+            let config = models::network::Config::new(models::network::Architecture::Demc, &[4; 5]);
+            let mut network = models::build(&config, 1);
+            for param in network.params() {
+                param.set(&vec![value; param.values().len()]);
+            }
+            network
+        };
+        for (step, kept) in [(1, 2.0 / 11.0), (1000, 0.5)] {
+            let (mut average, mut current) = (network(0.0), network(1.0));
+            follow(&mut *average, &mut *current, 0.5, step);
+            let (mut learned, mut fixed) = (0, 0);
+            for param in average.params() {
+                let want = if param.trainable { 1.0 - kept } else { 1.0 };
+                *(if param.trainable { &mut learned } else { &mut fixed }) += 1;
+                assert!(param.values().iter().all(|v| (v - want).abs() < 1e-6), "{}, {step}", param.name);
+            }
+            assert!(learned > 0 && fixed > 0);
+        }
     }
 
     #[test]
