@@ -16,6 +16,7 @@ use assert_cmd::cargo::cargo_bin;
 use common::{
     demc,
     files::{data, read_exr, samples, write_render},
+    shot::SHOT,
 };
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
@@ -146,10 +147,12 @@ fn frames_at_once_come_to_the_same_bits() {
     assert!(alone == run("two", "--threads 3 --jobs 2"));
     assert!(alone == run("four", "--threads 4 --jobs 4"));
     // A sequence is cut into stretches, each of which reads the frames around it.
-    let alone = run("sequence", "--temporal 2");
-    assert!(alone == run("stretches", "--temporal 2 --threads 3 --jobs 3"));
+    (1..=5).for_each(|frame| SHOT.write(&renders.join(format!("shot.{frame:04}.exr")), frame));
+    let sequence = run("sequence", "--temporal 2");
+    assert!(sequence.iter().zip(run("each", "")).all(|(with, alone)| *with != alone));
+    assert!(sequence == run("stretches", "--temporal 2 --threads 3 --jobs 3"));
     fs::remove_file(folder.path().join("stretches/shot.0002.exr")).unwrap();
-    assert!(alone == run("stretches", "--temporal 2 --threads 2 --jobs 2"), "a batch that goes on");
+    assert!(sequence == run("stretches", "--temporal 2 --threads 2 --jobs 2"), "a batch that goes on");
 }
 
 #[test]

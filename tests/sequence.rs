@@ -16,6 +16,7 @@ use assert_cmd::Command;
 use common::{
     files::{bits, read_exr, samples, values},
     python,
+    shot::{SHOT, SIZE, Shot, random, write_channels},
     tables::table,
 };
 use demc::{
@@ -25,144 +26,6 @@ use demc::{
 use exr::prelude::*;
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
-
-const SIZE: (usize, usize) = (48, 36);
-
-/// How a frame is made.
-#[derive(Clone, Copy)]
-struct Shot {
-    /// Pixels to the right that the wall moves by in a frame.
-    speed: f32,
-    /// Whether the Vector pass is written.
-    vectors: bool,
-    /// What vectors are multiplied by.
-    vector_scale: f32,
-    /// Another number is another wall, in front of another camera.
-    scene: u32,
-    size: (usize, usize),
-    /// Of the noise.
-    seed: u32,
-    /// Light from column `shadow + 3 * frame` on is a third.
-    shadow: Option<f32>,
-    /// By how much the light of frames of odd numbers is more, and that of the others less.
-    flicker: f32,
-    /// The light of a lamp that guides and vectors do not know, twelve columns further in each frame.
-    lamp: f32,
-}
-
-const SHOT: Shot = Shot {
-    speed: 2.0,
-    vectors: true,
-    vector_scale: 1.0,
-    scene: 0,
-    size: SIZE,
-    seed: 1,
-    shadow: None,
-    flicker: 0.0,
-    lamp: 0.0,
-};
-
-/// A number from 0 to 1 that depends on all of `parts`.
-fn random(parts: [u32; 3]) -> f32 {
-    let mix = |hash: u32, part: u32| {
-        (hash ^ part).wrapping_mul(0x85eb_ca6b).rotate_left(13).wrapping_mul(0xc2b2_ae35)
-    };
-    let hash = parts.into_iter().fold(0x9e37_79b9, mix);
-    ((hash ^ (hash >> 15)) >> 8) as f32 / (1 << 24) as f32
-}
-
-impl Shot {
-    /// Colour of the wall at a pixel of a frame.
-    fn albedo(&self, c: usize, (x, y): (f32, f32), frame: i64) -> f32 {
-        let x = x - self.speed * frame as f32;
-        let phase = c as f32 + 2.0 * self.scene as f32;
-        0.5 + 0.3 * (0.25 * x + phase).sin() * (0.3 * y + 1.7 * self.scene as f32).cos()
-    }
-
-    fn light(&self, x: f32, frame: i64) -> f32 {
-        let light = match self.shadow {
-            Some(edge) if x > edge + 3.0 * frame as f32 => 0.3,
-            _ => 0.9,
-        };
-        light * if frame % 2 == 0 { 1.0 - self.flicker } else { 1.0 + self.flicker }
-    }
-
-    /// Whether a pixel of a frame shows the lamp.
-    fn is_lamp(&self, i: usize, frame: i64) -> bool {
-        let (x, y) = (i % self.size.0, i / self.size.0);
-        let first = 12 * frame as usize;
-        self.lamp > 0.0 && (first..first + 6).contains(&x) && (12..18).contains(&y)
-    }
-
-    /// Combined without noise.
-    fn truth(&self, c: usize, i: usize, frame: i64) -> f32 {
-        if self.is_lamp(i, frame) {
-            return self.lamp;
-        }
-        let place = ((i % self.size.0) as f32, (i / self.size.0) as f32);
-        self.light(place.0, frame) * self.albedo(c, place, frame)
-    }
-
-    fn noise(&self, i: usize, frame: i64) -> f32 {
-        0.2 + 1.6 * random([self.seed, frame as u32, i as u32])
-    }
-
-    /// The channels of a view layer, or of one stereo view of it.
-    fn channels(&self, layer: &str, view: &str, frame: i64) -> Vec<AnyChannel<FlatSamples>> {
-        let pixels = self.size.0 * self.size.1;
-        let mut list = Vec::new();
-        let mut add = |pass: &str, component: &str, value: &dyn Fn(usize) -> f32| {
-            let samples = FlatSamples::F32((0..pixels).map(value).collect());
-            list.push(AnyChannel::new(format!("{layer}.{pass}.{view}{component}").as_str(), samples));
-        };
-        for (c, name) in ["R", "G", "B"].into_iter().enumerate() {
-            add("Combined", name, &|i| self.truth(c, i, frame) * self.noise(i, frame));
-            add("Denoising Albedo", name, &|i| {
-                self.albedo(c, ((i % self.size.0) as f32, (i / self.size.0) as f32), frame)
-            });
-        }
-        for (name, value) in [("X", 0.0), ("Y", 0.6 * self.scene as f32), ("Z", 1.0)] {
-            add("Denoising Normal", name, &|_| value);
-        }
-        add("Denoising Depth", "Z", &|_| 5.0 + 3.0 * self.scene as f32);
-        if self.vectors {
-            let speed = -self.speed * self.vector_scale;
-            for (name, value) in [("X", speed), ("Y", 0.0), ("Z", speed), ("W", 0.0)] {
-                add("Vector", name, &|_| value);
-            }
-        }
-        list
-    }
-
-    fn write(&self, path: &Path, frame: i64) {
-        write_channels(path, self.size, self.channels("ViewLayer", "", frame), &[]);
-    }
-
-    /// The mean squared error of a result away from the borders, where neighbours show as much as the frame.
-    fn error(&self, result: &Path, layer: &str, frame: i64) -> f32 {
-        let image = read_exr(result);
-        let (w, h) = self.size;
-        let (mut sum, mut count) = (0.0, 0.0);
-        for (c, name) in ["R", "G", "B"].into_iter().enumerate() {
-            let got = values(&image, &format!("{layer}.{name}"));
-            for i in (0..w * h).filter(|i| (8..w - 8).contains(&(i % w))) {
-                sum += (got[i] - self.truth(c, i, frame)).powi(2);
-                count += 1.0;
-            }
-        }
-        sum / count
-    }
-}
-
-fn write_channels(path: &Path, size: (usize, usize), list: Vec<AnyChannel<FlatSamples>>, views: &[&str]) {
-    let mut attributes = LayerAttributes::default();
-    if !views.is_empty() {
-        attributes.multi_view_names = Some(views.iter().map(|view| Text::from(*view)).collect());
-    }
-    let channels = AnyChannels::sort(list.into_iter().collect());
-    let layer = Layer::new(size, attributes, Encoding::SMALL_LOSSLESS, channels);
-    Image::from_layer(layer).write().to_file(path).unwrap();
-}
 
 /// A folder with `shot_0004spp.NNNN.exr` of these numbers.
 fn sequence(shot: Shot, numbers: std::ops::RangeInclusive<i64>) -> TempDir {
@@ -201,7 +64,9 @@ fn denoised(out: &Path, number: i64) -> Vec<Vec<u32>> {
 
 #[test]
 fn neighbours_take_noise_away_along_the_motion() {
-    for shot in [SHOT, Shot { speed: -1.0, ..SHOT }, Shot { speed: 0.0, ..SHOT }] {
+    // The last goes to the right by -8, -4, 0 and 4 pixels, and falls by -4, 0, 4 and 8.
+    let bent = Shot { speed: -16.0, fall: -12.0, acceleration: 4.0, ..SHOT };
+    for shot in [SHOT, Shot { speed: -1.0, ..SHOT }, Shot { speed: 0.0, ..SHOT }, bent] {
         let dir = sequence(shot, 1..=5);
         let (alone, with) = (dir.path().join("alone"), dir.path().join("with"));
         demc(&alone).arg(dir.path()).assert().success();
@@ -219,6 +84,21 @@ fn neighbours_take_noise_away_along_the_motion() {
         demc(&with).arg(dir.path()).args(["--overwrite", "--temporal", "2"]).assert().success();
         (1..=5).for_each(|frame| assert_eq!(denoised(&two, frame), denoised(&with, frame)));
     }
+}
+
+#[test]
+fn networks_gain_from_neighbours_whose_light_differs() {
+    let shot = Shot { flicker: 0.15, ..SHOT };
+    let dir = sequence(shot, 1..=5);
+    let error = |name: &str, more: &[&str]| {
+        let out = dir.path().join(name);
+        let mut command = common::demc();
+        command.args(["denoise", "--model", "demc-s", "--out"]).arg(&out).arg(dir.path());
+        command.args(more).assert().success();
+        shot.error(&result(&out, 3), "ViewLayer.Denoised", 3)
+    };
+    let (alone, with) = (error("alone", &[]), error("with", &["--temporal"]));
+    assert!(with < 0.9 * alone, "{with} after {alone}");
 }
 
 #[test]

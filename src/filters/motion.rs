@@ -353,6 +353,26 @@ mod tests {
     }
 
     #[test]
+    fn each_way_and_each_step_has_vectors_of_its_own() {
+        // From where it was to where it will be, from the left of column 12 on and from there: of all, no two are alike.
+        let vectors = Planes::from_rows(4, SIZE, |c, _, out| {
+            let (left, right) = ([-1.0, 2.0, -3.0, 5.0][c], [-2.0, 4.0, 6.0, -1.0][c]);
+            out.iter_mut().enumerate().for_each(|(x, out)| *out = if x < 12 { left } else { right });
+        });
+        let from = |place: (usize, usize), direction, steps| {
+            let mut flow = Flow::still(SIZE.0, SIZE.1);
+            (0..steps).for_each(|_| flow.step(&vectors, direction));
+            let (columns, rows) = flow.row(place.1);
+            (columns[place.0], rows[place.0])
+        };
+        assert_eq!(from((10, 8), Direction::Back, 1), (9.0, 6.0));
+        assert_eq!(from((10, 8), Direction::Forth, 1), (13.0, 13.0));
+        // The second step begins where the first one ends.
+        assert_eq!(from((13, 8), Direction::Back, 2), (11.0 - 1.0, 4.0 - 2.0));
+        assert_eq!(from((10, 3), Direction::Forth, 2), (13.0 - 6.0, 8.0 - 1.0));
+    }
+
+    #[test]
     fn what_leaves_the_frame_stays_away() {
         let mut flow = Flow::still(SIZE.0, SIZE.1);
         flow.step(&vectors((30.0, 0.0)), Direction::Forth);

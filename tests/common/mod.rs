@@ -5,6 +5,7 @@ pub mod browser;
 pub mod debian;
 pub mod files;
 pub mod python;
+pub mod shot;
 pub mod tables;
 
 /// The program under test.
