@@ -156,6 +156,23 @@ fn frames_at_once_come_to_the_same_bits() {
 }
 
 #[test]
+fn results_older_than_their_renders_are_told_and_kept() {
+    let folder = renders();
+    denoise(folder.path(), "renders --out clean").success();
+    let again = denoise(folder.path(), "renders --out clean").success();
+    again.stdout(contains("is there already")).stderr(contains("older").not());
+    let render = fs::File::options().append(true).open(folder.path().join("renders/a.exr")).unwrap();
+    render.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
+    let told = denoise(folder.path(), "renders --out clean").success();
+    told.stderr(contains("a.exr: is older than its render, and was kept; --overwrite denoises that again"));
+    let run = denoise(folder.path(), "renders --out clean --json").success();
+    let line: serde_json::Value = serde_json::from_slice(&run.get_output().stdout).unwrap();
+    assert_eq!(line["status"], "skipped");
+    assert!(line["notes"][0].as_str().unwrap().contains("older than its render"), "{line}");
+    denoise(folder.path(), "renders --out clean --overwrite").success().stderr(contains("older").not());
+}
+
+#[test]
 fn more_frames_at_once_than_threads_are_told_of() {
     let folder = renders();
     denoise(folder.path(), "renders --recursive --out clean --jobs 8 --threads 2")

@@ -12,7 +12,7 @@ use std::{
 };
 
 use assert_cmd::cargo::cargo_bin;
-use common::python;
+use common::{python, tables::table};
 
 /// For one block; far more than any takes.
 const PATIENCE: Duration = Duration::from_secs(300);
@@ -169,4 +169,25 @@ fn every_link_leads_somewhere() {
         }
     }
     assert!(broken.is_empty(), "lead nowhere:\n{}", broken.join("\n"));
+}
+
+#[test]
+fn the_readme_s_table_is_that_of_eval() {
+    let readme = fs::read_to_string(root().join("README.md")).unwrap();
+    let rows = table(&root().join("eval/val/summary.csv"));
+    let mut compared = 0;
+    for line in readme.lines().filter_map(|line| line.strip_prefix("| ")) {
+        let [method, cells @ ..] = &line.split('|').map(str::trim).collect::<Vec<_>>()[..] else { continue };
+        let Some(row) = rows.iter().find(|row| row["model"] == *method && row["spp"] == "all") else {
+            continue;
+        };
+        for (cell, column) in cells.iter().zip(["relmse_ratio", "ssim_mean", "ms_per_mpx_geomean"]) {
+            let decimals = cell.split_once('.').map_or(0, |(_, decimals)| decimals.len());
+            let value =
+                row[column].parse::<f64>().map_or(String::new(), |value| format!("{value:.decimals$}"));
+            assert_eq!(*cell, value, "{method}, {column}");
+            compared += 1;
+        }
+    }
+    assert_eq!(compared, 7 * 3);
 }

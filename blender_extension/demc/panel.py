@@ -24,12 +24,11 @@ class DEMC_PT_panel(bpy.types.Panel):
         if settings.model == WEIGHTS_FILE:
             column.prop(settings, "weights")
         lacks = passes.missing(scene)
-        if lacks:
-            box = layout.box()
-            for lack in lacks:
-                _paragraph(box, context, lack.text, "ERROR")
-            if any(lack.prepared for lack in lacks):
-                box.operator("demc.prepare")
+        box = layout.box() if lacks else layout
+        for lack in lacks:
+            _paragraph(box, context, lack.text, "ERROR")
+        # Always, as it also sets what files need, which the panel does not ask for where a render may do.
+        box.operator("demc.prepare")
         column = layout.column(align=True)
         column.operator("demc.denoise_render", icon="RENDER_STILL")
         column.operator("demc.denoise_range", icon="RENDER_ANIMATION")

@@ -17,8 +17,8 @@ class DemcSettings(bpy.types.PropertyGroup):
         description="The network that denoises",
         items=(
             ("demc-s", "Small (demc-s)", "Fastest"),
-            ("demc-m", "Medium (demc-m)", "Takes 1.7 times as long as small, and is more accurate"),
-            ("demc-l", "Large (demc-l)", "Takes three times as long as small, and is the most accurate"),
+            ("demc-m", "Medium (demc-m)", "Takes twice as long as small, and is more accurate"),
+            ("demc-l", "Large (demc-l)", "Takes over three times as long as small, and is the most accurate"),
             (WEIGHTS_FILE, "Weights File", "A network that 'demc train' made"),
         ),
         default="demc-m",

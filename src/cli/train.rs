@@ -33,7 +33,7 @@ Examples:
   demc train --data pairs --out run --model demc-s --steps 20000
   demc train --resume --out run")]
 pub struct Args {
-    /// Directory, CSV manifest or quoted glob of <scene>_<spp>spp.exr and <scene>_ref.exr
+    /// Directory, CSV manifest or quoted glob of <scene>_<spp>spp.exr and <scene>_ref.exr; may be given several times
     #[arg(long, required_unless_present = "resume")]
     data: Vec<String>,
     /// Run folder to write: config.json, log.csv, loss.png, checkpoint, best.safetensors
@@ -92,7 +92,7 @@ pub struct Args {
     /// Weight of the past in the average of the weights that is kept
     #[arg(long, default_value_t = 0.999)]
     average: f64,
-    /// Pairs to validate on, never trained on; without it one scene in ten is held out
+    /// Pairs to validate on, never trained on; without it one view in ten is held out
     #[arg(long)]
     val: Vec<String>,
     /// Steps between validations
@@ -125,7 +125,7 @@ pub struct Args {
     threads: Option<u16>,
 }
 
-/// One scene in this many is held out for validation.
+/// One view in this many is held out for validation.
 const HOLD_OUT: u64 = 10;
 
 fn parse_rates(text: &str) -> Result<(f64, f64), String> {
@@ -287,12 +287,12 @@ impl Args {
         }
         if training.is_empty() {
             return Err(usage(
-                "nothing left to train on once one scene in ten is held out; add pairs or --val",
+                "nothing left to train on once one view in ten is held out; add pairs or --val",
             ));
         }
         if validation.is_empty() && training.len() > 1 {
             warn_line(
-                "note: no scene is held out, so nothing tells the best weights from the last: name some with --val",
+                "note: no view is held out, so nothing tells the best weights from the last: name some with --val",
             );
         }
         if network.architecture == Architecture::Kpcn {

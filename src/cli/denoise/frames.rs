@@ -4,7 +4,7 @@
 //! files whose names end in one of these numbers, as Blender writes them: `shot_0004spp.0017.exr`,
 //! `shot0017.exr`, `shot.-0003.exr`.
 
-use std::str::FromStr;
+use std::{collections::BTreeSet, path::PathBuf, str::FromStr};
 
 use crate::{
     Error, Result,
@@ -27,6 +27,15 @@ struct Span {
 impl Span {
     fn contains(self, frame: i64) -> bool {
         (self.first..=self.last).contains(&frame) && (frame - self.first) % self.step == 0
+    }
+
+    /// How many of its frames are not among those that are `there`, and the first of them; none if all are.
+    fn lacking(self, there: &BTreeSet<i64>) -> Option<(i128, i64)> {
+        let found = there.iter().filter(|frame| self.contains(**frame)).count();
+        let frames = (i128::from(self.last) - i128::from(self.first)) / i128::from(self.step) + 1;
+        let mut all = (self.first..=self.last).step_by(usize::try_from(self.step).unwrap_or(usize::MAX));
+        let first = all.find(|frame| !there.contains(frame))?;
+        Some((frames - found as i128, first))
     }
 }
 
@@ -70,22 +79,24 @@ impl Frames {
         is_of_these || is_missing_folder(&input.file)
     }
 
-    /// The files of these frames. Warns of single frames that were asked for and have no file.
+    /// The files of these frames. Tells how many frames that were asked for have none.
     ///
     /// # Errors
-    /// There is no such file, where `are_all` that were named.
-    pub fn pick(&self, files: Vec<Input>, are_all: bool) -> Result<Vec<Input>> {
+    /// There is no such file, where `are_all` that were named, as by `inputs`.
+    pub fn pick(&self, files: Vec<Input>, inputs: &[PathBuf], are_all: bool) -> Result<Vec<Input>> {
         let picked: Vec<Input> = files.into_iter().filter(|file| self.has(file)).collect();
-        if picked.is_empty() && are_all {
-            return Err(Error::Usage(
-                "--frames: none of the inputs has a name that ends in one of these numbers, as in shot.0017.exr"
-                    .into(),
-            ));
+        if let ([], true, [first, ..]) = (&picked[..], are_all, inputs) {
+            let why = "has no file of --frames, whose name ends in one of these numbers as in shot.0017.exr";
+            return Err(Error::invalid(first, why));
         }
-        for single in self.0.iter().filter(|span| span.first == span.last) {
-            if !picked.iter().any(|input| frame_number(&input.file) == Some(single.first)) {
-                warn_line(&format!("demc: note: --frames {}: no input is of this frame", single.first));
-            }
+        let there: BTreeSet<i64> = picked.iter().filter_map(|input| frame_number(&input.file)).collect();
+        for (count, first) in self.0.iter().filter_map(|span| span.lacking(&there)) {
+            let which = if count == 1 {
+                format!("frame {first} is")
+            } else {
+                format!("{count} frames from {first} on are")
+            };
+            warn_line(&format!("demc: note: --frames: {which} not there"));
         }
         Ok(picked)
     }
@@ -98,6 +109,17 @@ mod tests {
     fn picked(frames: &str) -> Vec<i64> {
         let frames: Frames = frames.parse().unwrap();
         (-6..=12).filter(|n| frames.contains(*n)).collect()
+    }
+
+    #[test]
+    fn frames_that_are_not_there_are_counted() {
+        let lacking = |frames: &str| {
+            let frames: Frames = frames.parse().unwrap();
+            frames.0.into_iter().map(|span| span.lacking(&[3, 4, 5, 9].into())).collect::<Vec<_>>()
+        };
+        assert_eq!(lacking("3-5,3-7,1-9:4,8"), [None, Some((2, 6)), Some((1, 1)), Some((1, 8))]);
+        let all = "-9223372036854775808-9223372036854775807";
+        assert_eq!(lacking(all), [Some((i128::from(u64::MAX) + 1 - 4, i64::MIN))]);
     }
 
     #[test]

@@ -318,7 +318,7 @@ impl Work {
             Some((input.file.clone(), Error::io("read", &input.file)(error)))
         }));
         let files = match &args.frames {
-            Some(frames) => frames.pick(files, unusable.is_empty())?,
+            Some(frames) => frames.pick(files, &args.inputs, unusable.is_empty())?,
             None => files,
         };
         Ok(Self::List { jobs: denoise::plan_tree(files, &args.out)?, unusable })

@@ -1,7 +1,10 @@
 //! What the user sees of a batch: a bar on a terminal, plain lines otherwise, or JSON lines.
 //! Results go to stdout; notes and failures to stderr, each naming its file.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
@@ -46,6 +49,9 @@ struct Line<'a> {
     error: Option<String>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     report: Option<Details<'a>>,
+    /// None of what failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    notes: Option<Vec<String>>,
 }
 
 #[derive(Serialize)]
@@ -64,7 +70,6 @@ struct Details<'a> {
     expected_error: Option<f64>,
     seconds: f64,
     non_finite: &'a std::collections::BTreeMap<String, usize>,
-    notes: &'a [String],
 }
 
 impl Progress {
@@ -194,22 +199,38 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
                 warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
-        Outcome::Skipped => print_line(&format!("{place}{}  is there already", job.output.display())),
+        Outcome::Skipped => {
+            print_line(&format!("{place}{}  is there already", job.output.display()));
+            if is_outdated(job) {
+                warn_line(&format!("demc: note: {}: {OUTDATED}", job.output.display()));
+            }
+        }
         Outcome::Failed(_) => {}
     }
 }
 
+/// What is said of an old result.
+const OUTDATED: &str = "is older than its render, and was kept; --overwrite denoises that again";
+
+/// Whether a render has been written since its result, as far as the disk tells.
+fn is_outdated(job: &Job) -> bool {
+    let written = |path: &Path| path.metadata().and_then(|file| file.modified()).ok();
+    written(&job.output).is_some_and(|result| written(&job.input).is_some_and(|render| render > result))
+}
+
 fn json_line(job: &Job, outcome: &Outcome) -> String {
-    let (status, error, report) = match outcome {
-        Outcome::Done(report) => ("done", None, Some(report)),
-        Outcome::Skipped => ("skipped", None, None),
-        Outcome::Failed(error) => ("failed", Some(error.to_string()), None),
+    let outdated = || is_outdated(job).then(|| OUTDATED.to_owned()).into_iter().collect();
+    let (status, error, report, notes) = match outcome {
+        Outcome::Done(report) => ("done", None, Some(report), Some(report.notes.clone())),
+        Outcome::Skipped => ("skipped", None, None, Some(outdated())),
+        Outcome::Failed(error) => ("failed", Some(error.to_string()), None, None),
     };
     let line = Line {
         input: job.input.display().to_string(),
         output: job.output.display().to_string(),
         status,
         error,
+        notes,
         report: report.map(|r| Details {
             view_layer: &r.view_layer,
             width: r.width,
@@ -221,7 +242,6 @@ fn json_line(job: &Job, outcome: &Outcome) -> String {
             expected_error: r.expected_error,
             seconds: r.seconds,
             non_finite: &r.repaired,
-            notes: &r.notes,
         }),
     };
     serde_json::to_string(&line).expect("strings and numbers serialise")
