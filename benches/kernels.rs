@@ -2,6 +2,8 @@
 //! item, so divan's "item/s" column is FLOP/s. For convolutions by Winograd, the FLOPs of the same
 //! convolution tap by tap are counted. `DEMC_TIER=avx2` benches that tier.
 
+mod peak;
+
 use demc::kernels::{
     Block, LANES, Shape, View, ViewMut,
     conv::{Direction, Epilogue, Geometry, convolve, packed_len},
@@ -9,7 +11,6 @@ use demc::kernels::{
         Engine, Format, Operand, Steps,
         conv::{self, Output, Weights},
     },
-    peak,
     simd::Tier,
     weight_grad::weight_gradient,
     winograd,

@@ -9,6 +9,8 @@
 //! `--rounds N` (default 5) sets the rounds, `--small` shrinks everything to test the bench itself.
 //! `base16` is the paper's dual encoder with the widths 16,32,64,128,128.
 
+mod peak;
+
 use std::{
     io::{BufRead, Write},
     path::PathBuf,
@@ -16,7 +18,7 @@ use std::{
 };
 
 use demc::{
-    kernels::{Shape, peak, simd::Tier},
+    kernels::{Shape, simd::Tier},
     models::{
         self, catalogue,
         demc::PAPER_WIDTHS,

@@ -333,7 +333,8 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     // Both looks have the clean guides of the first.
     let guides = network.clean_guides(&frame).unwrap().expect("it has a prefilter");
     let turned = grown(&guides, &[Pass::DenoisingAlbedo, Pass::DenoisingNormal]);
-    let second = network.infer_with(&grown(&frame, &GUIDE_PASSES), &turned, &mut [], None).unwrap().turned();
+    let second =
+        network.infer_along(&grown(&frame, &GUIDE_PASSES), Some(&turned), &mut [], None).unwrap().turned();
     let looks = [network.infer(&frame, None).unwrap(), second.window((0, 0), (50, 37))];
     assert!(looks[0] != looks[1], "a network sees which way up a picture is");
     let mut mean = looks[0].clone();
@@ -341,7 +342,7 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let [radiance, albedo] =
         [Pass::Combined, Pass::DenoisingAlbedo].map(|p| frame.require(p, "test").unwrap());
     let (exposure, samples) = (features::exposure(radiance), frame.samples);
-    shrink(&mut mean, &Render { radiance, albedo, exposure, samples, firefly: features::FIREFLY }, None);
+    shrink(&mut mean, &Render { radiance, albedo, exposure, samples }, None);
     assert_eq!(twice.denoise(&Shot::new(frame.clone())).unwrap(), mean);
 }
 

@@ -17,7 +17,7 @@ use demc::{
     },
     nn::{
         Stats,
-        weights::{self, Precision, Tensor},
+        weights::{self, Storage, Tensor},
     },
     passes::PassSet,
     planes::Planes,
@@ -104,7 +104,7 @@ fn compare(
     let (mut network, _) = weights_file::read(weights).unwrap();
     let facts = facts(&mut *network, noisy, reference, loss);
     let file = folder.join("facts.safetensors");
-    weights::write(&file, "{}", &facts, Precision::Full).unwrap();
+    weights::write(&file, "{}", &facts, Storage::Full).unwrap();
     println!("{}", run(script(python, "check.py").arg(weights).arg(&file).arg(loss.to_string())));
 }
 

@@ -19,6 +19,16 @@ pub fn threads() -> RangedI64ValueParser<u16> {
     clap::value_parser!(u16).range(1..=MOST_THREADS.into())
 }
 
+/// Computes with as many threads as asked for, or with all. Comes before anything runs in parallel.
+///
+/// # Errors
+/// The system does not start them.
+pub fn use_threads(threads: Option<u16>) -> Result<()> {
+    let Some(threads) = threads else { return Ok(()) };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.into());
+    pool.build_global().map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))
+}
+
 /// Refuses settings that mean nothing.
 ///
 /// # Errors

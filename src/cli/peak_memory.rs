@@ -42,12 +42,7 @@ pub struct Args {
 /// # Errors
 /// The frame cannot be read or denoised, or the system does not tell (only Linux does).
 pub fn run(args: &Args) -> Result<ExitCode> {
-    if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.into())
-            .build_global()
-            .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
-    }
+    environment::use_threads(args.threads)?;
     let model = models::open(&args.model)?;
     let mut shot = shot::prepare(&args.input, args.view_layer.as_deref())?;
     if model.reads_halves() {

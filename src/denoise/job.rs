@@ -345,7 +345,7 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let (radiance, error) = run_expecting(&shot, &mut along.companions, model, options, report)?;
+        let (radiance, error) = run(&shot, &mut along.companions, true, (model, options), report)?;
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
         // What was read is not needed any more, so its memory is freed.
         drop(shot);
@@ -367,7 +367,7 @@ pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Plan
     }
     let mut report = Report::default();
     rayon::scope(|_| {
-        let radiance = run(shot, model, options, &mut report)?;
+        let (radiance, _) = run(shot, &mut [], false, (model, options), &mut report)?;
         finite(radiance, model.name(), &shot.passes.path, &mut report)
     })
 }
@@ -397,41 +397,21 @@ impl<T> Views<T> {
     }
 }
 
-/// Runs the model over a view.
+/// Runs the model over a view, measures its time and adds its notes to the report. Companions are denoised in place; if
+/// the caller `expects` it, how far off the result is expected to be is returned.
 ///
 /// # Errors
 /// The model cannot denoise it.
 pub(super) fn run(
     shot: &Shot,
-    model: &dyn Denoiser,
-    options: &Options,
-    report: &mut Report,
-) -> Result<Planes> {
-    let denoise =
-        |shot: &Shot, along: &mut [Companion]| Ok((model.denoise_along(shot, along, options.tile)?, None));
-    Ok(run_by(denoise, shot, &mut [], model, report)?.0)
-}
-
-/// As [`run`], and also denoises the companions in place and tells how far off the result is expected to be.
-fn run_expecting(
-    shot: &Shot,
     companions: &mut [Companion],
-    model: &dyn Denoiser,
-    options: &Options,
+    expects: bool,
+    (model, options): (&dyn Denoiser, &Options),
     report: &mut Report,
 ) -> Result<(Planes, Option<ExpectedError>)> {
-    let denoise = |shot: &Shot, along: &mut [Companion]| model.denoise_expecting(shot, along, options.tile);
-    run_by(denoise, shot, companions, model, report)
-}
-
-/// Runs `denoise` over a view, measures its time and adds the model's notes to the report.
-fn run_by(
-    denoise: impl FnOnce(&Shot, &mut [Companion]) -> Result<(Planes, Option<ExpectedError>)>,
-    shot: &Shot,
-    companions: &mut [Companion],
-    model: &dyn Denoiser,
-    report: &mut Report,
-) -> Result<(Planes, Option<ExpectedError>)> {
+    let denoise = |shot: &Shot, companions: &mut [Companion]| {
+        model.denoise_along(shot, companions, options.tile, expects)
+    };
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
     let (radiance, error) =

@@ -414,7 +414,7 @@ impl Window {
             own.shot()
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
-        let image = run(&shot, model, options, report)?;
+        let (image, _) = run(&shot, &mut [], false, (model, options), report)?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
         (moment.result, moment.lacked) = (Some(image), lacked);

@@ -29,9 +29,9 @@ impl Wrap {
     }
 }
 
-/// How many columns of the other side an edge is denoised with: as many as the built-in networks see to
-/// either side of a pixel, and a multiple of what they halve a frame by, so that their quads lie where they
-/// did.
+/// How many columns of the other side an edge is denoised with: what lies further away hardly counts, though the
+/// built-in networks see up to 453 pixels to either side. It is a multiple of what they halve a frame by, so that their
+/// quads lie where they did.
 const MARGIN: usize = 256;
 
 /// Adds columns to the shot and its companions at both edges, gives them to `run`, and takes the columns off

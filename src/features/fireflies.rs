@@ -6,13 +6,11 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::neighbours;
+pub use crate::filters::FIREFLY;
 use crate::planes::{Planes, mirror_beyond, mirrored};
 
 /// Pixels of a row that are tested together.
 const RUN: usize = 32;
-
-/// A pixel may be at most this many times as bright as the brightest other pixel in the 5x5 around it.
-pub const FIREFLY: f32 = 32.0;
 
 /// Rows `rows` of `radiance` (3, H, W) without fireflies, padded to `size` (width, height) as
 /// [`Planes::padded_to`] does.

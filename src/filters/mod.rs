@@ -25,3 +25,6 @@ pub mod solve;
 pub mod squares;
 pub mod temporal;
 pub mod variance;
+
+/// A pixel more than this many times as bright as the brightest other pixel in the 5x5 around it is a firefly.
+pub const FIREFLY: f32 = 32.0;

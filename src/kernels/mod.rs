@@ -23,7 +23,6 @@ pub mod layout;
 pub mod logarithm;
 pub mod memory;
 pub mod narrow;
-pub mod peak;
 pub mod plane;
 pub mod pool;
 pub mod redivide;

@@ -8,7 +8,7 @@ use super::{
     network::{Architecture, Config},
     nfor, oidn, pyramid,
 };
-use crate::{Error, Result};
+use crate::{Error, Result, nn::weights};
 
 /// A method: a row of the catalogue.
 pub struct Method {
@@ -151,7 +151,7 @@ impl Method {
             return Learned::parse(name, bytes, Path::new(name));
         }
         if let Some(path) = self.weights_file() {
-            let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
+            let bytes = weights::bytes(&path)?;
             return Learned::parse(name, &bytes, &path);
         }
         Err(Error::Usage(match self.kind {

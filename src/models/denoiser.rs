@@ -61,23 +61,19 @@ pub trait Denoiser: Send + Sync {
     /// A pass is missing, or the method cannot run here; the message says why.
     fn denoise(&self, shot: &Shot) -> Result<Planes>;
 
-    /// As [`Denoiser::denoise`], working on tiles of at most `tile` pixels a side where the method
-    /// can, to bound its memory; a method that cannot ignores the hint.
-    ///
-    /// # Errors
-    /// As [`Denoiser::denoise`].
-    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
-        let _ = tile;
-        self.denoise(shot)
-    }
-
     /// Whether it denoises layers along with the beauty.
     fn takes_companions(&self) -> bool {
         false
     }
 
-    /// As [`Denoiser::denoise_tiled`]. Each of the companions, which are layers of the same frame, is
-    /// denoised along with the beauty, in place.
+    /// Whether it can tell how far off a result is expected to be.
+    fn expects_errors(&self) -> bool {
+        false
+    }
+
+    /// As [`Denoiser::denoise`], working on tiles of at most `tile` pixels a side where the method can, to bound its
+    /// memory. Each of the companions, which are layers of the same frame, is denoised along with the beauty, in place.
+    /// How far off the result is expected to be is returned if the caller `expects` it and the method can tell.
     ///
     /// # Errors
     /// As [`Denoiser::denoise`], or there are companions and the method takes none.
@@ -89,28 +85,11 @@ pub trait Denoiser: Send + Sync {
         shot: &Shot,
         companions: &mut [Companion],
         tile: Option<usize>,
-    ) -> Result<Planes> {
-        refuse_companions(self.name(), companions)?;
-        self.denoise_tiled(shot, tile)
-    }
-
-    /// As [`Denoiser::denoise_along`], and how far off the result is expected to be, where the method can
-    /// tell.
-    ///
-    /// # Errors
-    /// As [`Denoiser::denoise_along`].
-    fn denoise_expecting(
-        &self,
-        shot: &Shot,
-        companions: &mut [Companion],
-        tile: Option<usize>,
+        expects: bool,
     ) -> Result<(Planes, Option<ExpectedError>)> {
-        Ok((self.denoise_along(shot, companions, tile)?, None))
-    }
-
-    /// Whether [`Denoiser::denoise_expecting`] tells how far off the result is expected to be.
-    fn expects_errors(&self) -> bool {
-        false
+        let _ = (tile, expects);
+        refuse_companions(self.name(), companions)?;
+        Ok((self.denoise(shot)?, None))
     }
 
     /// As [`Denoiser::denoise`], with what it cost. A method that works in a process of its own

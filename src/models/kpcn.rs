@@ -26,7 +26,7 @@ use crate::{
         kpcn_combined, kpcn_streams,
     },
     kernels::Shape,
-    nn::{Activation, Conv, Field, Images, Init, Param, Stats},
+    nn::{Activation, Conv, Field, Images, Init, Stats},
     passes::{Pass, PassSet},
     rng::Rng,
 };
@@ -190,10 +190,6 @@ impl Network for Kpcn {
             Architecture::Kpcn => kpcn_streams(passes, "kpcn"),
             _ => kpcn_combined(passes, "kpcn"),
         }
-    }
-
-    fn params(&mut self) -> Vec<&mut Param> {
-        self.streams.iter_mut().flat_map(|s| &mut s.layers).flat_map(|conv| conv.params()).collect()
     }
 
     fn convolutions(&mut self) -> Vec<&mut Conv> {

@@ -13,7 +13,7 @@ use crate::{
     augment::Augment,
     companion::{Companion, Kind},
     error::remedy,
-    features::{FIREFLY, PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
+    features::{PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
     filters::{
         coverage,
         shrinkage::{Render, Shrinkage, take_back},
@@ -122,7 +122,7 @@ impl Learned {
             }
         }
         let guides = HALF_TURN.passes(&guides.padded_rows(&PREFILTERED_PASSES, 0..size.1, odd));
-        let image = self.network.infer_with(&HALF_TURN.passes(&grown), &guides, companions, tile)?;
+        let image = self.network.infer_along(&HALF_TURN.passes(&grown), Some(&guides), companions, tile)?;
         let back = |image: &Planes| image.turned().window((0, 0), size);
         companions.iter_mut().for_each(|companion| companion.planes = back(&companion.planes));
         Ok(back(&image))
@@ -178,44 +178,19 @@ impl Denoiser for Learned {
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
-        self.denoise_tiled(shot, None)
-    }
-
-    fn denoise_tiled(&self, shot: &Shot, tile: Option<usize>) -> Result<Planes> {
-        self.denoise_along(shot, &mut [], tile)
+        Ok(self.denoise_along(shot, &mut [], None, false)?.0)
     }
 
     fn takes_companions(&self) -> bool {
         self.network.takes_companions()
     }
 
-    fn denoise_along(
-        &self,
-        shot: &Shot,
-        companions: &mut [Companion],
-        tile: Option<usize>,
-    ) -> Result<Planes> {
-        Ok(self.denoise_rendered(shot, companions, tile, false)?.0)
-    }
-
     fn expects_errors(&self) -> bool {
         self.metadata.network.architecture == Architecture::Pyramid && self.is_restrained
     }
 
-    fn denoise_expecting(
-        &self,
-        shot: &Shot,
-        companions: &mut [Companion],
-        tile: Option<usize>,
-    ) -> Result<(Planes, Option<ExpectedError>)> {
-        self.denoise_rendered(shot, companions, tile, true)
-    }
-}
-
-impl Learned {
-    /// Denoises the part of a frame that was rendered, in its place. If the caller `expects` it, the error to
-    /// be expected is returned as well.
-    fn denoise_rendered(
+    /// Denoises the part of the frame that was rendered, in its place.
+    fn denoise_along(
         &self,
         shot: &Shot,
         companions: &mut [Companion],
@@ -239,7 +214,9 @@ impl Learned {
             .for_each(|companion| companion.planes = companion.planes.placed_in(whole, place));
         Ok((part.placed_in(whole, place), error.map(|error| error.placed_in(whole, place))))
     }
+}
 
+impl Learned {
     /// What the network makes of a frame, after [`Shrinkage`] took back what it changed beyond the noise, unless
     /// nothing is to be taken back.
     fn restrained(
@@ -256,7 +233,7 @@ impl Learned {
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
-        let render = Render { radiance, albedo, exposure, samples, firefly: FIREFLY };
+        let render = Render { radiance, albedo, exposure, samples };
         let size = (passes.width, passes.height);
         // Of such a frame, as a clear sky or a black frame, all that a network made would be taken back.
         let shrinkage = Shrinkage::of(&render);
@@ -297,11 +274,11 @@ impl Learned {
     /// What the network makes of a frame.
     fn looks(&self, passes: &PassSet, companions: &mut [Companion], tile: Option<usize>) -> Result<Planes> {
         if !self.turned {
-            return self.network.infer_along(passes, companions, tile);
+            return self.network.infer_along(passes, None, companions, tile);
         }
         let guides = self.network.clean_guides(passes)?.expect("what looks twice has a prefilter");
         let mut seen_turned = companions.to_vec();
-        let mut image = self.network.infer_with(passes, &guides, companions, tile)?;
+        let mut image = self.network.infer_along(passes, Some(&guides), companions, tile)?;
         let second = self.second_look(passes, &guides, &mut seen_turned, tile)?;
         average(&mut image, &second);
         for (first, second) in companions.iter_mut().zip(&seen_turned) {

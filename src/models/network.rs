@@ -191,8 +191,10 @@ pub trait Network: Send + Sync {
     /// A pass is missing.
     fn inputs(&self, passes: &PassSet) -> Result<Inputs>;
 
-    /// Its parameters, in a fixed order.
-    fn params(&mut self) -> Vec<&mut Param>;
+    /// Its parameters, in a fixed order: those of its convolutions, where it has no others.
+    fn params(&mut self) -> Vec<&mut Param> {
+        self.convolutions().into_iter().flat_map(Conv::params).collect()
+    }
 
     /// Its convolutions, whose arithmetic can be chosen; none if it is fixed.
     fn convolutions(&mut self) -> Vec<&mut Conv> {
@@ -234,7 +236,7 @@ pub trait Network: Send + Sync {
     /// # Errors
     /// A pass is missing.
     fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        run_tiled(self, passes, tile)
+        self.infer_along(passes, None, &mut [], tile)
     }
 
     /// The denoised versions of those passes of a frame that it denoises before radiance, if there are any.
@@ -245,32 +247,24 @@ pub trait Network: Send + Sync {
         Ok(None)
     }
 
-    /// [`Network::infer`] and [`Network::infer_along`] where [`Network::clean_guides`] are known.
-    ///
-    /// # Errors
-    /// As for these functions.
-    fn infer_with(
-        &self,
-        passes: &PassSet,
-        _: &PassSet,
-        companions: &mut [Companion],
-        tile: Option<usize>,
-    ) -> Result<Planes> {
-        self.infer_along(passes, companions, tile)
-    }
-
     /// Whether it can denoise layers along with the beauty.
     fn takes_companions(&self) -> bool {
         false
     }
 
-    /// [`Network::infer`], and each of the companions denoised along with it, where
-    /// [`Network::takes_companions`].
+    /// [`Network::infer`], by [`Network::clean_guides`] where they are known, and each of the companions denoised along
+    /// with it where [`Network::takes_companions`].
     ///
     /// # Errors
     /// As [`Network::infer`].
-    fn infer_along(&self, passes: &PassSet, _: &mut [Companion], tile: Option<usize>) -> Result<Planes> {
-        self.infer(passes, tile)
+    fn infer_along(
+        &self,
+        passes: &PassSet,
+        _: Option<&PassSet>,
+        _: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
+        run_tiled(self, passes, tile)
     }
 
     /// A copy with its own parameters.

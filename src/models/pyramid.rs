@@ -43,7 +43,7 @@ use crate::{
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::memory::PlaneBuffer,
-    nn::{Conv, Field, Images, Param, Stats},
+    nn::{Conv, Field, Images, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
     rng::Rng,
@@ -171,10 +171,6 @@ impl Network for Pyramid {
         &GUIDE_PASSES
     }
 
-    fn target(&self, reference: &PassSet) -> Result<Planes> {
-        Ok(reference.require(Pass::Combined, NEEDED_BY)?.clone())
-    }
-
     fn multiple(&self) -> usize {
         MULTIPLE
     }
@@ -188,10 +184,6 @@ impl Network for Pyramid {
         let passes = guide_rows(passes, rows, size, exposure, NEEDED_BY)?;
         let inputs = light_inputs(&passes, Refined { albedo, normal, shading }, exposure, NEEDED_BY)?;
         Ok(Inputs { planes: inputs.into_list().into(), scale: exposure.recip() })
-    }
-
-    fn params(&mut self) -> Vec<&mut Param> {
-        self.convolutions().into_iter().flat_map(Conv::params).collect()
     }
 
     fn convolutions(&mut self) -> Vec<&mut Conv> {
@@ -223,26 +215,12 @@ impl Network for Pyramid {
         self.trunk.reach() + self.prefilter.reach()
     }
 
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
-        self.infer_along(passes, &mut [], tile)
-    }
-
     fn clean_guides(&self, passes: &PassSet) -> Result<Option<PassSet>> {
         let [albedo, normal] = strips::infer_guides(&self.prefilter, passes, None)?;
-        let mut guides = passes.rows(&[], 0..passes.height);
+        let mut guides = passes.empty((passes.width, passes.height));
         guides.insert(Pass::DenoisingAlbedo, albedo_of_target(albedo));
         guides.insert(Pass::DenoisingNormal, normal_of_target(normal));
         Ok(Some(guides))
-    }
-
-    fn infer_with(
-        &self,
-        passes: &PassSet,
-        guides: &PassSet,
-        companions: &mut [Companion],
-        tile: Option<usize>,
-    ) -> Result<Planes> {
-        strips::infer(self, passes, Some(guides), companions, tile)
     }
 
     fn takes_companions(&self) -> bool {
@@ -252,10 +230,11 @@ impl Network for Pyramid {
     fn infer_along(
         &self,
         passes: &PassSet,
+        guides: Option<&PassSet>,
         companions: &mut [Companion],
         tile: Option<usize>,
     ) -> Result<Planes> {
-        strips::infer(self, passes, None, companions, tile)
+        strips::infer(self, passes, guides, companions, tile)
     }
 
     fn duplicate(&self) -> Box<dyn Network> {

@@ -115,7 +115,7 @@ pub fn write(path: &Path, network: &mut dyn Network, facts: &Facts) -> Result<()
         .into_iter()
         .map(|p| Tensor { name: p.name.clone(), shape: p.shape.clone(), values: p.values() })
         .collect();
-    weights::write(path, &metadata, &tensors, weights::Precision::Half)
+    weights::write(path, &metadata, &tensors, weights::Storage::Half)
 }
 
 /// Reads a network from a weights file.
@@ -321,7 +321,7 @@ mod tests {
         let (metadata, mut tensors) = weights::read(&path).unwrap();
         let mut metadata = serde_json::from_str(&metadata).unwrap();
         change(&mut metadata, &mut tensors);
-        weights::write(&path, &metadata.to_string(), &tensors, weights::Precision::Half).unwrap();
+        weights::write(&path, &metadata.to_string(), &tensors, weights::Storage::Half).unwrap();
         (config, path)
     }
 

@@ -578,8 +578,3 @@ fn each_row(shape: crate::kernels::Shape, mut visit: impl FnMut(usize, std::ops:
         }
     }
 }
-
-/// The values of an activation without its tape.
-pub fn detached<T: Tape<f32, Cpu>>(activation: &Activation<T>) -> Activation<NoneTape> {
-    Activation { saved: activation.saved.clone(), tape: NoneTape }
-}

@@ -18,7 +18,7 @@ pub use activation::Activation;
 pub use arithmetic::{Arithmetic, Precision};
 pub use cross_bilateral::{GuidedImages, cross_bilateral};
 pub use field::Field;
-pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats, detached};
+pub use layers::{BatchNorm, BatchStats, Conv, MaxPool, Stats};
 pub use line::{Line, Rows};
 pub use param::{Init, Param, values_of};
 pub use pool::clear as clear_buffers;

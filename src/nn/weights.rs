@@ -26,7 +26,7 @@ pub struct Tensor {
 
 /// How values are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Precision {
+pub enum Storage {
     /// 32-bit: nothing is lost.
     Full,
     /// 16-bit: half the size, 3 decimal digits.
@@ -37,13 +37,13 @@ pub enum Precision {
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, metadata: &str, tensors: &[Tensor], precision: Precision) -> Result<()> {
-    let dtype = if precision == Precision::Half { Dtype::F16 } else { Dtype::F32 };
+pub fn write(path: &Path, metadata: &str, tensors: &[Tensor], storage: Storage) -> Result<()> {
+    let dtype = if storage == Storage::Half { Dtype::F16 } else { Dtype::F32 };
     let bytes: Vec<Vec<u8>> = tensors
         .iter()
-        .map(|t| match precision {
-            Precision::Full => t.values.iter().flat_map(|v| v.to_le_bytes()).collect(),
-            Precision::Half => t.values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect(),
+        .map(|t| match storage {
+            Storage::Full => t.values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+            Storage::Half => t.values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect(),
         })
         .collect();
     let views = tensors.iter().zip(&bytes).map(|(t, bytes)| {

@@ -12,6 +12,7 @@ use super::{
     figure::Figure,
     labels::{self, Rect},
     palette::{FAINT, GRID, INK, colours, legible},
+    plural,
     summary::MethodSummary,
 };
 use crate::Result;
@@ -69,8 +70,8 @@ impl Chart {
         let scenes = summaries.iter().map(|s| s.scenes).max().unwrap_or(0);
         let title = format!(
             "Speed and accuracy over {scenes} render{}, {threads} thread{}",
-            if scenes == 1 { "" } else { "s" },
-            if threads == 1 { "" } else { "s" }
+            plural(scenes),
+            plural(threads)
         );
         Self { title, panels }
     }

@@ -226,7 +226,7 @@ impl PairRun<'_> {
                 }
             }
         }
-        for (row, times) in rows.iter_mut().zip(&mut times) {
+        for (row, times) in rows.iter_mut().zip(&times) {
             if let Some(row) = row {
                 row.repeats = times.len();
                 row.set_time(times, loaded.noisy().pixels());

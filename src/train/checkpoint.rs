@@ -11,7 +11,7 @@ use crate::{
         self,
         network::{Config, Network},
     },
-    nn::weights::{self, Precision, Tensor},
+    nn::weights::{self, Storage, Tensor},
 };
 
 /// The file of a run folder that holds the state.
@@ -60,7 +60,7 @@ pub fn save(
         push("average.", &param.name, &param.shape, param.values());
     }
     let metadata = serde_json::to_string(progress).expect("counters serialise");
-    weights::write(path, &metadata, &tensors, Precision::Full)
+    weights::write(path, &metadata, &tensors, Storage::Full)
 }
 
 /// Refuses a checkpoint that is too small for a network, before memory is set aside for the network.

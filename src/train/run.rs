@@ -29,7 +29,7 @@ use crate::{
         network::{Network, stack},
         weights_file::{self, Facts},
     },
-    nn::{Conv, Stats},
+    nn::{Conv, Stats, weights},
     planes::Planes,
     rng::Rng,
 };
@@ -349,7 +349,7 @@ fn set_prefilter(network: &mut dyn Network, options: &TrainOptions) -> Result<()
         return Ok(());
     }
     if let Some(path) = &options.prefilter {
-        let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+        let bytes = weights::bytes(path)?;
         return weights_file::set_prefilter(network, &bytes, path);
     }
     if let Some(path) = &options.init

@@ -179,12 +179,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         Some(idle) => Work::Watch(watch(&args, search, idle)?, idle),
     };
     // This comes before anything runs in parallel, as opening a model does.
-    if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.into())
-            .build_global()
-            .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
-    }
+    environment::use_threads(args.threads)?;
     // Beside a single frame, those around it are read where they make it steadier.
     let stands_alone = |job: &Job| {
         args.temporal.is_none_or(|reach| denoise::neighbours(&job.input, reach.into()).is_empty())

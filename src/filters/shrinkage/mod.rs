@@ -91,9 +91,6 @@ pub struct Render<'a> {
     pub exposure: f32,
     /// Samples of a pixel, where the file tells.
     pub samples: Option<u32>,
-    /// A pixel more than this many times as bright as all others of the 5x5 around it is a firefly, of which
-    /// nothing is taken back.
-    pub firefly: f32,
 }
 
 impl Render<'_> {
@@ -353,7 +350,7 @@ mod tests {
     /// What becomes of `denoised` beside `radiance`.
     fn shrunk(denoised: &Planes, radiance: &Planes, albedo: &Planes, samples: Option<u32>) -> Planes {
         let mut image = denoised.clone();
-        let render = Render { radiance, albedo, exposure: 0.6, samples, firefly: 32.0 };
+        let render = Render { radiance, albedo, exposure: 0.6, samples };
         shrink(&mut image, &render, None);
         image
     }
@@ -474,7 +471,6 @@ mod tests {
                 albedo: &albedo,
                 exposure: 0.6 / film,
                 samples: Some(64),
-                firefly: 32.0,
             };
             assert!((film_exposure(&render) / film - 1.0).abs() < 0.003, "{film}");
             let mut exposed = times(&planes(picture));
@@ -484,13 +480,7 @@ mod tests {
             assert!(same == image.data.len(), "{film}: {same} of {}", image.data.len());
         }
         // A wall alone has no such light, whatever its noise.
-        let render = Render {
-            radiance: &wall,
-            albedo: &planes(|_, _, _| 0.5),
-            exposure: 1.0,
-            samples: None,
-            firefly: 32.0,
-        };
+        let render = Render { radiance: &wall, albedo: &planes(|_, _, _| 0.5), exposure: 1.0, samples: None };
         assert_eq!(film_exposure(&render), 1.0);
     }
 
@@ -557,13 +547,8 @@ mod tests {
             for v in [0.0, 1e-30, 1.0, 65504.0] {
                 let of = |v: f32| Planes::from_vec(3, w, h, vec![v; 3 * w * h]);
                 let mut image = of(v);
-                let render = Render {
-                    radiance: &of(0.5 * v),
-                    albedo: &of(0.7),
-                    exposure: 1.0,
-                    samples: None,
-                    firefly: 32.0,
-                };
+                let render =
+                    Render { radiance: &of(0.5 * v), albedo: &of(0.7), exposure: 1.0, samples: None };
                 shrink(&mut image, &render, None);
                 assert!(image.data.iter().all(|x| x.is_finite() && *x <= v && *x >= 0.5 * v), "{w}x{h}, {v}");
             }

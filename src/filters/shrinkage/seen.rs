@@ -5,7 +5,7 @@
 //! such pixels agree on.
 
 use super::Render;
-use crate::{kernels::logarithm::ln, planes::Planes};
+use crate::{filters::FIREFLY, kernels::logarithm::ln, planes::Planes};
 
 /// A frame in which no more than this share of the pixels differ from their albedo is no picture of light on
 /// surfaces, and all of it is kept.
@@ -160,5 +160,5 @@ pub fn is_firefly(render: &Render, x: usize, y: usize) -> bool {
         (0..3).map(|c| radiance.channel(c)[y * radiance.width + x]).fold(0.0, f32::max)
     };
     let others = near(radiance, x, y, 2).filter(|&other| other != (x, y)).map(brightest);
-    brightest((x, y)) > render.firefly * others.fold(0.0, f32::max)
+    brightest((x, y)) > FIREFLY * others.fold(0.0, f32::max)
 }

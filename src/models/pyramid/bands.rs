@@ -226,7 +226,7 @@ impl<'a, S: Subject> Progress<'a, S> {
     fn predicted(&mut self, level: usize, rows: Range<usize>, head: &Field) {
         let planes = |first, count| head.channels(first, count);
         if level > 0 {
-            return self.scales[level].predicted(rows, Prediction::split(KERNEL, planes));
+            return self.scales[level].predicted(rows, Prediction::split(KERNEL, level, planes));
         }
         let (prediction, finish) = Prediction::split_full(self.trunk.kernel(0), head.extent().1, planes);
         let images = &mut self.scales[0].images;
@@ -342,11 +342,11 @@ impl Filtered {
 impl Scale {
     /// Takes in what a head predicted for `rows`.
     fn predicted(&mut self, rows: Range<usize>, prediction: Prediction<NoneTape>) {
-        let Prediction { kernel, confidence, mask, corners } = prediction;
+        let Prediction { kernel, confidence, below } = prediction;
         // The confidence is copied, since it is kept for longer than the head's other planes, and would keep
         // the memory of them all.
         self.confidence.push(Field::input(confidence.extent(), confidence.values()));
-        self.masks.push_back((rows.clone(), mask, corners));
+        self.masks.extend(below.map(|(mask, corners)| (rows.clone(), mask, corners)));
         self.kernels.push_back((rows, kernel));
     }
 }

@@ -15,7 +15,7 @@ use crate::{
     Result,
     features::{GuideInputs, Inputs, PREFILTERED_PASSES, albedo_exposure, guide_inputs, guide_targets},
     models::network::{Architecture, Batch, Config, Network, Taped, duplicate},
-    nn::{Conv, Images, Param, Stats},
+    nn::{Conv, Images, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
     rng::Rng,
@@ -83,20 +83,12 @@ impl Network for Prefilter {
         Ok(Inputs { planes: inputs.into_list().into(), scale: exposure.recip() })
     }
 
-    fn params(&mut self) -> Vec<&mut Param> {
-        self.convolutions().into_iter().flat_map(Conv::params).collect()
-    }
-
     fn convolutions(&mut self) -> Vec<&mut Conv> {
         self.trunk.convolutions().collect()
     }
 
     fn freeze(&mut self) {
         self.trunk.freeze();
-    }
-
-    fn is_quantizable(&mut self) -> bool {
-        self.trunk.convolutions().all(|conv| conv.is_quantizable())
     }
 
     fn forward(&self, batch: &Batch, _: &mut Stats) -> Images {

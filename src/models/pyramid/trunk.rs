@@ -247,7 +247,8 @@ impl Trunk {
         let (_, full) = heads.pop().expect("full resolution has a head");
         let count = full.shape().c / 4;
         let (finest, finish) = Prediction::split_full(self.kernel(0), count, planes_of(full, 2));
-        let coarser = heads.into_iter().rev().map(|(f, head)| Prediction::split(KERNEL, planes_of(head, f)));
+        let coarser = heads.into_iter().rev().zip(1..);
+        let coarser = coarser.map(|((f, head), level)| Prediction::split(KERNEL, level, planes_of(head, f)));
         (std::iter::once(finest).chain(coarser).collect(), finish)
     }
 
@@ -321,10 +322,9 @@ pub struct Prediction<T> {
     pub kernel: Field<T>,
     /// How far each pixel is to be trusted, (N, 1, H, W).
     pub confidence: Field<T>,
-    /// The share of the level below before its logistic, (N, 1, H, W).
-    pub mask: Field<T>,
-    /// Logits of the corners from which that level is upsampled, (N, 4, H, W).
-    pub corners: Field<T>,
+    /// Of levels that have one below: the share of that before its logistic, (N, 1, H, W), and logits of the corners
+    /// from which it is upsampled, (N, 4, H, W).
+    pub below: Option<(Field<T>, Field<T>)>,
 }
 
 /// What the head of full resolution predicts besides the [`Prediction`] of its level.
@@ -339,21 +339,18 @@ pub struct Finish<T> {
 impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
     /// A second handle on the same prediction, with empty tapes.
     pub fn fork(&self) -> Self {
-        let Self { kernel, confidence, mask, corners } = self;
-        let [kernel, confidence, mask, corners] = [kernel, confidence, mask, corners].map(Field::fork);
-        Self { kernel, confidence, mask, corners }
+        let Self { kernel, confidence, below } = self;
+        let below = below.as_ref().map(|(mask, corners)| (mask.fork(), corners.fork()));
+        Self { kernel: kernel.fork(), confidence: confidence.fork(), below }
     }
 
-    /// Splits the planes of a level's head, whose k x k kernels come first. `planes(first, count)` gives some
-    /// of these planes.
-    pub fn split(k: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> Self {
+    /// Splits the planes of the head of `level`, whose k x k kernels come first. `planes(first, count)` gives some
+    /// of these planes. (The head of the coarsest level has planes for a level below as well; nothing reads them.)
+    pub fn split(k: usize, level: usize, mut planes: impl FnMut(usize, usize) -> Field<T>) -> Self {
         let taps = k * k;
-        Self {
-            kernel: planes(0, taps),
-            confidence: planes(taps, 1),
-            mask: planes(taps + 1, 1),
-            corners: planes(taps + 2, CORNERS),
-        }
+        let (kernel, confidence) = (planes(0, taps), planes(taps, 1));
+        let below = (level < LEVELS).then(|| (planes(taps + 1, 1), planes(taps + 2, CORNERS)));
+        Self { kernel, confidence, below }
     }
 
     /// Splits the `count` planes of the head of full resolution, whose k x k kernels come first.
@@ -362,7 +359,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Prediction<T> {
         count: usize,
         mut planes: impl FnMut(usize, usize) -> Field<T>,
     ) -> (Self, Finish<T>) {
-        let prediction = Self::split(k, &mut planes);
+        let prediction = Self::split(k, 0, &mut planes);
         let (divisor, shade) = (head_of(k) + GAINS, head_of(k) + GAINS + DIVISOR);
         let refined = (shade < count).then(|| (planes(divisor, DIVISOR), planes(shade, SHADE)));
         (prediction, Finish { gain: planes(head_of(k), GAINS), refined })
@@ -402,11 +399,11 @@ pub fn filter_levels<T: Tape<f32, Cpu> + Merge<T>>(
     let mut below: Option<Field<T>> = None;
     loop {
         let (noisy, predicted) = pyramid.pop().expect("there are levels");
-        let Prediction { kernel, confidence, mask, corners } = predicted;
-        let blended = match below.take() {
+        let Prediction { kernel, confidence, below: how } = predicted;
+        let blended = match below.take().zip(how) {
             None => noisy,
             // (N, 3, H, W) and (N, 3, H/2, W/2) -> (N, 3, H, W)
-            Some(below) => noisy.blend(below, mask, corners),
+            Some((below, (mask, corners))) => noisy.blend(below, mask, corners),
         };
         let filtered = blended.filter(kernel, Some(confidence));
         if pyramid.is_empty() {

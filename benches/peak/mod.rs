@@ -1,6 +1,6 @@
 //! The FMA peak of a core, measured: the denominator of every efficiency figure.
 
-use super::{
+use demc::kernels::{
     Block, LANES,
     simd::{Kernel, Simd, Tier},
 };
