@@ -18,32 +18,36 @@ use crate::{
 };
 
 /// Columns of `scores.csv` in order; the first twelve are the contract with other tools.
-pub const COLUMNS: [&str; 24] = [
-    "scene",
-    "model",
-    "spp",
-    "width",
-    "height",
-    "relmse",
-    "ssim",
-    "rmse",
-    "max_error",
-    "seconds",
-    "ms_per_mpx",
-    "exposure",
-    "relmse_trimmed",
-    "smape",
-    "flip",
-    "flicker",
-    "peak_mib",
-    "threads",
-    "repeats",
-    "non_finite",
-    "noisy",
-    "reference",
-    "reason",
-    "note",
+pub const COLUMNS: [Column<Row>; 24] = [
+    ("scene", |row| row.scene.clone()),
+    ("model", |row| row.model.clone()),
+    ("spp", |row| row.spp.to_string()),
+    ("width", |row| count(row.width)),
+    ("height", |row| count(row.height)),
+    ("relmse", |row| cell(row.relmse)),
+    ("ssim", |row| cell(row.ssim)),
+    ("rmse", |row| cell(row.rmse)),
+    ("max_error", |row| cell(row.max_error)),
+    ("seconds", |row| cell(row.seconds)),
+    ("ms_per_mpx", |row| cell(row.ms_per_mpx)),
+    ("exposure", |row| cell(row.exposure)),
+    ("relmse_trimmed", |row| cell(row.relmse_trimmed)),
+    ("smape", |row| cell(row.smape)),
+    ("flip", |row| cell(row.flip)),
+    ("flicker", |row| cell(row.flicker)),
+    ("peak_mib", |row| cell(row.peak_mib)),
+    ("threads", |row| row.threads.to_string()),
+    ("repeats", |row| row.repeats.to_string()),
+    ("non_finite", |row| count(row.non_finite)),
+    ("noisy", |row| row.noisy.display().to_string()),
+    ("reference", |row| row.reference.display().to_string()),
+    ("reason", |row| row.reason.clone()),
+    ("note", |row| row.note.clone()),
 ];
+
+fn count(count: Option<usize>) -> String {
+    count.map(|count| count.to_string()).unwrap_or_default()
+}
 
 /// What one method scored on one pair. A number that could not be measured is none; `reason` says why.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
@@ -192,47 +196,26 @@ impl Row {
         self.seconds = Some(seconds);
         self.ms_per_mpx = Some(seconds * 1e3 / (pixels as f64 / 1e6));
     }
-
-    /// Its cells in the order of [`COLUMNS`].
-    fn cells(&self) -> [String; COLUMNS.len()] {
-        let count = |v: Option<usize>| v.map(|v| v.to_string()).unwrap_or_default();
-        [
-            self.scene.clone(),
-            self.model.clone(),
-            self.spp.to_string(),
-            count(self.width),
-            count(self.height),
-            cell(self.relmse),
-            cell(self.ssim),
-            cell(self.rmse),
-            cell(self.max_error),
-            cell(self.seconds),
-            cell(self.ms_per_mpx),
-            cell(self.exposure),
-            cell(self.relmse_trimmed),
-            cell(self.smape),
-            cell(self.flip),
-            cell(self.flicker),
-            cell(self.peak_mib),
-            self.threads.to_string(),
-            self.repeats.to_string(),
-            count(self.non_finite),
-            self.noisy.display().to_string(),
-            self.reference.display().to_string(),
-            self.reason.clone(),
-            self.note.clone(),
-        ]
-    }
 }
 
-/// A CSV document.
-pub fn to_csv<R: AsRef<[String]>>(columns: &[&str], rows: impl IntoIterator<Item = R>) -> String {
+/// A column of a table: its name, and the cell of a row.
+pub type Column<R> = (&'static str, fn(&R) -> String);
+
+/// A table as CSV, with a header.
+pub fn to_csv<'a, R: 'a>(columns: &[Column<R>], rows: impl IntoIterator<Item = &'a R>) -> String {
+    let header = columns.iter().map(|(name, _)| (*name).to_owned()).collect();
+    csv_lines(std::iter::once(header).chain(rows.into_iter().map(|row| cells(columns, row))))
+}
+
+fn cells<R>(columns: &[Column<R>], row: &R) -> Vec<String> {
+    columns.iter().map(|(_, cell)| cell(row)).collect()
+}
+
+/// Lines of CSV from their cells.
+pub fn csv_lines(lines: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut writer = csv::Writer::from_writer(Vec::new());
     let invariant = "writing to memory does not fail";
-    writer.write_record(columns).expect(invariant);
-    for row in rows {
-        writer.write_record(row.as_ref()).expect(invariant);
-    }
+    lines.into_iter().for_each(|cells| writer.write_record(cells).expect(invariant));
     String::from_utf8(writer.into_inner().expect(invariant)).expect("cells are UTF-8")
 }
 
@@ -260,9 +243,8 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
 ///
 /// # Errors
 /// It cannot be written.
-pub fn append_row(path: &Path, cells: &[String]) -> Result<()> {
-    let cells: Vec<&str> = cells.iter().map(String::as_str).collect();
-    let line = to_csv::<Vec<String>>(&cells, []);
+pub fn append_row<R>(path: &Path, columns: &[Column<R>], row: &R) -> Result<()> {
+    let line = csv_lines([cells(columns, row)]);
     let mut file = OpenOptions::new().append(true).open(path).map_err(Error::io("write", path))?;
     file.write_all(line.as_bytes()).map_err(Error::io("write", path))
 }
@@ -297,7 +279,7 @@ pub struct Table {
 impl Table {
     /// Starts with the rows kept from an earlier run, and others that are not asked for now.
     pub fn create(path: PathBuf, kept: Vec<Row>, others: Vec<Row>) -> Result<Self> {
-        let text = to_csv(&COLUMNS, kept.iter().chain(&others).map(Row::cells));
+        let text = to_csv(&COLUMNS, kept.iter().chain(&others));
         write_file(&path, text.as_bytes())?;
         Ok(Self { path, rows: kept.into_iter().map(|row| (row.key(), row)).collect(), others })
     }
@@ -309,7 +291,7 @@ impl Table {
 
     /// Stores a row at once.
     pub fn push(&mut self, row: Row) -> Result<()> {
-        append_row(&self.path, &row.cells())?;
+        append_row(&self.path, &COLUMNS, &row)?;
         self.rows.insert(row.key(), row);
         Ok(())
     }
@@ -318,7 +300,7 @@ impl Table {
     /// for.
     pub fn finish(mut self, keys: impl IntoIterator<Item = Key>) -> Result<Vec<Row>> {
         let rows: Vec<Row> = keys.into_iter().filter_map(|key| self.rows.remove(&key)).collect();
-        let text = to_csv(&COLUMNS, rows.iter().chain(&self.others).map(Row::cells));
+        let text = to_csv(&COLUMNS, rows.iter().chain(&self.others));
         write_file(&self.path, text.as_bytes())?;
         Ok(rows)
     }
@@ -380,7 +362,7 @@ mod tests {
     #[test]
     fn header_begins_with_the_contract() {
         let contract = "scene,model,spp,width,height,relmse,ssim,rmse,max_error,seconds,ms_per_mpx,exposure";
-        assert_eq!(COLUMNS[..12].join(","), contract);
+        assert_eq!(COLUMNS.map(|(name, _)| name)[..12].join(","), contract);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use std::{
 
 use super::{
     NOISY, cell,
-    rows::{Row, to_csv},
+    rows::{Row, csv_lines},
 };
 
 /// How a row gives a metric.
@@ -181,7 +181,6 @@ pub fn to_text(summaries: &[MethodSummary], baseline: &str) -> String {
         columns.extend(["mean", "median", "geomean", "ratio"].map(|s| format!("{metric}_{s}")));
     }
     columns.push("peak_mib_max".into());
-    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let rows = summaries.iter().map(|s| {
         let mut cells = vec![
             s.model.clone(),
@@ -196,7 +195,7 @@ pub fn to_text(summaries: &[MethodSummary], baseline: &str) -> String {
         cells.push(cell(s.peak_mib));
         cells
     });
-    to_csv(&columns, rows)
+    csv_lines(std::iter::once(columns).chain(rows))
 }
 
 #[cfg(test)]

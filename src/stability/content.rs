@@ -13,7 +13,7 @@ use std::{
 };
 
 use super::{Trial, TrialRow};
-use crate::report::{HeatCell, HeatMap, NOISY, cell, geometric_mean, mean, plural};
+use crate::report::{Column, HeatCell, HeatMap, NOISY, cell, geometric_mean, mean, plural};
 
 /// RelMSE that a method may bring to an input that is exact: nothing that an eye sees.
 const HARMLESS: f64 = 1e-4;
@@ -22,19 +22,19 @@ const HARMLESS: f64 = 1e-4;
 const ENERGY: f64 = 0.02;
 
 /// Columns of `stability_scenes.csv`.
-pub const COLUMNS: [&str; 12] = [
-    "scene",
-    "spp",
-    "model",
-    "seeds",
-    "failed",
-    "relmse",
-    "spread",
-    "to_input",
-    "to_baseline",
-    "ssim",
-    "energy",
-    "verdict",
+pub const COLUMNS: [Column<Case>; 12] = [
+    ("scene", |case| case.scene.clone()),
+    ("spp", |case| case.spp.to_string()),
+    ("model", |case| case.model.clone()),
+    ("seeds", |case| case.seeds.len().to_string()),
+    ("failed", |case| case.failed.to_string()),
+    ("relmse", |case| cell(case.relmse)),
+    ("spread", |case| cell(case.spread)),
+    ("to_input", |case| cell(case.to_input)),
+    ("to_baseline", |case| cell(case.to_baseline)),
+    ("ssim", |case| cell(case.ssim)),
+    ("energy", |case| cell(case.energy)),
+    ("verdict", Case::verdict),
 ];
 
 /// The results of one method on one scene at one sample count.
@@ -72,27 +72,13 @@ impl Case {
         (self.model != NOISY).then_some(self.faults.is_empty())
     }
 
-    /// Its cells in the order of [`COLUMNS`].
-    pub fn cells(&self) -> [String; COLUMNS.len()] {
-        let verdict = match self.passes() {
+    /// In words: whether it is within the bounds, and else why not; empty for the input itself.
+    fn verdict(&self) -> String {
+        match self.passes() {
             None => String::new(),
             Some(true) => "pass".into(),
             Some(false) => format!("fail: {}", self.faults.join("; ")),
-        };
-        [
-            self.scene.clone(),
-            self.spp.to_string(),
-            self.model.clone(),
-            self.seeds.len().to_string(),
-            self.failed.to_string(),
-            cell(self.relmse),
-            cell(self.spread),
-            cell(self.to_input),
-            cell(self.to_baseline),
-            cell(self.ssim),
-            cell(self.energy),
-            verdict,
-        ]
+        }
     }
 
     /// Finds the faults, given the energy of the input, and the largest RelMSE where the input had none.
@@ -267,8 +253,8 @@ mod tests {
         assert!((good.to_input.unwrap() - 0.375f64.sqrt()).abs() < 1e-12);
         assert!((good.spread.unwrap() - 0.02f64.sqrt() / 0.2).abs() < 1e-12);
         assert!((cases[3].to_baseline.unwrap() - 12.0f64.sqrt()).abs() < 1e-12);
-        assert!(cases[2].cells()[11].contains("91.0% of the reference's light"), "{:?}", cases[2].cells());
-        assert!(cases[3].cells()[11].contains("x the input's RelMSE"));
+        assert!(cases[2].verdict().contains("91.0% of the reference's light"), "{:?}", cases[2].verdict());
+        assert!(cases[3].verdict().contains("x the input's RelMSE"));
     }
 
     #[test]

@@ -22,8 +22,8 @@ use crate::{
     metrics::{self, display, error, ssim},
     planes::Planes,
     report::{
-        self, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, Provenance, append_row, cell,
-        geometric_mean, to_csv, write_file, write_json,
+        self, Column, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, Provenance, append_row,
+        cell, geometric_mean, to_csv, write_file, write_json,
     },
     shot::Shot,
     testset::Pair,
@@ -63,43 +63,32 @@ pub struct TrialRow {
 }
 
 /// Columns of `stability.csv`.
-const COLUMNS: [&str; 12] = [
-    "scene",
-    "model",
-    "spp",
-    "trial",
-    "relmse",
-    "ratio",
-    "deviation",
-    "reason",
-    "note",
-    "ssim",
-    "energy",
-    "noisy",
+const COLUMNS: [Column<TrialRow>; 12] = [
+    ("scene", |row| row.scene.clone()),
+    ("model", |row| row.model.clone()),
+    ("spp", |row| row.spp.to_string()),
+    ("trial", |row| row.trial.into()),
+    ("relmse", |row| cell(row.relmse)),
+    ("ratio", |row| cell(row.ratio)),
+    ("deviation", |row| cell(row.deviation)),
+    ("reason", |row| row.reason.clone()),
+    ("note", |row| row.note.clone()),
+    ("ssim", |row| cell(row.ssim)),
+    ("energy", |row| cell(row.energy)),
+    ("noisy", |row| row.noisy.display().to_string()),
 ];
 
 /// Columns of `stability_summary.csv`; `scenes` are those that have a ratio.
-const SUMMARY_COLUMNS: [&str; 8] =
-    ["model", "trial", "scenes", "failed", "ratio", "worst_ratio", "worst_scene", "worst_deviation"];
-
-impl TrialRow {
-    fn cells(&self) -> [String; COLUMNS.len()] {
-        [
-            self.scene.clone(),
-            self.model.clone(),
-            self.spp.to_string(),
-            self.trial.into(),
-            cell(self.relmse),
-            cell(self.ratio),
-            cell(self.deviation),
-            self.reason.clone(),
-            self.note.clone(),
-            cell(self.ssim),
-            cell(self.energy),
-            self.noisy.display().to_string(),
-        ]
-    }
-}
+const SUMMARY_COLUMNS: [Column<Summary>; 8] = [
+    ("model", |row| row.model.clone()),
+    ("trial", |row| row.trial.name().into()),
+    ("scenes", |row| row.scenes.to_string()),
+    ("failed", |row| row.failed.to_string()),
+    ("ratio", |row| cell(row.ratio)),
+    ("worst_ratio", |row| cell(row.worst.as_ref().map(|(ratio, _)| *ratio))),
+    ("worst_scene", |row| row.worst.as_ref().map_or(String::new(), |(_, scene)| scene.clone())),
+    ("worst_deviation", |row| cell(row.worst_deviation)),
+];
 
 /// What to run, and where to write.
 #[derive(Clone, Debug)]
@@ -137,7 +126,7 @@ pub fn run(
     let made = serde_json::json!({ "provenance": &provenance, "threads": options.threads });
     write_json(&out.join("run.json"), &made)?;
     let table = out.join("stability.csv");
-    write_file(&table, to_csv::<Vec<String>>(&COLUMNS, []).as_bytes())?;
+    write_file(&table, to_csv(&COLUMNS, []).as_bytes())?;
     let mut rows = Vec::new();
     for pair in pairs {
         let loaded = report::load_listed(pair, options.view_layer.as_deref());
@@ -160,20 +149,16 @@ pub fn run(
                     }
                     Err(error) => row.reason = error.to_string(),
                 }
-                append_row(&table, &row.cells())?;
+                append_row(&table, &COLUMNS, &row)?;
                 on(&row);
                 rows.push(row);
             }
         }
     }
     let summary = summarise(&rows, methods, &options.trials);
-    let lines = summary.iter().map(Summary::cells);
-    write_file(&out.join("stability_summary.csv"), to_csv(&SUMMARY_COLUMNS, lines).as_bytes())?;
+    write_file(&out.join("stability_summary.csv"), to_csv(&SUMMARY_COLUMNS, &summary).as_bytes())?;
     let cases = content::cases(&rows, &options.baseline);
-    write_file(
-        &out.join("stability_scenes.csv"),
-        to_csv(&content::COLUMNS, cases.iter().map(Case::cells)).as_bytes(),
-    )?;
+    write_file(&out.join("stability_scenes.csv"), to_csv(&content::COLUMNS, &cases).as_bytes())?;
     show(pairs, methods, options, &provenance, (&summary, &cases))?;
     Ok((rows, cases))
 }
@@ -343,22 +328,6 @@ fn summarise(rows: &[TrialRow], methods: &[Contender], trials: &[Trial]) -> Vec<
         }
     };
     lines.map(line).collect()
-}
-
-impl Summary {
-    fn cells(&self) -> [String; SUMMARY_COLUMNS.len()] {
-        let (ratio, scene) = self.worst.clone().unzip();
-        [
-            self.model.clone(),
-            self.trial.name().into(),
-            self.scenes.to_string(),
-            self.failed.to_string(),
-            cell(self.ratio),
-            cell(ratio),
-            scene.unwrap_or_default(),
-            cell(self.worst_deviation),
-        ]
-    }
 }
 
 #[cfg(test)]
