@@ -182,13 +182,15 @@ fn frames_are_picked_by_number() {
     assert_eq!(names("steps"), ["shot_0004spp.0001.exr", "shot_0004spp.0005.exr"]);
     run("renders pairs --out listed --frames 12,7")
         .success()
-        .stderr(contains("--frames: frame 7 is not there"));
+        .stderr(contains("--frames: no input is of frame 7"));
     assert_eq!(names("listed"), ["shot_0004spp.0012.exr"]);
-    run("renders --out steps --frames 1-20:4").success().stderr(contains("3 frames from 9 on are not there"));
+    run("renders --out steps --frames 1-20:4").success().stderr(contains("no input is of frames 9,13,17"));
+    run("renders --out steps --frames 1-20:4 --quiet").success().stderr("");
     // No wrong usage: on a farm, a chunk of frames may not be rendered.
-    run("renders --out none --frames 2-4").code(1).stderr(contains("renders: has no file of --frames"));
+    run("renders --out none --frames 2-4").code(1).stderr(contains("renders: no file of --frames"));
+    run("renders pairs --out none --frames 2-4").code(1).stderr(contains("renders and 1 more: no file of"));
     run("renders --out none --frames 4-2").code(2).stderr(contains("the last frame comes before the first"));
-    run("renders --out none --frames -5--1").code(1).stderr(contains("has no file of --frames"));
+    run("renders --out none --frames -5--1").code(1).stderr(contains("no file of --frames"));
 }
 
 /// Two tasks that are given the same frames: each result is whole, and nothing else stays.

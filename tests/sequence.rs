@@ -126,6 +126,21 @@ fn a_result_is_the_same_bits_in_any_order_alone_and_resumed() {
 }
 
 #[test]
+fn results_older_than_a_frame_beside_theirs_are_told() {
+    let dir = sequence(SHOT, 1..=4);
+    let out = dir.path().join("out");
+    demc(&out).arg(dir.path()).arg("--temporal=1").assert().success();
+    let render = fs::File::options().append(true).open(named(&dir, 1)).unwrap();
+    render.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
+    let again = demc(&out).arg(dir.path()).arg("--temporal=1").assert().success();
+    let told = String::from_utf8_lossy(&again.get_output().stderr).into_owned();
+    let notes: Vec<&str> = told.lines().filter(|line| line.contains("is older than")).collect();
+    assert_eq!(notes.len(), 2, "{told}");
+    assert!(notes[0].contains("0001.exr: is older than its render"), "{told}");
+    assert!(notes[1].contains("0002.exr: is older than a frame beside its render"), "{told}");
+}
+
+#[test]
 fn a_frame_that_was_made_without_another_is_made_again_when_that_is_there() {
     let dir = sequence(SHOT, 1..=8);
     let [whole, mended] = ["whole", "mended"].map(|name| dir.path().join(name));

@@ -84,7 +84,7 @@ class Job:
         self.options, self.layer, self.scene = options, picture, scene
         self.state = WAITING
         self.results = []  # the objects of demc's JSON for files that are done, or were there
-        self.skipped = 0
+        self.skipped = self.outdated = 0  # of the results, and of those
         self.errors, self.notes = [], []
         self.picture = None
         self.scratch = []  # files and folders that are of no use when the job has ended
@@ -180,7 +180,8 @@ class Job:
         parts = [f"{count} {'frame' if count == 1 else 'frames'} denoised in {self.seconds:.1f} s"] if count else []
         if self.skipped:
             were = "result was" if self.skipped == 1 else "results were"
-            parts.append(f"{self.skipped} {were} there already (Overwrite makes them again)")
+            older = f", {self.outdated} older than the render" if self.outdated else ""
+            parts.append(f"{self.skipped} {were} there already{older} (Overwrite makes them again)")
         if self.errors:
             more = f", and {len(self.errors) - 1} more failed" if len(self.errors) > 1 else ""
             parts.append(f"failed: {self.errors[0]}{more}")
@@ -213,8 +214,12 @@ class Job:
             self.errors.append(said.get("error", "unknown"))
         elif "status" in said:
             self.results.append(said)
-            self.skipped += said["status"] == "skipped"
-            self.notes += said.get("notes") or []
+            notes = said.get("notes") or []
+            if said["status"] == "skipped":
+                self.skipped += 1
+                self.outdated += bool(notes)
+            else:
+                self.notes += notes
 
     def _conclude(self, status):
         self._ended = time.monotonic()

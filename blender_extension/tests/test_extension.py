@@ -177,6 +177,16 @@ class Extension(unittest.TestCase):
             self.refused(bpy.ops.demc.denoise_range, "Output path .* cannot be read")
             bpy.ops.render.render()
 
+    def test_results_of_frames_that_were_rendered_again_are_told(self):
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        later = time.time() + 60
+        os.utime(bpy.path.abspath(self.scene.render.frame_path(frame=2)), (later, later))
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        summary = sys.modules[f"{MODULE}.jobs"].current().summary()
+        self.assertEqual(summary, "2 results were there already, 1 older than the render (Overwrite makes them again)")
+
     def test_both_eyes(self):
         self.prepared()
         self.scene.render.use_multiview = True

@@ -87,7 +87,9 @@ fn detached<T: Send + 'static>(
         // Starting many threads takes long too, so that is done here.
         let guarded = AssertUnwindSafe(|| {
             let pool = match threads {
-                Some(count) => ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool))),
+                Some(count) => {
+                    ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool)))
+                }
                 None => forked_pool(),
             };
             match pool.map_err(|error| Failure::Usage(format!("threads: {error}")))? {

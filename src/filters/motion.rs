@@ -354,7 +354,7 @@ mod tests {
 
     #[test]
     fn each_way_and_each_step_has_vectors_of_its_own() {
-        // From where it was to where it will be, from the left of column 12 on and from there: of all, no two are alike.
+        // No two of all are alike, before column 12 and from there on.
         let vectors = Planes::from_rows(4, SIZE, |c, _, out| {
             let (left, right) = ([-1.0, 2.0, -3.0, 5.0][c], [-2.0, 4.0, 6.0, -1.0][c]);
             out.iter_mut().enumerate().for_each(|(x, out)| *out = if x < 12 { left } else { right });

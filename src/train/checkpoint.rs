@@ -24,8 +24,9 @@ pub struct Progress {
     pub step: usize,
     /// Seconds spent in all, before and after resuming.
     pub seconds: f64,
-    /// The step of the last row of the log, or 0. A row that was written after the checkpoint is not counted, and made
-    /// again.
+    /// The step of the last row of the log, or 0. A row that was written after the checkpoint is not counted, and
+    /// made again. In checkpoints that do not tell, all rows are.
+    #[serde(default = "all")]
     pub logged: usize,
     /// Sum and number of training losses since the last line of the log.
     pub losses: (f64, usize),
@@ -34,6 +35,10 @@ pub struct Progress {
     pub skipped: usize,
     /// The best validation RelMSE so far.
     pub best: Option<f64>,
+}
+
+const fn all() -> usize {
+    usize::MAX
 }
 
 /// Writes the state, whole or not at all.

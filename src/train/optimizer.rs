@@ -158,18 +158,20 @@ fn orthogonal(matrix: Vec<f32>, rows: usize, columns: usize) -> Vec<f32> {
     if tall {
         x = transposed(x);
     }
-    // Each iteration multiplies by `a + b G + c G^2`, `G` the matrix times its transpose, and so `G` by the square of that. All
-    // but two products are then of small square matrices.
+    // Each iteration multiplies by `a + b G + c G^2`, `G` the matrix times its transpose, and so `G` by the
+    // square of that. All but two products are then of small square matrices.
     let [a, b, c] = COEFFICIENTS;
     let mut gram: Matrix = x.clone().matmul(transposed(x.clone()));
     let side = rows.min(columns);
     let unit = (0..side * side).map(|i| if i % (side + 1) == 0 { 1.0 } else { 0.0 }).collect();
     let mut product: Matrix = Cpu::default().tensor_from_vec(unit, (side, side));
-    for _ in 0..ITERATIONS {
+    for left in (0..ITERATIONS).rev() {
         let polynomial: Matrix = gram.clone() * b + gram.clone().matmul(gram.clone()) * c;
         let apply = |m: Matrix| polynomial.clone().matmul(m.clone()) + m * a;
         product = apply(product);
-        gram = apply(apply(gram));
+        if left > 0 {
+            gram = apply(apply(gram));
+        }
     }
     x = product.matmul(x);
     if tall { transposed(x) } else { x }.as_vec()

@@ -171,7 +171,7 @@ impl<'a> Run<'a> {
         if resume {
             progress = checkpoint::load(&checkpoint, &mut *network, &mut *average, &mut optimizer)?;
         }
-        let rows = log::read(&out.join(LOG), progress.logged)?;
+        let rows = log::read(&out.join(LOG), progress.step.min(progress.logged))?;
         let now = Instant::now();
         let silent = BTreeSet::new();
         Ok(Self { options, out, network, average, optimizer, progress, rows, silent, since: now, saved: now })

@@ -72,7 +72,9 @@ impl Shot {
         let place = self.place(frame);
         let (x, y) = (x - place.0, y - place.1);
         let phase = c as f32 + 2.0 * self.scene as f32;
-        0.5 + 0.3 * (0.25 * x + phase).sin() * (0.3 * y + 1.7 * self.scene as f32).cos()
+        // Systems differ in the last bit of a sine, which f32 does not hold.
+        let (wide, high) = (f64::from(0.25 * x + phase), f64::from(0.3 * y + 1.7 * self.scene as f32));
+        (0.5 + 0.3 * wide.sin() * high.cos()) as f32
     }
 
     pub fn light(&self, x: f32, frame: i64) -> f32 {

@@ -8,8 +8,9 @@ use std::{collections::BTreeSet, path::PathBuf, str::FromStr};
 
 use crate::{
     Error, Result,
-    cli::{inputs::is_missing_folder, lines::warn_line},
+    cli::inputs::is_missing_folder,
     denoise::{Input, frame_number},
+    report::plural,
 };
 
 /// Frames as the user lists them.
@@ -26,16 +27,12 @@ struct Span {
 
 impl Span {
     fn contains(self, frame: i64) -> bool {
-        (self.first..=self.last).contains(&frame) && (frame - self.first) % self.step == 0
+        let is_between = (self.first..=self.last).contains(&frame);
+        is_between && frame.abs_diff(self.first).is_multiple_of(self.step.unsigned_abs())
     }
 
-    /// How many of its frames are not among those that are `there`, and the first of them; none if all are.
-    fn lacking(self, there: &BTreeSet<i64>) -> Option<(i128, i64)> {
-        let found = there.iter().filter(|frame| self.contains(**frame)).count();
-        let frames = (i128::from(self.last) - i128::from(self.first)) / i128::from(self.step) + 1;
-        let mut all = (self.first..=self.last).step_by(usize::try_from(self.step).unwrap_or(usize::MAX));
-        let first = all.find(|frame| !there.contains(frame))?;
-        Some((frames - found as i128, first))
+    fn frames(self) -> impl Iterator<Item = i64> {
+        (self.first..=self.last).step_by(usize::try_from(self.step).unwrap_or(usize::MAX))
     }
 }
 
@@ -79,28 +76,48 @@ impl Frames {
         is_of_these || is_missing_folder(&input.file)
     }
 
-    /// The files of these frames. Tells how many frames that were asked for have none.
+    /// The files of these frames.
     ///
     /// # Errors
     /// There is no such file, where `are_all` that were named, as by `inputs`.
     pub fn pick(&self, files: Vec<Input>, inputs: &[PathBuf], are_all: bool) -> Result<Vec<Input>> {
         let picked: Vec<Input> = files.into_iter().filter(|file| self.has(file)).collect();
-        if let ([], true, [first, ..]) = (&picked[..], are_all, inputs) {
-            let why = "has no file of --frames, whose name ends in one of these numbers as in shot.0017.exr";
-            return Err(Error::invalid(first, why));
-        }
-        let there: BTreeSet<i64> = picked.iter().filter_map(|input| frame_number(&input.file)).collect();
-        for (count, first) in self.0.iter().filter_map(|span| span.lacking(&there)) {
-            let which = if count == 1 {
-                format!("frame {first} is")
-            } else {
-                format!("{count} frames from {first} on are")
-            };
-            warn_line(&format!("demc: note: --frames: {which} not there"));
+        if let ([], true, [first, others @ ..]) = (&picked[..], are_all, inputs) {
+            let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
+            let named = format!("{}{more}", first.display());
+            return Err(Error::invalid(
+                named,
+                "no file of --frames, whose name ends in a number as shot.0017.exr",
+            ));
         }
         Ok(picked)
     }
+
+    /// Says which frames are asked for and not among `files`, if there are any. So many that they stand for all that
+    /// there are do not count.
+    pub fn lacking(&self, files: &[Input]) -> Option<String> {
+        let there: BTreeSet<i64> = files.iter().filter_map(|input| frame_number(&input.file)).collect();
+        let wanted: BTreeSet<i64> = self.0.iter().flat_map(|span| span.frames()).take(MOST + 1).collect();
+        let lacking: Vec<i64> = wanted.difference(&there).copied().collect();
+        let mut spans = lacking.chunk_by(|frame, next| *next == frame + 1).map(|span| match span {
+            [one] => one.to_string(),
+            [first, .., last] => format!("{first}-{last}"),
+            [] => String::new(),
+        });
+        let mut named = spans.by_ref().take(NAMED).collect::<Vec<_>>().join(",");
+        if spans.next().is_some() {
+            named += ",...";
+        }
+        (!lacking.is_empty() && wanted.len() <= MOST)
+            .then(|| format!("--frames: no input is of frame{} {named}", plural(lacking.len())))
+    }
 }
+
+/// More frames than this are asked for by nobody who means each of them.
+const MOST: usize = 100_000;
+
+/// Stretches of frames that are named.
+const NAMED: usize = 8;
 
 #[cfg(test)]
 mod tests {
@@ -112,14 +129,23 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_are_not_there_are_counted() {
-        let lacking = |frames: &str| {
-            let frames: Frames = frames.parse().unwrap();
-            frames.0.into_iter().map(|span| span.lacking(&[3, 4, 5, 9].into())).collect::<Vec<_>>()
-        };
-        assert_eq!(lacking("3-5,3-7,1-9:4,8"), [None, Some((2, 6)), Some((1, 1)), Some((1, 8))]);
+    fn frames_that_are_not_there_are_named() {
+        let there =
+            [3, 4, 5, 9].map(|n| Input { file: format!("shot.{n:04}.exr").into(), below: PathBuf::new() });
+        let lacking = |frames: &str| frames.parse::<Frames>().unwrap().lacking(&there);
+        let says = |frames: &str| Some(format!("--frames: no input is of frame{frames}"));
+        assert_eq!(lacking("3-5,9"), None);
+        assert_eq!(lacking("7,7"), says(" 7"));
+        assert_eq!(lacking("3-7,6-9:2,1-9:4"), says("s 1,6-8"));
+        assert_eq!(lacking("11-40:2"), says("s 11,13,15,17,19,21,23,25,..."));
         let all = "-9223372036854775808-9223372036854775807";
-        assert_eq!(lacking(all), [Some((i128::from(u64::MAX) + 1 - 4, i64::MIN))]);
+        assert_eq!(lacking(all), None, "they stand for all");
+        assert_eq!(
+            lacking(&format!("{all}:9223372036854775807")),
+            says("s -9223372036854775808,-1,9223372036854775806")
+        );
+        let third: Frames = format!("{all}:3").parse().unwrap();
+        assert!(third.contains(i64::MIN + 3) && third.contains(4) && !third.contains(5));
     }
 
     #[test]

@@ -224,16 +224,17 @@ pub fn run(args: Args) -> Result<ExitCode> {
         (_, true) => Style::Quiet,
         _ => Style::Plain,
     };
+    let reach = options.temporal.unwrap_or(0);
     let (mut progress, batch) = match work {
         Work::List { jobs, unusable } => {
-            let mut progress = Progress::new(Some(jobs.len() + unusable.len()), style);
+            let mut progress = Progress::new(Some(jobs.len() + unusable.len()), style, reach);
             for (input, error) in unusable {
                 progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
             }
             (progress, Batch::new(jobs, model.into(), options))
         }
         Work::Watch(watch, idle) => {
-            let progress = Progress::new(None, style);
+            let progress = Progress::new(None, style, reach);
             progress.say_watching(idle);
             (progress, Batch::watching(watch, model.into(), options)?)
         }
@@ -313,7 +314,13 @@ impl Work {
             Some((input.file.clone(), Error::io("read", &input.file)(error)))
         }));
         let files = match &args.frames {
-            Some(frames) => frames.pick(files, &args.inputs, unusable.is_empty())?,
+            Some(frames) => {
+                let picked = frames.pick(files, &args.inputs, unusable.is_empty())?;
+                if let Some(note) = frames.lacking(&picked).filter(|_| !args.quiet) {
+                    warn_line(&format!("demc: note: {note}"));
+                }
+                picked
+            }
             None => files,
         };
         Ok(Self::List { jobs: denoise::plan_tree(files, &args.out)?, unusable })

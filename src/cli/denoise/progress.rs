@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::{
     cli::lines::{print_line, warn_line},
-    denoise::{Job, Outcome},
+    denoise::{self, Job, Outcome},
 };
 
 /// What is printed of files that did not fail.
@@ -32,6 +32,8 @@ pub struct Progress {
     start: Instant,
     /// Files there are; not known while they are coming in.
     total: Option<usize>,
+    /// How many frames on either side a result is made of as well.
+    reach: usize,
     done: usize,
     skipped: usize,
     failed: usize,
@@ -73,8 +75,9 @@ struct Details<'a> {
 }
 
 impl Progress {
-    /// For a batch of `total` files, or of those that come in. The bar shows on a terminal alone.
-    pub fn new(total: Option<usize>, style: Style) -> Self {
+    /// For a batch of `total` files, or of those that come in, each denoised with `reach` frames on either side. The
+    /// bar shows on a terminal alone.
+    pub fn new(total: Option<usize>, style: Style, reach: usize) -> Self {
         let target = match style {
             Style::Quiet => ProgressDrawTarget::hidden(),
             _ => ProgressDrawTarget::stderr(),
@@ -89,7 +92,7 @@ impl Progress {
             bar.set_message("waiting for renders");
             bar.enable_steady_tick(Duration::from_millis(250));
         }
-        Self { bar, style, start: Instant::now(), total, done: 0, skipped: 0, failed: 0 }
+        Self { bar, style, start: Instant::now(), total, reach, done: 0, skipped: 0, failed: 0 }
     }
 
     /// Says that files are waited for, and what ends that.
@@ -123,10 +126,11 @@ impl Progress {
             None => format!("[{count}] "),
         };
         let style = self.style;
+        let note = matches!(outcome, Outcome::Skipped).then(|| outdated(job, self.reach)).flatten();
         // Above the bar, where there is one.
         self.bar.suspend(|| match style {
-            Style::Json => print_line(&json_line(job, outcome)),
-            Style::Plain => print_plain(job, outcome, &place, &pace),
+            Style::Json => print_line(&json_line(job, outcome, note)),
+            Style::Plain => print_plain(job, outcome, note, (&place, &pace)),
             Style::Quiet => {}
         });
         if let Outcome::Failed(error) = outcome {
@@ -177,7 +181,7 @@ impl Progress {
     }
 }
 
-fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
+fn print_plain(job: &Job, outcome: &Outcome, note: Option<&str>, (place, pace): (&str, &str)) {
     match outcome {
         Outcome::Done(report) => {
             print_line(&format!(
@@ -201,28 +205,32 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
         }
         Outcome::Skipped => {
             print_line(&format!("{place}{}  is there already", job.output.display()));
-            if is_outdated(job) {
-                warn_line(&format!("demc: note: {}: {OUTDATED}", job.output.display()));
+            if let Some(note) = note {
+                warn_line(&format!("demc: note: {}: {note}", job.output.display()));
             }
         }
         Outcome::Failed(_) => {}
     }
 }
 
-/// What is said of an old result.
-const OUTDATED: &str = "is older than its render, and was kept; --overwrite denoises that again";
-
-/// Whether a render has been written since its result, as far as the disk tells.
-fn is_outdated(job: &Job) -> bool {
+/// What is to be said of a result that is kept although its render, or one of the `reach` frames on either side, has been
+/// written since, as far as the disk tells.
+fn outdated(job: &Job, reach: usize) -> Option<&'static str> {
     let written = |path: &Path| path.metadata().and_then(|file| file.modified()).ok();
-    written(&job.output).is_some_and(|result| written(&job.input).is_some_and(|render| render > result))
+    let result = written(&job.output)?;
+    let is_newer = |path: &Path| written(path).is_some_and(|render| render > result);
+    if is_newer(&job.input) {
+        return Some("is older than its render, and was kept; --overwrite denoises that again");
+    }
+    let beside = denoise::neighbours(&job.input, reach);
+    let why = "is older than a frame beside its render, and was kept; --overwrite makes it again";
+    beside.iter().any(|(_, path)| is_newer(path)).then_some(why)
 }
 
-fn json_line(job: &Job, outcome: &Outcome) -> String {
-    let outdated = || is_outdated(job).then(|| OUTDATED.to_owned()).into_iter().collect();
+fn json_line(job: &Job, outcome: &Outcome, note: Option<&str>) -> String {
     let (status, error, report, notes) = match outcome {
         Outcome::Done(report) => ("done", None, Some(report), Some(report.notes.clone())),
-        Outcome::Skipped => ("skipped", None, None, Some(outdated())),
+        Outcome::Skipped => ("skipped", None, None, Some(note.map(Into::into).into_iter().collect())),
         Outcome::Failed(error) => ("failed", Some(error.to_string()), None, None),
     };
     let line = Line {

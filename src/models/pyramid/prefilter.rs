@@ -13,6 +13,7 @@ use super::{
 };
 use crate::{
     Result,
+    companion::Companion,
     features::{GuideInputs, Inputs, PREFILTERED_PASSES, albedo_exposure, guide_inputs, guide_targets},
     models::network::{Architecture, Batch, Config, Network, Taped, duplicate},
     nn::{Conv, Images, Stats},
@@ -108,7 +109,13 @@ impl Network for Prefilter {
     }
 
     /// Albedo and normal as [`Network::target`] has them, (6, H, W).
-    fn infer(&self, passes: &PassSet, tile: Option<usize>) -> Result<Planes> {
+    fn infer_along(
+        &self,
+        passes: &PassSet,
+        _: Option<&PassSet>,
+        _: &mut [Companion],
+        tile: Option<usize>,
+    ) -> Result<Planes> {
         let guides = strips::infer_guides(self, passes, tile)?;
         let rows = |c: usize, y: usize, row: &mut [f32]| {
             row.copy_from_slice(&guides[c / 3].channel(c % 3)[y * passes.width..][..passes.width]);
