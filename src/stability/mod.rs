@@ -332,6 +332,8 @@ fn summarise(rows: &[TrialRow], methods: &[Contender], trials: &[Trial]) -> Vec<
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::{models::Denoiser, passes::Pass};
 
@@ -358,6 +360,47 @@ mod tests {
         }
     }
 
+    fn options(out: &Path, worst: usize) -> StabilityOptions {
+        StabilityOptions {
+            out: out.into(),
+            view_layer: None,
+            trials: Trial::ALL.to_vec(),
+            baseline: NOISY.into(),
+            worst,
+            threads: 1,
+        }
+    }
+
+    #[test]
+    fn the_worst_scenes_of_our_own_methods_are_shown_once_each() {
+        let noisy = |scene: &str| format!("{scene}.exr");
+        let pair = |scene: &str| Pair {
+            scene: scene.into(),
+            noisy: noisy(scene).into(),
+            reference: "ref.exr".into(),
+            spp: 4,
+            frame: None,
+        };
+        let case = |(scene, model, ratio): (&str, &str, f64)| Case {
+            model: model.into(),
+            seeds: vec![noisy(scene).into()],
+            to_baseline: Some(ratio),
+            ..Case::default()
+        };
+        let cases = [
+            ("a", "demc-s", 1.2),
+            ("b", "demc-s", 3.0),
+            ("c", "demc-s", 2.0),
+            ("b", "demc-m", 2.5),
+            ("a", "oidn-high", 9.0),
+        ];
+        let (pairs, cases) = (["a", "b", "c"].map(pair), cases.map(case));
+        for (count, scenes) in [(0, ""), (1, "b"), (2, "bc"), (9, "bca")] {
+            let shown = worst(&pairs, &cases, &options(Path::new(""), count));
+            assert_eq!(shown.iter().map(|pair| &*pair.scene).collect::<String>(), scenes);
+        }
+    }
+
     #[test]
     fn rows_are_stored_as_they_finish_and_a_panic_costs_one() {
         let out = tempfile::tempdir().unwrap();
@@ -370,14 +413,7 @@ mod tests {
             stamp: String::new(),
         };
         let mut told = 0;
-        let options = StabilityOptions {
-            out: out.path().into(),
-            view_layer: None,
-            trials: Trial::ALL.to_vec(),
-            baseline: NOISY.into(),
-            worst: 0,
-            threads: 1,
-        };
+        let options = options(out.path(), 0);
         let (rows, _) = run(&pairs, &[method], &options, &mut |row| {
             told += 1;
             let text = std::fs::read_to_string(out.path().join("stability.csv")).unwrap();
