@@ -15,7 +15,7 @@ use std::{
 use assert_cmd::cargo::cargo_bin;
 use common::{
     demc,
-    files::{data, read_exr, samples, write_render},
+    files::{data, read_exr, samples, touch_later, write_render},
     shot::SHOT,
 };
 use predicates::{prelude::*, str::contains};
@@ -161,8 +161,7 @@ fn results_older_than_their_renders_are_told_and_kept() {
     denoise(folder.path(), "renders --out clean").success();
     let again = denoise(folder.path(), "renders --out clean").success();
     again.stdout(contains("is there already")).stderr(contains("older").not());
-    let render = fs::File::options().append(true).open(folder.path().join("renders/a.exr")).unwrap();
-    render.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
+    touch_later(&folder.path().join("renders/a.exr"));
     let told = denoise(folder.path(), "renders --out clean").success();
     told.stderr(contains("a.exr: is older than its render, and was kept; --overwrite denoises that again"));
     let run = denoise(folder.path(), "renders --out clean --json").success();

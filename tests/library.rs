@@ -110,7 +110,7 @@ fn each_file_of_a_batch_ends_once() {
         let end = batch.run(|job, outcome| {
             let outcome = match outcome {
                 Outcome::Done(_) => "done",
-                Outcome::Skipped => "skipped",
+                Outcome::Skipped(_) => "skipped",
                 Outcome::Failed(_) => "failed",
             };
             told.push((job.clone(), outcome));

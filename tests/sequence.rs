@@ -14,7 +14,7 @@ use std::{
 
 use assert_cmd::Command;
 use common::{
-    files::{bits, read_exr, samples, values},
+    files::{bits, read_exr, samples, touch_later, values},
     python,
     shot::{SHOT, SIZE, Shot, random, write_channels},
     tables::table,
@@ -130,8 +130,7 @@ fn results_older_than_a_frame_beside_theirs_are_told() {
     let dir = sequence(SHOT, 1..=4);
     let out = dir.path().join("out");
     demc(&out).arg(dir.path()).arg("--temporal=1").assert().success();
-    let render = fs::File::options().append(true).open(named(&dir, 1)).unwrap();
-    render.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
+    touch_later(&named(&dir, 1));
     let again = demc(&out).arg(dir.path()).arg("--temporal=1").assert().success();
     let told = String::from_utf8_lossy(&again.get_output().stderr).into_owned();
     let notes: Vec<&str> = told.lines().filter(|line| line.contains("is older than")).collect();

@@ -187,6 +187,12 @@ fn options(out: &Path) -> TrainOptions {
     serde_json::from_str(&text).expect("options")
 }
 
+/// Has a run go on by other settings.
+fn configure(out: &Path, options: &TrainOptions) {
+    let text = serde_json::to_string(options).expect("text");
+    fs::write(out.join("config.json"), text).expect("a file");
+}
+
 /// Trains in this process until the step `stop_at`, as if interrupted there.
 fn run_until(options: &TrainOptions, out: &Path, resume: bool, stop_at: usize) -> demc::Result<()> {
     let stop = AtomicBool::new(false);
@@ -241,7 +247,7 @@ fn the_best_weights_are_those_of_the_best_row() {
     run(train_with("demc-s", "32", &out, 4).args(["--precision", "f32", "--average", "0"])).success();
     // At such a rate it can only get worse.
     let ruined = TrainOptions { steps: 8, lr: (0.03, 0.03), ..options(&out) };
-    fs::write(out.join("config.json"), serde_json::to_string(&ruined).expect("text")).expect("a file");
+    configure(&out, &ruined);
     run(&mut resume(&out)).success();
     let error = |row: &String| row.split(',').nth(3).expect("a cell").parse::<f64>().expect("an error");
     let errors: Vec<f64> = log(&out)[1..].iter().map(error).collect();
@@ -388,7 +394,7 @@ fn a_run_goes_on_from_any_folder_to_as_many_steps_as_its_configuration_says() {
     command.args(["--model", "demc-s", "--every", "2", "--steps", "2"]).arg("--out").arg(&out);
     run(command.current_dir(env!("CARGO_MANIFEST_DIR"))).success();
     let longer = TrainOptions { steps: 4, ..options(&out) };
-    fs::write(out.join("config.json"), serde_json::to_string(&longer).expect("text")).expect("a file");
+    configure(&out, &longer);
     let mut command = resume(Path::new("run"));
     run(command.current_dir(dir.path())).success();
     assert_eq!(log(&out).len(), 3, "rows after 2 and 4 steps");

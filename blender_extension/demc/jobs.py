@@ -84,7 +84,7 @@ class Job:
         self.options, self.layer, self.scene = options, picture, scene
         self.state = WAITING
         self.results = []  # the objects of demc's JSON for files that are done, or were there
-        self.skipped = self.outdated = 0  # of the results, and of those
+        self.skipped = self.outdated = 0  # results that were there, and how many of them are older than the render
         self.errors, self.notes = [], []
         self.picture = None
         self.scratch = []  # files and folders that are of no use when the job has ended

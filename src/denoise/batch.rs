@@ -6,7 +6,7 @@
 
 use std::{
     collections::{HashMap, VecDeque},
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{
         Arc, Mutex, MutexGuard, PoisonError, RwLock,
         atomic::{AtomicBool, Ordering},
@@ -26,8 +26,8 @@ use crate::{Error, Result, error::attempt, frame::Frame, frame_number::frame_num
 pub enum Outcome {
     /// Written.
     Done(Report),
-    /// The result was there already.
-    Skipped,
+    /// The result was there already; why it may not be what is wanted, if there is a reason.
+    Skipped(Option<&'static str>),
     /// Nothing was written.
     Failed(Error),
 }
@@ -206,7 +206,13 @@ impl Shared {
                     && let Some(mut sequence) = list.sequences.pop_front()
                 {
                     // Finished jobs are taken out first, so that those that are left are split evenly.
-                    sequence.jobs.retain(|(job, _)| !self.take_up_existing(job, ended));
+                    let Stretch { files, jobs, .. } = &mut sequence;
+                    let reach = i64::try_from(self.options.temporal.unwrap_or(0)).unwrap_or(i64::MAX);
+                    jobs.retain(|(job, number)| {
+                        let near = number.saturating_sub(reach)..=number.saturating_add(reach);
+                        let beside = files.range(near).map(|(_, file)| file.as_path());
+                        !self.take_up_existing(job, beside, ended)
+                    });
                     list.stretches = sequence.split(lanes).into();
                 }
                 let frame = list.frames.pop_front().map(Work::Frame);
@@ -312,8 +318,14 @@ impl Shared {
         })
     }
 
-    /// Whether the result of a job exists already; if so, the job's end is reported.
-    pub fn take_up_existing(&self, job: &Job, ended: &Sender<Message>) -> bool {
+    /// Whether the result of a job exists already; if so, the job's end is reported. It is made of the frames `beside`
+    /// its own as well.
+    pub fn take_up_existing<'a>(
+        &self,
+        job: &Job,
+        beside: impl IntoIterator<Item = &'a Path>,
+        ended: &Sender<Message>,
+    ) -> bool {
         if self.options.overwrite {
             return false;
         }
@@ -324,7 +336,8 @@ impl Shared {
         };
         let take_up = |job: &Job| {
             let take_up = || headers?.map_or(Ok(()), |headers| job::take_up(&headers, &self.options));
-            attempt(&job.output, take_up).map_or_else(Outcome::Failed, |()| Outcome::Skipped)
+            let outdated = |()| Outcome::Skipped(job::outdated(job, beside));
+            attempt(&job.output, take_up).map_or_else(Outcome::Failed, outdated)
         };
         let _ = self.write(job.clone(), take_up, ended);
         true

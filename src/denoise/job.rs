@@ -625,6 +625,19 @@ pub(super) fn existing(output: &Path) -> Result<Option<Frame>> {
     }
 }
 
+/// Why a result is to be looked at that is kept although its render, or one of the frames `beside` that, has been
+/// written since, as far as the disk tells.
+pub(super) fn outdated<'a>(job: &Job, beside: impl IntoIterator<Item = &'a Path>) -> Option<&'static str> {
+    let written = |path: &Path| path.metadata().and_then(|file| file.modified()).ok();
+    let result = written(&job.output)?;
+    let is_newer = |path: &Path| written(path).is_some_and(|render| render > result);
+    if is_newer(&job.input) {
+        return Some("is older than its render, and was kept; --overwrite denoises that again");
+    }
+    let why = "is older than a frame beside its render, and was kept; --overwrite makes it again";
+    beside.into_iter().any(is_newer).then_some(why)
+}
+
 /// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
 /// missing.
 ///

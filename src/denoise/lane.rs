@@ -114,7 +114,7 @@ impl Lane {
 
     /// Reads a job's file; none where its result exists already, or the file is not whole yet.
     fn read_new(&self, job: &Job) -> Option<Result<Frame>> {
-        if self.shared.take_up_existing(job, &self.ended) { None } else { self.shared.read(job) }
+        if self.shared.take_up_existing(job, [], &self.ended) { None } else { self.shared.read(job) }
     }
 
     /// Decodes the passes that are needed from a file that was read.

@@ -339,7 +339,10 @@ impl Stored {
 
 #[cfg(test)]
 mod tests {
-    use std::{collections::BTreeSet, path::Path};
+    use std::{
+        collections::BTreeSet,
+        path::{Path, PathBuf},
+    };
 
     use super::*;
     use crate::frame::{Frame, NewChannel, SampleKind};
@@ -420,15 +423,32 @@ mod tests {
         }
     }
 
-    /// [`room`], with a copy of its noisy frame in `folder` that has another layer; each channel is `values`.
-    fn room_with(folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> Pair {
-        let mut pair = room();
-        let mut frame = Frame::read(&pair.noisy).unwrap();
+    /// A copy of a frame in `folder` that has another layer; each of its channels is `values`.
+    fn with_layer(file: &Path, folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> PathBuf {
+        let mut frame = Frame::read(file).unwrap();
         let channels = axes.map(|component| NewChannel { component, kind: SampleKind::Float, values });
         frame.set_layer(0, &format!("ViewLayer.{layer}"), None, &channels).unwrap();
-        pair.noisy = folder.join("noisy.exr");
-        frame.write(&pair.noisy).unwrap();
-        pair
+        let copy = folder.join(file.file_name().unwrap());
+        frame.write(&copy).unwrap();
+        copy
+    }
+
+    /// [`room`], with such a copy of its noisy frame.
+    fn room_with(folder: &Path, layer: &str, axes: [&str; 3], values: &[f32]) -> Pair {
+        let pair = room();
+        Pair { noisy: with_layer(&pair.noisy, folder, layer, axes, values), ..pair }
+    }
+
+    /// [`room`], with such a copy of its reference.
+    fn reference_with(folder: &Path, layer: &str, values: &[f32]) -> Pair {
+        let pair = room();
+        Pair { reference: with_layer(&pair.reference, folder, layer, ["R", "G", "B"], values), ..pair }
+    }
+
+    /// A dataset of one pair that is trained on Combined.
+    fn load(pair: Pair, raw_references: bool, least: usize) -> Result<Dataset> {
+        let passes = (&[Pass::Combined][..], &[][..]);
+        Dataset::load(&[pair], passes, &[Pass::Combined], raw_references, least, &AtomicBool::new(false))
     }
 
     /// The only frame of a dataset of one pair, with one pass and Combined as its target.
@@ -465,19 +485,8 @@ mod tests {
     fn single_bad_values_of_references_are_told_and_holes_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let load = |bad: usize| {
-            let mut pair = room();
-            let mut frame = Frame::read(&pair.reference).unwrap();
             let values: Vec<f32> = (0..128 * 128).map(|i| if i < bad { f32::NAN } else { 0.5 }).collect();
-            let channels = ["R", "G", "B"].map(|component| NewChannel {
-                component,
-                kind: SampleKind::Float,
-                values: &values,
-            });
-            frame.set_layer(0, "ViewLayer.Combined", None, &channels).unwrap();
-            pair.reference = folder.path().join("room_ref.exr");
-            frame.write(&pair.reference).unwrap();
-            let none = AtomicBool::new(false);
-            Dataset::load(&[pair], (&[Pass::Combined], &[]), &[Pass::Combined], false, 1, &none)
+            load(reference_with(folder.path(), "Combined", &values), false, 1)
         };
         let told: Vec<String> = load(2).unwrap().warnings().cloned().collect();
         assert!(told[0].contains("room_ref.exr: 6 of the values to learn are NaN"), "{told:?}");
@@ -512,28 +521,10 @@ mod tests {
     #[test]
     fn references_before_they_were_denoised_are_kept_where_asked_for() {
         let folder = tempfile::tempdir().unwrap();
-        let mut pair = room();
-        let mut frame = Frame::read(&pair.reference).unwrap();
         let values = vec![0.75; 128 * 128];
-        let channels = ["R", "G", "B"].map(|component| NewChannel {
-            component,
-            kind: SampleKind::Float,
-            values: &values,
-        });
-        frame.set_layer(0, "ViewLayer.Noisy Image", None, &channels).unwrap();
-        pair.reference = folder.path().join("room_ref.exr");
-        frame.write(&pair.reference).unwrap();
+        let pair = reference_with(folder.path(), "Noisy Image", &values);
         for raw in [true, false] {
-            let wanted = (&[Pass::Combined][..], &[][..]);
-            let data = Dataset::load(
-                std::slice::from_ref(&pair),
-                wanted,
-                &[Pass::Combined],
-                raw,
-                1,
-                &AtomicBool::new(false),
-            );
-            let data = data.unwrap();
+            let data = load(pair.clone(), raw, 1).unwrap();
             assert_eq!(data.has_raw_references(), raw);
             let kept = data.frame(0).1.raw_reference.map(|planes| planes.channel(1).to_vec());
             assert_eq!(kept, raw.then(|| values.clone()));
@@ -542,19 +533,8 @@ mod tests {
 
     #[test]
     fn frames_that_hold_no_crop_at_all_are_named() {
-        let pair = room();
-        let load = |least| {
-            Dataset::load(
-                std::slice::from_ref(&pair),
-                (&[Pass::Combined], &[]),
-                &[Pass::Combined],
-                false,
-                least,
-                &AtomicBool::new(false),
-            )
-        };
-        assert_eq!(load(128).map(|data| data.len()).ok(), Some(1));
-        let error = load(144).err().expect("128x128 pixels hold none").to_string();
+        assert_eq!(load(room(), false, 128).map(|data| data.len()).ok(), Some(1));
+        let error = load(room(), false, 144).err().expect("128x128 pixels hold none").to_string();
         assert!(error.contains("s0000_room_0004spp.exr") && error.contains("144x144"), "{error}");
     }
 }

@@ -3,6 +3,7 @@
 use std::{
     fs,
     path::{Path, PathBuf},
+    time::{Duration, SystemTime},
 };
 
 use exr::prelude::*;
@@ -149,4 +150,10 @@ pub fn with_attributes(path: &Path, added: &[(&str, &str, &[u8])]) {
     }
     bytes.splice(8..8, written);
     fs::write(path, bytes).unwrap();
+}
+
+/// Has a file look as if written again after everything else.
+pub fn touch_later(path: &Path) {
+    let file = fs::File::options().append(true).open(path).unwrap();
+    file.set_modified(SystemTime::now() + Duration::from_secs(60)).unwrap();
 }

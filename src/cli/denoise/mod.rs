@@ -224,17 +224,16 @@ pub fn run(args: Args) -> Result<ExitCode> {
         (_, true) => Style::Quiet,
         _ => Style::Plain,
     };
-    let reach = options.temporal.unwrap_or(0);
     let (mut progress, batch) = match work {
         Work::List { jobs, unusable } => {
-            let mut progress = Progress::new(Some(jobs.len() + unusable.len()), style, reach);
+            let mut progress = Progress::new(Some(jobs.len() + unusable.len()), style);
             for (input, error) in unusable {
                 progress.report(&Job { input, output: PathBuf::new() }, &Outcome::Failed(error));
             }
             (progress, Batch::new(jobs, model.into(), options))
         }
         Work::Watch(watch, idle) => {
-            let progress = Progress::new(None, style, reach);
+            let progress = Progress::new(None, style);
             progress.say_watching(idle);
             (progress, Batch::watching(watch, model.into(), options)?)
         }
@@ -270,7 +269,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
 fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome, view_layer: Option<&str>) {
     let (errors, samples): (Vec<f64>, _) = match outcome {
         Outcome::Done(report) => (report.expected_error.into_iter().collect(), report.samples),
-        Outcome::Skipped => match noted(&job.output, view_layer) {
+        Outcome::Skipped(_) => match noted(&job.output, view_layer) {
             Ok(noted) => noted,
             Err(_) => return,
         },

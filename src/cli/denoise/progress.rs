@@ -1,17 +1,14 @@
 //! What the user sees of a batch: a bar on a terminal, plain lines otherwise, or JSON lines.
 //! Results go to stdout; notes and failures to stderr, each naming its file.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::{
     cli::lines::{print_line, warn_line},
-    denoise::{self, Job, Outcome},
+    denoise::{Job, Outcome},
 };
 
 /// What is printed of files that did not fail.
@@ -32,8 +29,6 @@ pub struct Progress {
     start: Instant,
     /// Files there are; not known while they are coming in.
     total: Option<usize>,
-    /// How many frames on either side a result is made of as well.
-    reach: usize,
     done: usize,
     skipped: usize,
     failed: usize,
@@ -75,9 +70,8 @@ struct Details<'a> {
 }
 
 impl Progress {
-    /// For a batch of `total` files, or of those that come in, each denoised with `reach` frames on either side. The
-    /// bar shows on a terminal alone.
-    pub fn new(total: Option<usize>, style: Style, reach: usize) -> Self {
+    /// For a batch of `total` files, or of those that come in. The bar shows on a terminal alone.
+    pub fn new(total: Option<usize>, style: Style) -> Self {
         let target = match style {
             Style::Quiet => ProgressDrawTarget::hidden(),
             _ => ProgressDrawTarget::stderr(),
@@ -92,7 +86,7 @@ impl Progress {
             bar.set_message("waiting for renders");
             bar.enable_steady_tick(Duration::from_millis(250));
         }
-        Self { bar, style, start: Instant::now(), total, reach, done: 0, skipped: 0, failed: 0 }
+        Self { bar, style, start: Instant::now(), total, done: 0, skipped: 0, failed: 0 }
     }
 
     /// Says that files are waited for, and what ends that.
@@ -110,7 +104,7 @@ impl Progress {
     pub fn report(&mut self, job: &Job, outcome: &Outcome) {
         match outcome {
             Outcome::Done(_) => self.done += 1,
-            Outcome::Skipped => self.skipped += 1,
+            Outcome::Skipped(_) => self.skipped += 1,
             Outcome::Failed(_) => self.failed += 1,
         }
         let count = self.done + self.skipped + self.failed;
@@ -126,11 +120,10 @@ impl Progress {
             None => format!("[{count}] "),
         };
         let style = self.style;
-        let note = matches!(outcome, Outcome::Skipped).then(|| outdated(job, self.reach)).flatten();
         // Above the bar, where there is one.
         self.bar.suspend(|| match style {
-            Style::Json => print_line(&json_line(job, outcome, note)),
-            Style::Plain => print_plain(job, outcome, note, (&place, &pace)),
+            Style::Json => print_line(&json_line(job, outcome)),
+            Style::Plain => print_plain(job, outcome, &place, &pace),
             Style::Quiet => {}
         });
         if let Outcome::Failed(error) = outcome {
@@ -181,7 +174,7 @@ impl Progress {
     }
 }
 
-fn print_plain(job: &Job, outcome: &Outcome, note: Option<&str>, (place, pace): (&str, &str)) {
+fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
     match outcome {
         Outcome::Done(report) => {
             print_line(&format!(
@@ -203,7 +196,7 @@ fn print_plain(job: &Job, outcome: &Outcome, note: Option<&str>, (place, pace): 
                 warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
-        Outcome::Skipped => {
+        Outcome::Skipped(note) => {
             print_line(&format!("{place}{}  is there already", job.output.display()));
             if let Some(note) = note {
                 warn_line(&format!("demc: note: {}: {note}", job.output.display()));
@@ -213,24 +206,10 @@ fn print_plain(job: &Job, outcome: &Outcome, note: Option<&str>, (place, pace): 
     }
 }
 
-/// What is to be said of a result that is kept although its render, or one of the `reach` frames on either side, has been
-/// written since, as far as the disk tells.
-fn outdated(job: &Job, reach: usize) -> Option<&'static str> {
-    let written = |path: &Path| path.metadata().and_then(|file| file.modified()).ok();
-    let result = written(&job.output)?;
-    let is_newer = |path: &Path| written(path).is_some_and(|render| render > result);
-    if is_newer(&job.input) {
-        return Some("is older than its render, and was kept; --overwrite denoises that again");
-    }
-    let beside = denoise::neighbours(&job.input, reach);
-    let why = "is older than a frame beside its render, and was kept; --overwrite makes it again";
-    beside.iter().any(|(_, path)| is_newer(path)).then_some(why)
-}
-
-fn json_line(job: &Job, outcome: &Outcome, note: Option<&str>) -> String {
+fn json_line(job: &Job, outcome: &Outcome) -> String {
     let (status, error, report, notes) = match outcome {
         Outcome::Done(report) => ("done", None, Some(report), Some(report.notes.clone())),
-        Outcome::Skipped => ("skipped", None, None, Some(note.map(Into::into).into_iter().collect())),
+        Outcome::Skipped(note) => ("skipped", None, None, Some(note.map(Into::into).into_iter().collect())),
         Outcome::Failed(error) => ("failed", Some(error.to_string()), None, None),
     };
     let line = Line {
