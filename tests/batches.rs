@@ -172,6 +172,50 @@ fn results_older_than_their_renders_are_told_and_kept() {
 }
 
 #[test]
+fn results_that_were_made_otherwise_are_told_and_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    SHOT.write(&folder.path().join("a.exr"), 1);
+    fs::create_dir(folder.path().join("weights")).unwrap();
+    let weights = concat!(env!("CARGO_MANIFEST_DIR"), "/src/models/weights/demc-s.safetensors");
+    fs::copy(weights, folder.path().join("weights/mine.safetensors")).unwrap();
+    let run = |arguments: &str| {
+        let mut command = demc();
+        command.current_dir(folder.path()).arg("denoise").args(arguments.split_whitespace());
+        command.assert().success()
+    };
+    let is_made = || contains("was made with");
+    let first = "a.exr --out out --model weights/mine.safetensors:f32 --alpha keep";
+    run(first).stderr(is_made().not());
+    run(first).stdout(contains("is there already")).stderr(is_made().not());
+    let told = |made: &str, now: &str| {
+        let why = format!("was made with {made}, and was kept; --overwrite makes it with {now}");
+        contains(format!("demc: note: out{}a.exr: {why}", std::path::MAIN_SEPARATOR))
+    };
+    let made = "--model mine.safetensors:f32 --alpha keep";
+    run("a.exr --out out --model demc-s").stderr(told(made, "--model demc-s"));
+    run("a.exr --out out --model weights/mine.safetensors:f32 --wrap x")
+        .stderr(told(made, "--model mine.safetensors:f32 --wrap x"));
+    run("a.exr --out out --model weights/mine.safetensors:f32 --alpha keep --map albedo=Colour")
+        .stderr(told(made, &format!("{made} --map 'Denoising Albedo=Colour'")));
+    // Each layer was made in its own way.
+    run("out --out more --layer Second --model demc-s");
+    run("out --out more --layer Second --model demc-s").stderr(is_made().not());
+    run(&first.replace("a.exr --out out", "out --out more")).stderr(is_made().not());
+    run("out --out more --layer Second").stderr(contains("made with --model demc-s, and was kept"));
+    demc()
+        .current_dir(folder.path())
+        .args(["inspect", "more/a.exr"])
+        .assert()
+        .success()
+        .stdout(contains(format!("'ViewLayer.Denoised' was made with {made}\n")))
+        .stdout(contains("'ViewLayer.Second' was made with --model demc-s\n"));
+    // What is made anew is made as it was asked for.
+    run("a.exr --out out --model demc-s --overwrite");
+    run("a.exr --out out --model demc-s").stderr(is_made().not());
+    run(first).stderr(told("--model demc-s", made));
+}
+
+#[test]
 fn more_frames_at_once_than_threads_are_told_of() {
     let folder = renders();
     denoise(folder.path(), "renders --recursive --out clean --jobs 8 --threads 2")

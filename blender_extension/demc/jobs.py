@@ -84,7 +84,7 @@ class Job:
         self.options, self.layer, self.scene = options, picture, scene
         self.state = WAITING
         self.results = []  # the objects of demc's JSON for files that are done, or were there
-        self.skipped = self.outdated = 0  # results that were there, and how many of them are older than the render
+        self.skipped = self.outdated = 0  # results that were there, and how many of them are not as they would be now
         self.errors, self.notes = [], []
         self.picture = None
         self.scratch = []  # files and folders that are of no use when the job has ended
@@ -180,8 +180,8 @@ class Job:
         parts = [f"{count} {'frame' if count == 1 else 'frames'} denoised in {self.seconds:.1f} s"] if count else []
         if self.skipped:
             were = "result was" if self.skipped == 1 else "results were"
-            older = f", {self.outdated} older than the render" if self.outdated else ""
-            parts.append(f"{self.skipped} {were} there already{older} (Overwrite makes them again)")
+            other = f", {self.outdated} of an older render or other settings" if self.outdated else ""
+            parts.append(f"{self.skipped} {were} there already{other} (Overwrite makes them again)")
         if self.errors:
             more = f", and {len(self.errors) - 1} more failed" if len(self.errors) > 1 else ""
             parts.append(f"failed: {self.errors[0]}{more}")

@@ -3,27 +3,26 @@
 
 methods="demc demc-nofusion semc kpcn lbf"
 
-# Sets what was found best for a method in short trials (README.md), and `rate`, its steps in 100 seconds.
+# Sets what was found best for a method in short trials (README.md), and `rate`, its steps in 100 seconds, at widths for
+# hours of training; `semc` gets those at which it is as large. demc-paper is `demc` at the widths of the paper.
 recipe() {
-    tint=0.25 decay=0.1 leak=0
+    model=$1 optimizer=muon widths=32,64,64,96,96 loss=relmse lr=5e-3 decay=0.5 leak=0.01 patch=64 batch=8 tint=0.25
     case $1 in
-        demc) rate=900 loss=relmse lr=5e-3 decay=0.2 leak=0.01 patch=64 batch=8 ;;
-        demc-nofusion) rate=1050 loss=relmse lr=5e-3 decay=0.5 leak=0.01 patch=64 batch=8 ;;
-        semc) rate=720 loss=relmse lr=5e-3 decay=0.2 leak=0.01 patch=64 batch=8 ;;
-        kpcn) rate=250 loss=smape lr=2e-3 patch=32 batch=8 ;;
-        lbf) rate=350 loss=both lr=3e-2 patch=128 batch=1 ;;
+        demc) rate=345 ;;
+        demc-nofusion) rate=400 ;;
+        semc) rate=290 ;;
+        demc-paper) model=demc optimizer=adam widths=64,128,256,512,512 rate=69 lr=3e-4 batch=4 ;;
+        kpcn) widths=64 rate=111 loss=smape lr=2e-3 decay=0.1 leak=0 patch=32 ;;
+        lbf) widths=10 rate=375 loss=both lr=3e-2 decay=0.1 leak=0 patch=128 batch=1 ;;
         *) echo "no recipe for $1" >&2; exit 2 ;;
     esac
 }
 
-# Prints the options of `demc train` for a method, whose recipe is set, and a number of steps.
+# Prints the options of `demc train` for the method whose recipe is set, and a number of steps.
 options() {
-    awk -v name="$1" -v steps="$2" -v tint="$tint" -v loss="$loss" -v lr="$lr" -v decay="$decay" \
-        -v leak="$leak" -v patch="$patch" -v batch="$batch" \
-        'BEGIN {
-            average = steps > 20 ? 1 - 20 / steps : 0
-            printf "--model %s --steps %d --average %g --lr %g:%g ", name, steps, average, lr, lr / 100
-            printf "--loss %s --patch %d --batch %d --tint %g ", loss, patch, batch, tint
-            printf "--optimizer muon --weight-decay %g --leak %g --seed 1\n", decay, leak
-        }'
+    # Weights are averaged over the last 20th of the steps.
+    average=$(awk "BEGIN { print ($1 > 20 ? 1 - 20 / $1 : 0) }")
+    last=$(awk "BEGIN { print $lr / 100 }")
+    echo "--model $model --widths $widths --steps $1 --average $average --lr $lr:$last --loss $loss --patch $patch" \
+        "--batch $batch --tint $tint --optimizer $optimizer --weight-decay $decay --leak $leak --seed 1"
 }

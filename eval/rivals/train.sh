@@ -1,14 +1,14 @@
 #!/bin/sh
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
-#   eval/rivals/train.sh DATA OUT SECONDS [NAME...]
-# DATA is a folder or a manifest, or several of them with commas between. Learning rates fall over as many
+#   eval/rivals/train.sh DATA HELD_OUT OUT SECONDS [NAME...]
+# DATA and HELD_OUT are folders or manifests of pairs, to train on and to validate on. Learning rates fall over as many
 # steps as fit one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
 # another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
 # the budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where
 # it was stopped: OUT/NAME.seconds holds the time used so far.
 set -eu
-data=$1 out=$2 seconds=$3
-shift 3
+data=$1 held_out=$2 out=$3 seconds=$4
+shift 4
 demc=${DEMC:-demc}
 # shellcheck source=eval/rivals/recipe.sh
 . "$(dirname "$0")/recipe.sh"
@@ -17,20 +17,26 @@ demc=${DEMC:-demc}
 mkdir -p "$out"
 failed=0
 
+# Becomes `demc train` for a method, with the options that follow its name.
+run() {
+    into=$out/$1
+    shift
+    exec "$demc" train --out "$into" --threads 1 "$@" 2>>"$into.log"
+}
+
 for name in "$@"; do
     recipe "$name"
     steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
+    spent=0
     if [ -e "$out/$name/checkpoint.safetensors" ]; then
-        spent=$(cat "$out/$name.seconds") set_up="--resume"
+        spent=$(cat "$out/$name.seconds")
         if [ "$spent" -ge "$seconds" ]; then continue; fi
+        run "$name" --resume &
     else
-        spent=0
-        # shellcheck disable=SC2046 # each set of pairs is two words
-        set_up="$(printf -- '--data %s ' $(echo "$data" | tr , ' ')) $(options "$name" "$steps") \
-            --every $((steps / 15 > 0 ? steps / 15 : 1))"
+        every=$((steps / 15 > 0 ? steps / 15 : 1))
+        # shellcheck disable=SC2046 # the options are words
+        run "$name" --data "$data" --val "$held_out" --every "$every" $(options "$steps") &
     fi
-    # shellcheck disable=SC2086 # the options are words
-    "$demc" train --out "$out/$name" $set_up --threads 1 2>>"$out/$name.log" &
     pid=$!
     # A shell's background jobs do not hear Ctrl-C.
     trap 'kill -TERM $pid 2>/dev/null; wait $pid; exit 130' INT TERM HUP

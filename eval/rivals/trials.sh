@@ -38,7 +38,7 @@ for name in "$@"; do
         run=$out/$name-$trial
         rm -rf "$run"
         # shellcheck disable=SC2046 # the options are words
-        "$demc" train --data "$data" --val "$held_out" --out "$run" --every "$steps" $(options "$name" "$steps") \
+        "$demc" train --data "$data" --val "$held_out" --out "$run" --every "$steps" $(options "$steps") \
             --threads 1 2>"$run.log" &
         pid=$!
         # A shell's background jobs do not hear Ctrl-C.

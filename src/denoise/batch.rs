@@ -26,8 +26,8 @@ use crate::{Error, Result, error::attempt, frame::Frame, frame_number::frame_num
 pub enum Outcome {
     /// Written.
     Done(Report),
-    /// The result was there already; why it may not be what is wanted, if there is a reason.
-    Skipped(Option<&'static str>),
+    /// The result was there already; why it may not be what is wanted, if there are reasons.
+    Skipped(Vec<String>),
     /// Nothing was written.
     Failed(Error),
 }
@@ -335,9 +335,15 @@ impl Shared {
             existing => existing,
         };
         let take_up = |job: &Job| {
-            let take_up = || headers?.map_or(Ok(()), |headers| job::take_up(&headers, &self.options));
-            let outdated = |()| Outcome::Skipped(job::outdated(job, beside));
-            attempt(&job.output, take_up).map_or_else(Outcome::Failed, outdated)
+            let take_up = || {
+                let made = headers?.map(|headers| job::take_up(&headers, &*self.model, &self.options));
+                made.transpose().map(Option::flatten)
+            };
+            let skipped = |made: Option<String>| {
+                let outdated = job::outdated(job, beside).map(Into::into);
+                Outcome::Skipped(outdated.into_iter().chain(made).collect())
+            };
+            attempt(&job.output, take_up).map_or_else(Outcome::Failed, skipped)
         };
         let _ = self.write(job.clone(), take_up, ended);
         true

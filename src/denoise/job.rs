@@ -85,6 +85,31 @@ impl Default for Options {
     }
 }
 
+impl Options {
+    /// How a result is made: the options that decide what is in it and that nothing else in the file tells, as they
+    /// are said on the command line. Files go by their names, wherever they lie.
+    fn method(&self, model: &dyn Denoiser) -> String {
+        let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let mut said = vec![format!("--model {}", name(Path::new(model.name())))];
+        match self.alpha {
+            Alpha::Auto => {}
+            Alpha::Denoise => said.push("--alpha denoise".into()),
+            Alpha::Keep => said.push("--alpha keep".into()),
+        }
+        match self.wrap {
+            Wrap::Auto => {}
+            Wrap::X => said.push("--wrap x".into()),
+            Wrap::None => said.push("--wrap none".into()),
+        }
+        let Sources { mapping, albedo, normal } = &self.sources;
+        said.extend(mapping.iter().map(|(pass, name)| format!("--map '{pass}={name}'")));
+        for (option, pattern) in [("--albedo", albedo), ("--normal", normal)] {
+            said.extend(pattern.as_ref().map(|pattern| format!("{option} '{}'", name(pattern))));
+        }
+        said.join(" ")
+    }
+}
+
 /// Whether a name can be a layer's: it must make channel names that read back as this layer and no other.
 ///
 /// # Errors
@@ -123,6 +148,8 @@ pub struct Report {
     pub was_denoised: bool,
     /// The expected RelMSE of the result, as the mean over its views, where the model can tell.
     pub expected_error: Option<f64>,
+    /// How it was made, in words of the command line, beyond what the file shows otherwise.
+    pub method: String,
     /// Seconds in the model alone.
     pub seconds: f64,
     /// How many NaN and infinite input values were repaired, by pass.
@@ -163,6 +190,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         view_layer: chosen.name.clone(),
         passes: chosen.passes.keys().map(Pass::to_string).collect(),
         light_groups: chosen.light_groups.keys().cloned().collect(),
+        method: options.method(model),
         ..Report::default()
     };
     if options.view_layer.is_none() {
@@ -517,6 +545,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
         frame.set_lacked(&result, &report.lacked);
         frame.set_reach(&result, options.temporal.unwrap_or(0));
+        frame.set_method(&result, &report.method);
         let name = layer_name(&layer.name, &error_layer(options));
         // Such a layer of an earlier result would not be true of this one, so it is replaced, by numbers that are
         // none where nothing is known.
@@ -639,11 +668,11 @@ pub(super) fn outdated<'a>(job: &Job, beside: impl IntoIterator<Item = &'a Path>
 }
 
 /// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
-/// missing.
+/// missing. Returns how it was made, if that is known and not how it would be made now.
 ///
 /// # Errors
 /// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
-pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
+pub(super) fn take_up(headers: &Frame, model: &dyn Denoiser, options: &Options) -> Result<Option<String>> {
     let output = headers.path();
     let layers = passes::layers_by(headers, &options.sources.mapping);
     let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
@@ -682,6 +711,18 @@ pub(super) fn take_up(headers: &Frame, options: &Options) -> Result<()> {
     if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
         return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
     }
+    write_missing_previews(output, &views, options)?;
+    let method = options.method(model);
+    let is_other = |(layer, made): &(String, String)| *layer == full_name && *made != method;
+    Ok(headers
+        .methods()
+        .into_iter()
+        .find(is_other)
+        .map(|(_, made)| format!("was made with {made}, and was kept; --overwrite makes it with {method}")))
+}
+
+/// Writes the previews of an existing result, which has these `views`, that are wanted and missing.
+fn write_missing_previews(output: &Path, views: &[Layer], options: &Options) -> Result<()> {
     let Some(write) = options.preview else { return Ok(()) };
     let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));
     let missing: Vec<_> = previews.filter(|(_, path)| !path.exists()).collect();

@@ -45,9 +45,14 @@ const EXPECTED_ERROR: &str = "demcExpectedError";
 const LACKED: &str = "demcLacked";
 /// Attribute that tells how many frames before and after a result was made with.
 const REACH: &str = "demcNeighbours";
+/// Attribute that tells how layers were made: a line for each, its name and what [`Frame::set_method`] was given.
+const METHOD: &str = "demcMethod";
+/// What stands between the two.
+const BY: &str = ": ";
 /// Attributes that another part of the same picture does not take over; nor does it take those of
 /// cryptomattes.
-const OWN: [&str; 8] = [MARK, EXPECTED_ERROR, LACKED, REACH, "name", "preview", "chunkCount", "idManifest"];
+const OWN: [&str; 9] =
+    [MARK, METHOD, EXPECTED_ERROR, LACKED, REACH, "name", "preview", "chunkCount", "idManifest"];
 /// The name that a part without one gets in a file of several parts, where each must have a name.
 const BEAUTY: &str = "rgba";
 /// How the names of a cryptomatte's attributes begin.
@@ -92,6 +97,13 @@ fn expected_errors(attributes: &Attributes) -> Vec<(String, f64)> {
         let (error, name) = line.split_once(' ')?;
         Some((name.to_owned(), error.parse().ok()?))
     };
+    text.lines().filter_map(read).collect()
+}
+
+/// What [`Frame::set_method`] noted in a part.
+fn methods(attributes: &Attributes) -> Vec<(String, String)> {
+    let text = attributes.text(METHOD).unwrap_or_default();
+    let read = |line: &str| line.split_once(BY).map(|(name, method)| (name.into(), method.into()));
     text.lines().filter_map(read).collect()
 }
 
@@ -168,6 +180,24 @@ impl Frame {
     /// The view layers whose results note an expected RelMSE, each with that error.
     pub fn expected_errors(&self) -> Vec<(String, f64)> {
         self.stored.iter().flat_map(|stored| expected_errors(&stored.attributes)).collect()
+    }
+
+    /// Notes how the layer `name` was made, which demc made: a text of one line.
+    ///
+    /// # Panics
+    /// If demc made no such layer.
+    pub fn set_method(&mut self, name: &str, method: &str) {
+        let attributes = self.attributes_beside(name);
+        let mut noted = methods(attributes);
+        noted.retain(|(layer, _)| layer != name);
+        noted.push((name.into(), method.replace(UNSTORABLE, " ")));
+        let lines: Vec<String> = noted.iter().map(|(name, method)| format!("{name}{BY}{method}")).collect();
+        attributes.set_text(METHOD, &lines.join("\n"));
+    }
+
+    /// The layers that demc made, each with how it did so, where that is noted.
+    pub fn methods(&self) -> Vec<(String, String)> {
+        self.stored.iter().flat_map(|stored| methods(&stored.attributes)).collect()
     }
 
     /// Notes the frames by number that the layer `name`, which demc made, was made without though they belong to its

@@ -16,7 +16,7 @@ use crate::{
     features::{PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
     filters::{
         coverage,
-        shrinkage::{Render, Shrinkage, take_back},
+        shrinkage::{Empty, Render, Shrinkage, take_back},
     },
     nn::Precision,
     passes::{Pass, PassSet},
@@ -233,7 +233,11 @@ impl Learned {
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
-        let render = Render { radiance, albedo, exposure, samples };
+        let is_alpha = |along: &&Companion| along.kind == Kind::Share && along.planes.channels == 1;
+        let denoised_alpha = companions.iter().find(is_alpha).map(|along| &along.planes);
+        let alpha = denoised_alpha.or(passes.get(Pass::Alpha));
+        let empty = alpha.and_then(|alpha| Empty::of(radiance, alpha));
+        let render = Render { radiance, albedo, exposure, samples, empty };
         let size = (passes.width, passes.height);
         // Of such a frame, as a clear sky or a black frame, all that a network made would be taken back.
         let shrinkage = Shrinkage::of(&render);

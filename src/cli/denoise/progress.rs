@@ -196,9 +196,9 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
                 warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
-        Outcome::Skipped(note) => {
+        Outcome::Skipped(notes) => {
             print_line(&format!("{place}{}  is there already", job.output.display()));
-            if let Some(note) = note {
+            for note in notes {
                 warn_line(&format!("demc: note: {}: {note}", job.output.display()));
             }
         }
@@ -209,7 +209,7 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
 fn json_line(job: &Job, outcome: &Outcome) -> String {
     let (status, error, report, notes) = match outcome {
         Outcome::Done(report) => ("done", None, Some(report), Some(report.notes.clone())),
-        Outcome::Skipped(note) => ("skipped", None, None, Some(note.map(Into::into).into_iter().collect())),
+        Outcome::Skipped(notes) => ("skipped", None, None, Some(notes.clone())),
         Outcome::Failed(error) => ("failed", Some(error.to_string()), None, None),
     };
     let line = Line {

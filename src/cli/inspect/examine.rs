@@ -26,11 +26,20 @@ pub struct FileReport {
     pub layers: Vec<LayerReport>,
     /// The expected RelMSE of the results that it holds, where demc noted it, by view layer.
     pub expected_errors: Vec<ExpectedError>,
+    /// The layers that demc made, each with how it did so.
+    pub results: Vec<Made>,
     /// What is wrong with the file, or with the shot that it belongs to.
     pub findings: Vec<Finding>,
     /// The trace of the first view layer with a beauty, for comparison with the frame that follows.
     #[serde(skip)]
     pub trace: Option<Trace>,
+}
+
+/// A layer that demc made, and how, in words of the command line.
+#[derive(Serialize)]
+pub struct Made {
+    pub layer: String,
+    pub method: String,
 }
 
 #[derive(Serialize)]
@@ -145,6 +154,7 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
             .into_iter()
             .map(|(view_layer, relmse)| ExpectedError { view_layer, relmse })
             .collect(),
+        results: frame.methods().into_iter().map(|(layer, method)| Made { layer, method }).collect(),
         findings: windows(&frame),
         trace: None,
     };

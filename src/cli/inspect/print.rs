@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::examine::{ExpectedError, FileReport, LayerReport, ModelReport};
+use super::examine::{ExpectedError, FileReport, LayerReport, Made, ModelReport};
 use crate::lint::Finding;
 
 /// The whole report; the caller ends the last line.
@@ -37,6 +37,9 @@ fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
         report.layout,
         kinds.join(" and ")
     )?;
+    for Made { layer, method } in &report.results {
+        writeln!(out, "  '{layer}' was made with {method}")?;
+    }
     for ExpectedError { view_layer, relmse } in &report.expected_errors {
         writeln!(out, "  denoised '{view_layer}': expected RelMSE {relmse:.2e}")?;
     }

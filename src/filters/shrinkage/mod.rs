@@ -16,8 +16,9 @@
 //!
 //! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing,
 //! and is kept. Of few samples, though, antialiasing is noise like any other: at 4 samples, a pixel in the
-//! gap of a blind before a bright sky may show a quarter of the sky, or nothing.
+//! gap of a blind before a bright sky may show a quarter of the sky, or nothing. What is `empty` is kept as well.
 
+mod empty;
 mod expected;
 mod features;
 mod restraint;
@@ -26,6 +27,7 @@ mod sums;
 
 use rayon::prelude::*;
 
+pub use self::empty::Empty;
 use self::{
     restraint::OUTPUTS,
     seen::{Seen, is_firefly},
@@ -91,6 +93,8 @@ pub struct Render<'a> {
     pub exposure: f32,
     /// Samples of a pixel, where the file tells.
     pub samples: Option<u32>,
+    /// Where nothing was met, if alpha tells of such pixels: they stay as rendered.
+    pub empty: Option<Empty>,
 }
 
 impl Render<'_> {
@@ -251,8 +255,11 @@ fn mix(
         None => (0..height).map(|_| None).collect(),
     };
     red.zip(green).zip(blue).zip(shares).enumerate().for_each_init(
-        || vec![0.0; OUTPUTS * squares],
-        |line, (y, (((red, green), blue), mut shares))| {
+        || (vec![0.0; OUTPUTS * squares], vec![true; width]),
+        |(line, is_near), (y, (((red, green), blue), mut shares))| {
+            if let Some(empty) = &render.empty {
+                empty.row(y, is_near);
+            }
             let mut note = |x: usize, share: f32| shares.iter_mut().for_each(|row| row[x] = share);
             let (above, share) = between(y, square_rows);
             let of =
@@ -271,7 +278,7 @@ fn mix(
                 let noisy = radiance.map(|row| row[x].max(0.0));
                 let colours = [&mut red[x], &mut green[x], &mut blue[x]];
                 let is_seen = is_all_seen || (keeps > 0.0 && seen.is_at(x, y));
-                if is_seen && keeps == 1.0 {
+                if (is_seen && keeps == 1.0) || !is_near[x] {
                     colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
                     note(x, 1.0);
                     continue;
@@ -350,7 +357,7 @@ mod tests {
     /// What becomes of `denoised` beside `radiance`.
     fn shrunk(denoised: &Planes, radiance: &Planes, albedo: &Planes, samples: Option<u32>) -> Planes {
         let mut image = denoised.clone();
-        let render = Render { radiance, albedo, exposure: 0.6, samples };
+        let render = Render { radiance, albedo, exposure: 0.6, samples, empty: None };
         shrink(&mut image, &render, None);
         image
     }
@@ -471,6 +478,7 @@ mod tests {
                 albedo: &albedo,
                 exposure: 0.6 / film,
                 samples: Some(64),
+                empty: None,
             };
             assert!((film_exposure(&render) / film - 1.0).abs() < 0.003, "{film}");
             let mut exposed = times(&planes(picture));
@@ -480,7 +488,8 @@ mod tests {
             assert!(same == image.data.len(), "{film}: {same} of {}", image.data.len());
         }
         // A wall alone has no such light, whatever its noise.
-        let render = Render { radiance: &wall, albedo: &planes(|_, _, _| 0.5), exposure: 1.0, samples: None };
+        let albedo = &planes(|_, _, _| 0.5);
+        let render = Render { radiance: &wall, albedo, exposure: 1.0, samples: None, empty: None };
         assert_eq!(film_exposure(&render), 1.0);
     }
 
@@ -542,13 +551,46 @@ mod tests {
     }
 
     #[test]
+    fn where_nothing_was_met_all_stays_as_rendered() {
+        // A noisy wall to the left, nothing to the right, and a trace of light all over. The sky is no part of a
+        // transparent film, but of the albedo.
+        let (w, _) = SIZE;
+        let wall = noisy(0.3);
+        let radiance = planes(|c, x, y| if x < 40 { wall.channel(c)[y * w + x] } else { 0.0 });
+        let alpha = Planes::from_rows(1, SIZE, |_, _, row| row[..40].fill(1.0));
+        let mut image = planes(|c, x, y| picture(c, x, y) * if x < 40 { 1.0 } else { 1e-3 });
+        let before = image.clone();
+        let render = Render {
+            radiance: &radiance,
+            albedo: &planes(|_, x, _| if x < 40 { 0.5 } else { 2.0 }),
+            exposure: 0.6,
+            samples: Some(4),
+            empty: Empty::of(&radiance, &alpha),
+        };
+        let mut shares = Planes::new(1, SIZE.0, SIZE.1);
+        shrink(&mut image, &render, Some(&mut shares));
+        for (at, share) in shares.data.iter().enumerate() {
+            let values = |planes: &Planes| [0, 1, 2].map(|c| planes.channel(c)[at]);
+            match at % w {
+                ..38 => assert_eq!(values(&image), values(&before), "the wall is noise alone"),
+                38..43 => assert!(
+                    values(&image).iter().all(|v| *v > 0.0),
+                    "{}: what samples may have missed",
+                    at % w
+                ),
+                _ => assert!(values(&image) == [0.0; 3] && *share == 1.0, "{}", at % w),
+            }
+        }
+    }
+
+    #[test]
     fn tiny_frames_of_any_brightness_stay_finite() {
         for (w, h) in [(1, 1), (1, 9), (9, 1), (2, 3), (4, 4), (5, 17)] {
             for v in [0.0, 1e-30, 1.0, 65504.0] {
                 let of = |v: f32| Planes::from_vec(3, w, h, vec![v; 3 * w * h]);
                 let mut image = of(v);
-                let render =
-                    Render { radiance: &of(0.5 * v), albedo: &of(0.7), exposure: 1.0, samples: None };
+                let (radiance, albedo) = (&of(0.5 * v), &of(0.7));
+                let render = Render { radiance, albedo, exposure: 1.0, samples: None, empty: None };
                 shrink(&mut image, &render, None);
                 assert!(image.data.iter().all(|x| x.is_finite() && *x <= v && *x >= 0.5 * v), "{w}x{h}, {v}");
             }
