@@ -209,6 +209,9 @@ fn results_that_were_made_otherwise_are_told_and_kept() {
         .success()
         .stdout(contains(format!("'ViewLayer.Denoised' was made with {made}\n")))
         .stdout(contains("'ViewLayer.Second' was made with --model demc-s\n"));
+    // Names of layers may hold what stands between other things.
+    run("a.exr --out odd --layer Final:_v2 --model demc-s");
+    run("a.exr --out odd --layer Final:_v2").stderr(contains("made with --model demc-s, and was kept"));
     // What is made anew is made as it was asked for.
     run("a.exr --out out --model demc-s --overwrite");
     run("a.exr --out out --model demc-s").stderr(is_made().not());

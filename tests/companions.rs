@@ -271,6 +271,29 @@ fn alpha_of_many_samples_is_not_blurred() {
 }
 
 #[test]
+fn layers_of_others_are_not_taken_for_denoised_light() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = denoise("sky.exr", folder.path(), "--model demc-s --passes");
+    // Without demc's mark they are anybody's. The beauty's is called otherwise.
+    let mut bytes = std::fs::read(&path).unwrap();
+    for (from, to) in [("demc\0string", "memo\0string"), ("ViewLayer.Denoised", "ViewLayer.Somebody")] {
+        let is_at = |at: &usize| bytes[*at..].starts_with(from.as_bytes());
+        let places: Vec<usize> = (0..bytes.len()).filter(is_at).collect();
+        assert!(!places.is_empty());
+        places.iter().for_each(|at| bytes[*at..at + to.len()].copy_from_slice(to.as_bytes()));
+    }
+    let input = folder.path().join("theirs.exr");
+    std::fs::write(&input, bytes).unwrap();
+    let run = |arguments: &str| {
+        let mut command = common::demc();
+        command.arg("denoise").arg(&input).arg("--out").arg(folder.path().join("out"));
+        command.args(["--model", "demc-s"]).args(arguments.split_whitespace()).assert()
+    };
+    run("--passes").code(1).stderr(contains(".Denoised' without demc's mark"));
+    run("").success();
+}
+
+#[test]
 fn opaque_frames_keep_their_alpha_to_the_bit() {
     let out = tempfile::tempdir().unwrap();
     let done = passes::load(denoise("sky.exr", out.path(), "--model demc-s --replace"), None).unwrap();

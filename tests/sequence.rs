@@ -166,6 +166,51 @@ fn a_frame_that_was_made_without_another_is_made_again_when_that_is_there() {
 }
 
 #[test]
+fn a_result_that_wants_a_frame_beside_it_is_no_other_that_is_wanted() {
+    let dir = sequence(SHOT, 1..=4);
+    let last = fs::read(named(&dir, 4)).unwrap();
+    fs::remove_file(named(&dir, 4)).unwrap();
+    let out = dir.path().join("out");
+    let run = |arguments: &str| {
+        let frames = "--frames 1-3 --temporal 1".split_whitespace();
+        demc(&out).arg(dir.path()).args(frames).args(arguments.split_whitespace()).assert()
+    };
+    run("--layer A").success();
+    fs::write(named(&dir, 4), last).unwrap();
+    let all = || [1, 2, 3].map(|n| fs::read(result(&out, n)).unwrap());
+    let before = all();
+    // Frame 3 was made without frame 4, but as another layer and by another method.
+    run("--layer B").code(1).stderr(contains("exists without 'ViewLayer.B'")).stdout(contains("3 failed"));
+    run("--replace").code(1).stdout(contains("3 failed"));
+    let told = run("--layer A --wrap x").success().stdout(contains("0 denoised, 3 already there"));
+    told.stderr(contains("shot_0004spp.0003.exr: was made with --model noisy --temporal 1, and was kept"));
+    assert!(before == all());
+    run("--layer A").success().stdout(contains("1 denoised, 2 already there"));
+}
+
+#[test]
+fn what_a_result_was_made_with_is_noted_of_each_layer() {
+    let dir = sequence(SHOT, 1..=3);
+    let [first, second] = ["first", "second"].map(|name| dir.path().join(name));
+    let run = |out: &Path, input: &Path, arguments: &str| {
+        demc(out).arg(input).args(arguments.split_whitespace()).assert()
+    };
+    run(&first, dir.path(), "--layer A").success();
+    run(&second, &first, "--layer B --temporal 1").success();
+    let lacking = contains("exists without its neighbours (--temporal 1)");
+    run(&second, dir.path(), "--layer A --temporal 1").code(1).stderr(lacking.clone());
+    run(&second, dir.path(), "--layer B --temporal 1").success().stdout(contains("3 already there"));
+    // A frame by frame result takes nothing from what is known of the other.
+    let third = dir.path().join("third");
+    run(&third, &second, "--layer C").success();
+    run(&third, dir.path(), "--layer B --temporal 1").success().stdout(contains("3 already there"));
+    run(&third, dir.path(), "--layer C --temporal 1").code(1).stderr(lacking);
+    // Whoever leaves neighbours out wants them out.
+    let told = run(&third, dir.path(), "--layer B").success();
+    told.stderr(contains("was made with --model noisy --temporal 1, and was kept"));
+}
+
+#[test]
 fn a_result_depends_on_its_window_alone() {
     let dir = sequence(SHOT, 1..=7);
     let [first, second] = ["first", "second"].map(|name| dir.path().join(name));
@@ -314,6 +359,53 @@ fn nothing_comes_into_what_was_not_rendered() {
         let image = read_exr(result(&out, n));
         let got = values(&image, "ViewLayer.Denoised.G");
         assert!((0..got.len()).all(|i| (got[i] != 0.0) == is_inside(i, n)), "frame {n}");
+    }
+}
+
+#[test]
+fn where_a_transparent_film_is_empty_nothing_comes_from_neighbours_either() {
+    let dir = tempfile::tempdir().unwrap();
+    let is_covered = |i: usize| (16..30).contains(&(i % SIZE.0));
+    for n in 1..=3 {
+        let mut channels = SHOT.channels("ViewLayer", "", n);
+        for channel in &mut channels {
+            if let FlatSamples::F32(values) = &mut channel.sample_data {
+                values.iter_mut().enumerate().filter(|(i, _)| !is_covered(*i)).for_each(|(_, v)| *v = 0.0);
+            }
+        }
+        let alpha = (0..SIZE.0 * SIZE.1).map(|i| f32::from(u8::from(is_covered(i)))).collect();
+        channels.push(AnyChannel::new("ViewLayer.Combined.A", FlatSamples::F32(alpha)));
+        write_channels(&named(&dir, n), SIZE, channels, &[]);
+    }
+    let [with, alone] = ["with", "alone"].map(|name| dir.path().join(name));
+    let network = |out: &Path, input: &Path, arguments: &[&str]| {
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["denoise", "--model", "demc-s", "--out"]).args([out, input]).args(arguments);
+        command.assert().success();
+    };
+    network(&with, dir.path(), &["--temporal"]);
+    network(&alone, dir.path(), &[]);
+    for out in [&with, &alone] {
+        let image = read_exr(result(out, 2));
+        let green = values(&image, "ViewLayer.Denoised.G");
+        let is_far = |i: usize| !(13..33).contains(&(i % SIZE.0));
+        assert!((0..green.len()).all(|i| if is_covered(i) {
+            green[i] > 0.0
+        } else {
+            !is_far(i) || green[i] == 0.0
+        }));
+    }
+    assert!(denoised(&with, 2) != denoised(&alone, 2), "neighbours count");
+    // A still among them leaves its alpha as it is, too.
+    fs::copy(named(&dir, 2), dir.path().join("still.exr")).unwrap();
+    demc(&with)
+        .arg(dir.path().join("still.exr"))
+        .args(["--model", "demc-s", "--temporal"])
+        .assert()
+        .success();
+    for file in [with.join("still.exr"), result(&with, 2)] {
+        let image = read_exr(file);
+        assert_eq!(values(&image, "ViewLayer.Denoised.A"), values(&image, "ViewLayer.Combined.A"));
     }
 }
 

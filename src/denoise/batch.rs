@@ -5,7 +5,7 @@
 //! All threads report to the caller's thread, which alone talks to the user.
 
 use std::{
-    collections::{HashMap, VecDeque},
+    collections::{BTreeSet, HashMap, VecDeque},
     path::{Path, PathBuf},
     sync::{
         Arc, Mutex, MutexGuard, PoisonError, RwLock,
@@ -15,7 +15,8 @@ use std::{
 };
 
 use super::{
-    Job, Options, Report, job,
+    Job, Options, Report,
+    job::{self, Existing},
     lane::Lane,
     sequence::{self, Stretch},
     watch::{Next, Watch},
@@ -305,8 +306,8 @@ impl Shared {
     }
 
     /// Whether a frame that a result was made without can be used now.
-    fn can_be_completed(&self, job: &Job, result: &Frame) -> bool {
-        let (Some(reach), lacked) = (self.options.temporal, result.lacked()) else { return false };
+    fn can_be_completed(&self, job: &Job, lacked: &BTreeSet<i64>) -> bool {
+        let Some(reach) = self.options.temporal else { return false };
         let Some(number) = frame_number(&job.input).filter(|_| !lacked.is_empty()) else { return false };
         let near = sequence::neighbours(&job.input, reach).into_iter();
         let mut found = near.filter(|(offset, _)| lacked.contains(&(number + i64::from(*offset))));
@@ -329,15 +330,25 @@ impl Shared {
         if self.options.overwrite {
             return false;
         }
-        let headers = match job::existing(&job.output) {
+        let look = || {
+            let headers = job::existing(&job.output)?;
+            headers.map(|headers| Existing::of(&headers, &*self.model, &self.options)).transpose()
+        };
+        let existing = match attempt(&job.output, look) {
             Ok(None) => return false,
-            Ok(Some(result)) if self.can_be_completed(job, &result) => return false,
-            existing => existing,
+            Ok(Some(Existing { made_otherwise: None, lacked, .. }))
+                if self.can_be_completed(job, &lacked) =>
+            {
+                return false;
+            }
+            Ok(Some(existing)) => Ok(existing),
+            Err(error) => Err(error),
         };
         let take_up = |job: &Job| {
             let take_up = || {
-                let made = headers?.map(|headers| job::take_up(&headers, &*self.model, &self.options));
-                made.transpose().map(Option::flatten)
+                let existing = existing?;
+                existing.write_missing_previews(&job.output, &self.options)?;
+                Ok(existing.made_otherwise)
             };
             let skipped = |made: Option<String>| {
                 let outdated = job::outdated(job, beside).map(Into::into);

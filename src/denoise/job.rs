@@ -7,7 +7,7 @@ use std::{
 };
 
 use super::{
-    lights::{Along, Alpha, Source, denoised_lights, light_passes},
+    lights::{Along, Alpha, Source, denoised_lights, light_passes, passes_along},
     plan::are_same,
     window,
     wrap::{self, Wrap},
@@ -101,6 +101,7 @@ impl Options {
             Wrap::X => said.push("--wrap x".into()),
             Wrap::None => said.push("--wrap none".into()),
         }
+        said.extend(self.temporal.map(|reach| format!("--temporal {reach}")));
         let Sources { mapping, albedo, normal } = &self.sources;
         said.extend(mapping.iter().map(|(pass, name)| format!("--map '{pass}={name}'")));
         for (option, pattern) in [("--albedo", albedo), ("--normal", normal)] {
@@ -199,7 +200,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     if options.layer.is_none() {
         report.notes.extend(note_other_pictures(&layers, chosen));
     }
-    check_added(&frame, &chosen.name, options)?;
+    check_added(&frame, chosen, options)?;
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
@@ -273,11 +274,16 @@ fn refuse_stale(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
 }
 
 /// Refuses layers to add whose names are no layer's, or those of others.
-fn check_added(frame: &Frame, view_layer: &str, options: &Options) -> Result<()> {
+fn check_added(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
     check_name(options)?;
-    let added = [options.layer.clone(), options.confidence.then(|| error_layer(options))];
-    for added in added.into_iter().flatten() {
-        let name = layer_name(view_layer, &added);
+    let mut names = Vec::new();
+    if let Some(added) = &options.layer {
+        names.push(added_name(layer, COMBINED, added));
+        let along = if options.passes { passes_along(layer) } else { Vec::new() };
+        names.extend(along.into_iter().map(|at| added_name(layer, &at.name, added)));
+    }
+    names.extend(options.confidence.then(|| layer_name(&layer.name, &error_layer(options))));
+    for name in names {
         if frame.has_foreign_layer(&name) {
             let why = format!("holds a layer '{name}' without demc's mark; give --layer another name");
             return Err(Error::invalid(frame.path(), why));
@@ -518,7 +524,7 @@ pub fn store(denoised: Views<Denoised>, output: &Path, options: &Options) -> Res
 pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options) -> Result<(Frame, Report)> {
     let Views { mut frame, views, mut report } = denoised;
     for (layer, _) in &views {
-        check_added(&frame, &layer.name, options)?;
+        check_added(&frame, layer, options)?;
     }
     // A pattern that leads to no file is told where it is read.
     let mut guides = options.sources.guides(frame.path()).unwrap_or_default().into_iter();
@@ -595,7 +601,7 @@ fn put(
     let mut channels: Vec<(usize, &[f32])> =
         at.channels.iter().enumerate().map(|(c, &i)| (i, planes.channel(c))).collect();
     if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
-        && of_alpha.part == at.part
+        && (of_alpha.part, &of_alpha.name) == (at.part, &at.name)
     {
         channels.push((of_alpha.channels[0], alpha.channel(0)));
     }
@@ -667,74 +673,83 @@ pub(super) fn outdated<'a>(job: &Job, beside: impl IntoIterator<Item = &'a Path>
     beside.into_iter().any(is_newer).then_some(why)
 }
 
-/// Takes an existing result for the one that is wanted, and writes the previews of it that are wanted and
-/// missing. Returns how it was made, if that is known and not how it would be made now.
-///
-/// # Errors
-/// It is not the result that is wanted, since nothing is overwritten unasked; or a preview cannot be written.
-pub(super) fn take_up(headers: &Frame, model: &dyn Denoiser, options: &Options) -> Result<Option<String>> {
-    let output = headers.path();
-    let layers = passes::layers_by(headers, &options.sources.mapping);
-    let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
-    let chosen = &layer.name;
-    let name = options.layer.as_deref().unwrap_or(COMBINED);
-    let full_name = layer_name(chosen, name);
-    let views = match &options.layer {
-        Some(added) => passes::rgb_layers(headers, Some(chosen), added),
-        // The beauty, whatever its renderer calls it.
-        None => layers
-            .iter()
-            .filter(|l| l.name == *chosen && l.passes.contains_key(&Pass::Combined))
-            .cloned()
-            .collect(),
-    };
-    let lacks = |what: &str| {
-        let why = format!(
-            "exists without {what} made by demc; --overwrite denoises the frame again, or choose another --out"
-        );
-        Err(Error::invalid(output, why))
-    };
-    if views.is_empty() || !headers.is_own_layer(&full_name) {
-        return lacks(&format!("'{full_name}'"));
-    }
-    let is_own = |at: &PassChannels| match &options.layer {
-        Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
-        None => headers.is_own_layer(&layer_name(chosen, &at.name)),
-    };
-    let lights = denoised_lights(layer);
-    if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
-        return lacks("denoised light passes");
-    }
-    if let Some(reach) = options.temporal.filter(|reach| headers.reach() < *reach) {
-        return lacks(&format!("its neighbours (--temporal {reach})"));
-    }
-    if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
-        return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
-    }
-    write_missing_previews(output, &views, options)?;
-    let method = options.method(model);
-    let is_other = |(layer, made): &(String, String)| *layer == full_name && *made != method;
-    Ok(headers
-        .methods()
-        .into_iter()
-        .find(is_other)
-        .map(|(_, made)| format!("was made with {made}, and was kept; --overwrite makes it with {method}")))
+/// A result that is there and is the one that is wanted.
+pub(super) struct Existing {
+    views: Vec<Layer>,
+    /// How it was made, if that is known and not how it would be made now; for the user.
+    pub made_otherwise: Option<String>,
+    /// The frames by number that it was made without.
+    pub lacked: BTreeSet<i64>,
 }
 
-/// Writes the previews of an existing result, which has these `views`, that are wanted and missing.
-fn write_missing_previews(output: &Path, views: &[Layer], options: &Options) -> Result<()> {
-    let Some(write) = options.preview else { return Ok(()) };
-    let previews = views.iter().map(|layer| (layer, preview_path(output, layer, views.len())));
-    let missing: Vec<_> = previews.filter(|(_, path)| !path.exists()).collect();
-    if missing.is_empty() {
-        return Ok(());
+impl Existing {
+    /// Looks at a file that lies where a result would be written.
+    ///
+    /// # Errors
+    /// It is not the result that is wanted, since nothing is overwritten unasked.
+    pub fn of(headers: &Frame, model: &dyn Denoiser, options: &Options) -> Result<Self> {
+        let output = headers.path();
+        let layers = passes::layers_by(headers, &options.sources.mapping);
+        let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
+        let chosen = &layer.name;
+        let full_name = layer_name(chosen, options.layer.as_deref().unwrap_or(COMBINED));
+        let views = match &options.layer {
+            Some(added) => passes::rgb_layers(headers, Some(chosen), added),
+            // The beauty, whatever its renderer calls it.
+            None => layers
+                .iter()
+                .filter(|l| l.name == *chosen && l.passes.contains_key(&Pass::Combined))
+                .cloned()
+                .collect(),
+        };
+        let lacks = |what: &str| {
+            let why = format!(
+                "exists without {what} made by demc; --overwrite denoises the frame again, or choose another --out"
+            );
+            Err(Error::invalid(output, why))
+        };
+        if views.is_empty() || !headers.is_own_layer(&full_name) {
+            return lacks(&format!("'{full_name}'"));
+        }
+        let is_own = |at: &PassChannels| match &options.layer {
+            Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
+            None => headers.is_own_layer(&layer_name(chosen, &at.name)),
+        };
+        let lights = denoised_lights(layer);
+        if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
+            return lacks("denoised light passes");
+        }
+        if let Some(reach) = options.temporal.filter(|reach| headers.reach(&full_name) < *reach) {
+            return lacks(&format!("its neighbours (--temporal {reach})"));
+        }
+        if options.confidence && !headers.is_own_layer(&layer_name(chosen, &error_layer(options))) {
+            return lacks(&format!("'{}'", layer_name(chosen, &error_layer(options))));
+        }
+        let method = options.method(model);
+        let made = headers.method(&full_name).filter(|made| *made != method);
+        let made_otherwise = made
+            .map(|made| format!("was made with {made}, and was kept; --overwrite makes it with {method}"));
+        Ok(Self { views, made_otherwise, lacked: headers.lacked(&full_name) })
     }
-    let frame = Frame::read(output)?;
-    for (layer, path) in missing {
-        let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
-        write(&path, set.require(Pass::Combined, "--preview")?)?;
+
+    /// Writes the previews that are wanted and missing.
+    ///
+    /// # Errors
+    /// The result cannot be read, or a preview not be written.
+    pub fn write_missing_previews(&self, output: &Path, options: &Options) -> Result<()> {
+        let Some(write) = options.preview else { return Ok(()) };
+        let previews = self.views.iter().map(|layer| (layer, preview_path(output, layer, self.views.len())));
+        let missing: Vec<_> = previews.filter(|(_, path)| !path.exists()).collect();
+        if missing.is_empty() {
+            return Ok(());
+        }
+        let frame = Frame::read(output)?;
+        for (layer, path) in missing {
+            let set = passes::read_layer(&frame, layer, &[Pass::Combined])?;
+            write(&path, set.require(Pass::Combined, "--preview")?)?;
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -62,6 +62,12 @@ pub fn denoised_lights(layer: &Layer) -> Vec<&PassChannels> {
     passes.chain(layer.light_groups.values()).collect()
 }
 
+/// Where all passes and light groups of a layer are that may go along with its beauty.
+pub fn passes_along(layer: &Layer) -> Vec<&PassChannels> {
+    let colours = LIT.iter().filter_map(|(_, colour)| layer.passes.get(colour));
+    denoised_lights(layer).into_iter().chain(colours).collect()
+}
+
 /// Where a companion comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
@@ -96,6 +102,8 @@ impl Along {
         let denoises_alpha = match options.alpha {
             Alpha::Keep => false,
             Alpha::Denoise => true,
+            // Neighbours leave alpha as it is, and so does a frame that has none.
+            Alpha::Auto if options.temporal.is_some() => false,
             Alpha::Auto => {
                 let varies = |alpha: &Planes| alpha.data.iter().any(|v| *v != alpha.data[0]);
                 model.takes_companions() && shot.passes.get(Pass::Alpha).is_some_and(varies)

@@ -25,6 +25,7 @@ use crate::{
     filters::{
         agreement::{self, Guides, Look},
         motion::{Direction, Flow},
+        shrinkage::Empty,
         temporal::{self, Link, likeness},
     },
     models::Denoiser,
@@ -318,7 +319,11 @@ impl Window {
         let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
         let results: Vec<(&Planes, &Link)> =
             others.iter().map(|other| (other.moment.result(), &other.link)).collect();
-        Ok(own.inside(temporal::blend(own.result(), &radiance, own.exposure, &results)))
+        let mut blended = own.inside(temporal::blend(own.result(), &radiance, own.exposure, &results));
+        if let Some(empty) = own.shot.passes.get(Pass::Alpha).and_then(|alpha| Empty::of(&radiance, alpha)) {
+            empty.clear(&mut blended);
+        }
+        Ok(blended)
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
@@ -667,11 +672,12 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
     (1..=reach).flat_map(|n| [-n, n])
 }
 
-/// The passes of a frame that the model reads, averaged with those of its neighbours. Places remain its own.
+/// The passes of a frame that the model reads, and alpha, averaged with those of its neighbours. Places, and shares such
+/// as alpha, remain its own.
 fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
     let passes = &own.shot.passes;
     let mut set = passes.empty((passes.width, passes.height));
-    for &pass in model.passes().iter().chain(model.optional_passes()) {
+    for &pass in model.passes().iter().chain(model.optional_passes()).chain(&[Pass::Alpha]) {
         let Some(values) = own.values(pass) else { continue };
         if is_place(pass) {
             // Places never wait.

@@ -41,14 +41,14 @@ const MARK: &str = "demc";
 /// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
 /// view layer.
 const EXPECTED_ERROR: &str = "demcExpectedError";
-/// Attribute that lists the frames by number that results were made without.
+/// Attributes with something of each layer that demc made: two lines a layer, its [`UNSTORABLE`]-free name first.
+///
+/// The frames by number that it was made without.
 const LACKED: &str = "demcLacked";
-/// Attribute that tells how many frames before and after a result was made with.
+/// How many frames before and after it was made with.
 const REACH: &str = "demcNeighbours";
-/// Attribute that tells how layers were made: a line for each, its name and what [`Frame::set_method`] was given.
+/// How it was made.
 const METHOD: &str = "demcMethod";
-/// What stands between the two.
-const BY: &str = ": ";
 /// Attributes that another part of the same picture does not take over; nor does it take those of
 /// cryptomattes.
 const OWN: [&str; 9] =
@@ -100,11 +100,11 @@ fn expected_errors(attributes: &Attributes) -> Vec<(String, f64)> {
     text.lines().filter_map(read).collect()
 }
 
-/// What [`Frame::set_method`] noted in a part.
-fn methods(attributes: &Attributes) -> Vec<(String, String)> {
-    let text = attributes.text(METHOD).unwrap_or_default();
-    let read = |line: &str| line.split_once(BY).map(|(name, method)| (name.into(), method.into()));
-    text.lines().filter_map(read).collect()
+/// What [`Frame::note`] noted of the layers of a part.
+fn noted(attributes: &Attributes, attribute: &str) -> Vec<(String, String)> {
+    let text = attributes.text(attribute).unwrap_or_default();
+    let lines: Vec<&str> = text.lines().collect();
+    lines.chunks_exact(2).map(|pair| (pair[0].into(), pair[1].into())).collect()
 }
 
 impl Frame {
@@ -187,17 +187,12 @@ impl Frame {
     /// # Panics
     /// If demc made no such layer.
     pub fn set_method(&mut self, name: &str, method: &str) {
-        let attributes = self.attributes_beside(name);
-        let mut noted = methods(attributes);
-        noted.retain(|(layer, _)| layer != name);
-        noted.push((name.into(), method.replace(UNSTORABLE, " ")));
-        let lines: Vec<String> = noted.iter().map(|(name, method)| format!("{name}{BY}{method}")).collect();
-        attributes.set_text(METHOD, &lines.join("\n"));
+        self.note(METHOD, name, Some(&method.replace(UNSTORABLE, " ")));
     }
 
     /// The layers that demc made, each with how it did so, where that is noted.
     pub fn methods(&self) -> Vec<(String, String)> {
-        self.stored.iter().flat_map(|stored| methods(&stored.attributes)).collect()
+        self.stored.iter().flat_map(|stored| noted(&stored.attributes, METHOD)).collect()
     }
 
     /// Notes the frames by number that the layer `name`, which demc made, was made without though they belong to its
@@ -206,12 +201,8 @@ impl Frame {
     /// # Panics
     /// If demc made no such layer.
     pub fn set_lacked(&mut self, name: &str, frames: &BTreeSet<i64>) {
-        let attributes = self.attributes_beside(name);
-        if frames.is_empty() && attributes.text(LACKED).is_none() {
-            return;
-        }
-        let frames: Vec<String> = frames.iter().map(i64::to_string).collect();
-        attributes.set_text(LACKED, &frames.join(" "));
+        let listed: Vec<String> = frames.iter().map(i64::to_string).collect();
+        self.note(LACKED, name, (!frames.is_empty()).then(|| listed.join(" ")).as_deref());
     }
 
     /// Notes how many frames before and after the layer `name`, which demc made, was made with, as far as they are
@@ -220,24 +211,42 @@ impl Frame {
     /// # Panics
     /// If demc made no such layer.
     pub fn set_reach(&mut self, name: &str, reach: usize) {
+        self.note(REACH, name, (reach > 0).then(|| reach.to_string()).as_deref());
+    }
+
+    /// How many frames before and after the layer `name` was made with.
+    pub fn reach(&self, name: &str) -> usize {
+        self.noted(REACH, name).and_then(|reach| reach.parse().ok()).unwrap_or(0)
+    }
+
+    /// The frames by number that the layer `name` was made without.
+    pub fn lacked(&self, name: &str) -> BTreeSet<i64> {
+        let list = self.noted(LACKED, name).unwrap_or_default();
+        list.split(' ').filter_map(|frame| frame.parse().ok()).collect()
+    }
+
+    /// How the layer `name` was made, where that is noted.
+    pub fn method(&self, name: &str) -> Option<String> {
+        self.noted(METHOD, name)
+    }
+
+    /// Notes something of the layer `name`, which demc made, or forgets what is noted of an earlier one.
+    fn note(&mut self, attribute: &str, name: &str, what: Option<&str>) {
         let attributes = self.attributes_beside(name);
-        if reach > 0 || attributes.text(REACH).is_some() {
-            attributes.set_text(REACH, &reach.to_string());
+        let mut of_layers = noted(attributes, attribute);
+        if of_layers.is_empty() && what.is_none() {
+            return;
         }
+        of_layers.retain(|(layer, _)| layer != name);
+        of_layers.extend(what.map(|what| (name.into(), what.into())));
+        let lines: Vec<String> = of_layers.iter().map(|(name, what)| format!("{name}\n{what}")).collect();
+        attributes.set_text(attribute, &lines.join("\n"));
     }
 
-    /// How many frames before and after all its results were made with.
-    pub fn reach(&self) -> usize {
-        let noted = self.stored.iter().filter_map(|stored| stored.attributes.text(REACH)?.parse().ok());
-        noted.min().unwrap_or(0)
-    }
-
-    /// The frames by number that its results were made without.
-    pub fn lacked(&self) -> BTreeSet<i64> {
-        let lists = self.stored.iter().filter_map(|stored| stored.attributes.text(LACKED));
-        lists
-            .flat_map(|list| list.split(' ').filter_map(|frame| frame.parse().ok()).collect::<Vec<i64>>())
-            .collect()
+    /// What is noted of the layer `name`.
+    fn noted(&self, attribute: &str, name: &str) -> Option<String> {
+        let mut of_layers = self.stored.iter().flat_map(|stored| noted(&stored.attributes, attribute));
+        of_layers.find(|(layer, _)| layer == name).map(|(_, what)| what)
     }
 
     /// The attributes of the part that holds a layer which demc made.

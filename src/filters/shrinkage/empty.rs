@@ -20,14 +20,20 @@ pub struct Empty {
 }
 
 impl Empty {
-    /// Of radiance, (3, H, W), and alpha, (1, H, W); nothing where alpha is zero nowhere.
+    /// Of radiance, (3, H, W), and alpha, (1, H, W); nothing where alpha is zero nowhere, or everywhere: programs fill in
+    /// an alpha that they do not know with zeros.
     ///
     /// # Panics
     /// If sizes differ.
     pub fn of(radiance: &Planes, alpha: &Planes) -> Option<Self> {
         let (width, height) = (radiance.width, radiance.height);
         assert_eq!((alpha.channels, alpha.width, alpha.height), (1, width, height), "planes of one frame");
-        if alpha.data.iter().all(|alpha| *alpha != 0.0) {
+        let (mut has_clear, mut has_covered) = (false, false);
+        for alpha in &alpha.data {
+            has_clear |= *alpha == 0.0;
+            has_covered |= *alpha != 0.0;
+        }
+        if !(has_clear && has_covered) {
             return None;
         }
         let mut met = vec![false; width * height];
@@ -50,6 +56,22 @@ impl Empty {
         Some(Self { width, height, met })
     }
 
+    /// Makes an image, (3, H, W), black where it is empty.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn clear(&self, image: &mut Planes) {
+        assert_eq!((image.width, image.height), (self.width, self.height), "planes of one frame");
+        let mut is_near = vec![true; self.width];
+        for y in 0..self.height {
+            self.row(y, &mut is_near);
+            for c in 0..image.channels {
+                let row = &mut image.channel_mut(c)[y * self.width..][..self.width];
+                row.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(value, _)| *value = 0.0);
+            }
+        }
+    }
+
     /// Sets for each pixel of a row whether something was met in it or near it.
     pub fn row(&self, y: usize, is_near: &mut [bool]) {
         is_near.fill(false);
@@ -70,6 +92,11 @@ mod tests {
         let at = |x: usize, y: usize| y * size.0 + x;
         let opaque = Planes::from_vec(1, size.0, size.1, vec![1e-4; size.0 * size.1]);
         assert!(Empty::of(&Planes::new(3, size.0, size.1), &opaque).is_none());
+        let unknown = Planes::new(1, size.0, size.1);
+        assert!(
+            Empty::of(&Planes::new(3, size.0, size.1), &unknown).is_none(),
+            "an alpha that tells nothing"
+        );
         let lit = (21, 2);
         let covered = (4, 16);
         let mut radiance = Planes::new(3, size.0, size.1);
@@ -77,12 +104,18 @@ mod tests {
         let mut alpha = Planes::new(1, size.0, size.1);
         alpha.data[at(covered.0, covered.1)] = 1.0;
         let empty = Empty::of(&radiance, &alpha).unwrap();
+        let mut cleared = Planes::from_vec(3, size.0, size.1, vec![1.0; 3 * size.0 * size.1]);
+        empty.clear(&mut cleared);
         for y in 0..size.1 {
             let mut is_near = vec![true; size.0];
             empty.row(y, &mut is_near);
             for (x, near) in is_near.into_iter().enumerate() {
                 let distance = |other: (usize, usize)| x.abs_diff(other.0).max(y.abs_diff(other.1));
                 assert_eq!(near, distance(lit).min(distance(covered)) <= 3, "{x}, {y}");
+                assert!(
+                    (0..3).all(|c| cleared.channel(c)[at(x, y)] == f32::from(u8::from(near))),
+                    "{x}, {y}"
+                );
             }
         }
     }
