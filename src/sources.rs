@@ -138,8 +138,10 @@ impl Sources {
 
 /// Whether a layer's normal is the pass that Cycles makes for denoisers.
 fn has_cycles_normal(layer: &Layer) -> bool {
+    // Programs write spaces and capitals otherwise.
     let names = Pass::DenoisingNormal.blender_names();
-    layer.passes.get(&Pass::DenoisingNormal).is_some_and(|at| names.contains(&at.name.as_str()))
+    let found = layer.passes.get(&Pass::DenoisingNormal);
+    found.is_some_and(|at| names.iter().any(|name| passes::plain(name) == passes::plain(&at.name)))
 }
 
 /// A guide in a file of its own: the pass, by its name, or what the file holds without one.

@@ -56,7 +56,7 @@ fn attributes_keep_their_bytes_and_their_order() {
     let input = render(dir.path(), &added);
     let [first, second] = ["a", "b"].map(|out| fs::read(denoise(&input, &dir.path().join(out))).unwrap());
     assert!(first == second, "the same input gives the same bytes");
-    let derived = |(name, _, _): &&Stored| name != "channels" && name != "demc";
+    let derived = |(name, _, _): &&Stored| name != "channels" && !name.starts_with("demc");
     let (before, after) = (header(&fs::read(&input).unwrap()).0, header(&first).0);
     let [before, after] = [&before, &after].map(|list| list.iter().filter(derived).collect::<Vec<_>>());
     assert_eq!(before, after);
@@ -120,7 +120,11 @@ fn a_part_that_is_added_says_of_its_colours_what_the_beauty_does() {
     let text = |text: &str| AttributeValue::Text(text.into());
     assert_eq!(
         other,
-        [("colorInteropID".to_string(), text("lin_ap1_scene")), ("demc".to_string(), text("V.Denoised"))]
+        [
+            ("colorInteropID".to_string(), text("lin_ap1_scene")),
+            ("demc".to_string(), text("V.Denoised")),
+            ("demcMethod".to_string(), text("V.Denoised\n--model noisy"))
+        ]
     );
 }
 
@@ -209,10 +213,14 @@ fn luminance_and_chroma_are_read_as_the_colours_they_make_and_kept_beside() {
 #[test]
 fn a_file_that_says_it_is_an_environment_is_denoised_without_a_seam() {
     let dir = tempfile::tempdir().unwrap();
+    let cut = std::cell::Cell::new(None);
     let result = |name: &str, kind: EnvironmentMap, wrap: &[&str]| {
         let input = dir.path().join("render.exr");
         let mut image = read_exr(data("s0000_room_0004spp.exr"));
         image.layer_data[0].attributes.environment_map = Some(kind);
+        if let Some(whole) = cut.get() {
+            image.attributes.display_window = whole;
+        }
         image.write().to_file(&input).unwrap();
         let mut command = demc();
         command.args(["denoise", "--model", "demc-s", "--overwrite"]).args(wrap).arg(input);
@@ -225,4 +233,35 @@ fn a_file_that_says_it_is_an_environment_is_denoised_without_a_seam() {
     assert!(
         joined != apart && joined == result("c", cube, &["--wrap", "x"]) && apart == result("d", cube, &[])
     );
+    // A region of it, and what was rendered beyond its edges, do not meet.
+    for (x, width) in [(-40, 400), (3, 20)] {
+        cut.set(Some(IntegerBounds::new((x, 0), (width, 50))));
+        assert!(
+            apart == result("e", all_round, &[]) && apart == result("f", all_round, &["--wrap", "x"]),
+            "{x}"
+        );
+    }
+}
+
+#[test]
+fn a_result_that_was_cropped_since_is_not_filled() {
+    let dir = tempfile::tempdir().unwrap();
+    let part = |name: &str, size: (usize, usize), mark: bool| {
+        let list = ["R", "G", "B"].map(|c| {
+            AnyChannel::new(format!("{name}.{c}").as_str(), FlatSamples::F32(vec![0.5; size.0 * size.1]))
+        });
+        let mut attributes = LayerAttributes::named(name);
+        if mark {
+            let mark = exr::meta::attribute::AttributeValue::Text(name.into());
+            attributes.other.insert("demc".into(), mark);
+        }
+        Layer::new(size, attributes, Encoding::SMALL_LOSSLESS, AnyChannels::sort(list.into_iter().collect()))
+    };
+    let parts = vec![part("V.Combined", (48, 40), false), part("V.Denoised", (32, 24), true)];
+    let input = dir.path().join("cropped.exr");
+    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((48, 40)));
+    Image::from_layers(shared, parts).write().to_file(&input).unwrap();
+    let mut command = demc();
+    command.args(["denoise", "--model", "noisy", "--out"]).arg(dir.path().join("out")).arg(&input);
+    command.assert().code(1).stderr(contains("'V.Denoised', cropped since").and(contains("--layer NAME")));
 }

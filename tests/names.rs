@@ -459,7 +459,127 @@ fn views_are_told_by_openexrs_rules() {
                 "{view} {guides_say} {in_front}"
             );
         }
+        // Beside a part of something else. What says nothing of its view has it in its channels' names there too.
+        let mut attributes = LayerAttributes::named("main");
+        attributes.multi_view_names = Some(vec![Text::from("left"), Text::from("right")]);
+        let parts = vec![
+            Render::new().layer(&channels, attributes),
+            Render::new().layer(&[("Mist.Z", 9)], LayerAttributes::named("mist")),
+        ];
+        let shared = ImageAttributes::new(IntegerBounds::from_dimensions((SIDE, SIDE)));
+        Image::from_layers(shared, parts).write().to_file(&path).unwrap();
+        let result = denoise(&path, &[]);
+        for view in ["left", "right"] {
+            assert!(layer(&result, &format!("Denoised.{view}")) == expected, "{view} beside another part");
+        }
+        denoise(&result, &[]);
     }
+}
+
+#[test]
+fn alpha_is_that_of_the_picture_it_was_rendered_with() {
+    let dir = tempfile::tempdir().unwrap();
+    let bare = [("R", 0), ("G", 1), ("B", 2), ("A", 3)];
+    // A layer of the user's, and MoonRay's, beside what programs show.
+    let any = ["albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"];
+    let moonray = [
+        "denoise_albedo.R",
+        "denoise_albedo.G",
+        "denoise_albedo.B",
+        "denoise_normal.X",
+        "denoise_normal.Y",
+        "denoise_normal.Z",
+    ];
+    for (name, options, guides) in
+        [("key", &["--map", "beauty=key"][..], any), ("denoise_rgba", &[], moonray)]
+    {
+        let guides: Vec<(&str, usize)> = guides.into_iter().zip(3..).collect();
+        for has_alpha in [false, true] {
+            let path = dir.path().join(format!("{name}_{has_alpha}.exr"));
+            let own: Vec<String> = ["R", "G", "B", "A"].map(|c| format!("{name}.{c}")).into();
+            let planes = own.iter().map(String::as_str).zip([0, 1, 2, 4]);
+            let own: Vec<(&str, usize)> = planes.take(if has_alpha { 4 } else { 3 }).collect();
+            Render::new().write(&path, &[&bare[..], &own, &guides].concat());
+            let [before, after] =
+                [read_exr(&path), read_exr(denoise(&path, &[&["--replace"], options].concat()))];
+            for (channel, plane) in bare {
+                assert!(
+                    values(&after, channel) == values(&before, channel),
+                    "{name}: {channel}, plane {plane}"
+                );
+            }
+            for (channel, _) in own {
+                assert!(values(&after, channel) != values(&before, channel), "{channel}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_was_replaced_is_told_by_its_own_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("two.exr");
+    let bare = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    Render::new().write(&path, &[&bare[..], &[("key.R", 2), ("key.G", 1), ("key.B", 0)]].concat());
+    let key = ["--replace", "--map", "beauty=key"];
+    let result = denoise(&path, &key);
+    let again = |options: &[&str]| said(&result, options).contains("was already denoised by demc");
+    assert!(again(&key) && !again(&["--replace"]));
+    let (mut command, _) = command(&path, &key);
+    let finished = command.output().unwrap();
+    assert!(finished.status.success());
+    // Without --overwrite it is found again.
+    let mut without = demc();
+    without
+        .args(["denoise", "--model", "demc-s"])
+        .args(key)
+        .arg(&path)
+        .arg("--out")
+        .arg(result.parent().unwrap());
+    without.assert().success().stdout(predicates::str::contains("is there already"));
+}
+
+#[test]
+fn parts_that_hold_the_same_names_are_not_mixed() {
+    let dir = tempfile::tempdir().unwrap();
+    let expected = expected(dir.path());
+    let path = dir.path().join("joined.exr");
+    let other = [
+        ("R", 3),
+        ("G", 4),
+        ("B", 5),
+        ("albedo.R", 0),
+        ("albedo.G", 1),
+        ("albedo.B", 2),
+        ("N.X", 8),
+        ("N.Y", 6),
+        ("N.Z", 7),
+    ];
+    let own = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    Render::new().write_parts(&path, &[("subimage00", None, &other), ("subimage01", None, &own)]);
+    assert!(layer(&denoise(&path, &["--map", "beauty=subimage01"]), "Denoised") == expected);
+}
+
+#[test]
+fn cycles_own_normals_are_known_by_the_names_that_nuke_gives_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("nuke.exr");
+    // Normals that another renderer's would be turned for: those of this one are taken as they are.
+    let render = || Render::new().with_normals(|[x, y, z]| [0.5 * x + 0.5, 0.5 * z + 0.5, 0.5 * y + 0.5]);
+    let names = |separator: &str, space: &str| {
+        let parts = ["Combined.R", "Combined.G", "Combined.B"].into_iter().map(str::to_owned);
+        let guides = ["Albedo.R", "Albedo.G", "Albedo.B", "Normal.X", "Normal.Y", "Normal.Z"];
+        let all = parts.chain(guides.map(|guide| format!("Denoising{space}{guide}")));
+        all.map(|name| format!("ViewLayer{separator}{name}")).collect::<Vec<String>>()
+    };
+    let result = |names: Vec<String>, name: &str| {
+        let channels: Vec<(&str, usize)> = names.iter().map(String::as_str).zip(0..).collect();
+        render().write(&path, &channels);
+        assert!(!said(&path, &[]).contains("space"), "{}", said(&path, &[]));
+        layer(&denoise(&path, &[]), name)
+    };
+    let blender = result(names(".", " "), "ViewLayer.Denoised");
+    assert!(blender == result(names("_", "_"), "ViewLayer.Denoised"));
 }
 
 #[test]

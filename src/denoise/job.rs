@@ -217,7 +217,11 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         refuse_stale(&frame, layer, options)?;
         options.sources.mapping.check(input, layer)?;
         let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
-        shot.wraps = options.wrap.of(&frame);
+        shot.wraps = options.wrap.of(&frame, layer.passes[&Pass::Combined].part);
+        if options.wrap == Wrap::X && !shot.wraps {
+            let why = "the frame is a part of the panorama's width, whose edges do not meet (--wrap x)";
+            report.notes.push(why.into());
+        }
         report.notes.extend(shot.normals.take());
         report.samples = shot.passes.samples;
         report.was_denoised |= shot.was_denoised;
@@ -547,7 +551,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
                 report.notes.push(format!("{what}: {recoded}"));
             }
         }
-        let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(COMBINED));
+        let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(&beauty.0.name));
         frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
         frame.set_lacked(&result, &report.lacked);
         frame.set_reach(&result, options.temporal.unwrap_or(0));
@@ -601,11 +605,11 @@ fn put(
     let mut channels: Vec<(usize, &[f32])> =
         at.channels.iter().enumerate().map(|(c, &i)| (i, planes.channel(c))).collect();
     if let (Some(alpha), Some(of_alpha)) = (alpha, layer.passes.get(&Pass::Alpha))
-        && (of_alpha.part, &of_alpha.name) == (at.part, &at.name)
+        && of_alpha.part == at.part
     {
         channels.push((of_alpha.channels[0], alpha.channel(0)));
     }
-    frame.replace(at.part, &layer_name(&layer.name, pass), &channels)
+    frame.replace(at.part, &layer_name(&layer.name, &at.name), &channels)
 }
 
 /// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse
@@ -692,7 +696,8 @@ impl Existing {
         let layers = passes::layers_by(headers, &options.sources.mapping);
         let layer = passes::choose(headers, &layers, options.view_layer.as_deref())?;
         let chosen = &layer.name;
-        let full_name = layer_name(chosen, options.layer.as_deref().unwrap_or(COMBINED));
+        let beauty = layer.passes.get(&Pass::Combined).map_or(COMBINED, |at| &at.name);
+        let full_name = layer_name(chosen, options.layer.as_deref().unwrap_or(beauty));
         let views = match &options.layer {
             Some(added) => passes::rgb_layers(headers, Some(chosen), added),
             // The beauty, whatever its renderer calls it.

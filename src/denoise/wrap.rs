@@ -2,14 +2,20 @@
 //! together with columns from the other side of the frame, so that no seam shows where a viewer joins them.
 
 use crate::{
-    Result, companion::Companion, frame::Frame, models::ExpectedError, passes::PassSet, planes::Planes,
+    Result,
+    companion::Companion,
+    frame::{Frame, Window},
+    models::ExpectedError,
+    passes::PassSet,
+    planes::Planes,
     shot::Shot,
 };
 
 /// Whether the left and the right edge of a frame meet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wrap {
-    /// Where the file says so: OpenEXR's attribute `envmap` names a map by latitude and longitude.
+    /// Where the file says so: OpenEXR's attribute `envmap` names a map by latitude and longitude, and the part is as
+    /// wide as the whole.
     #[default]
     Auto,
     /// They meet.
@@ -19,11 +25,13 @@ pub enum Wrap {
 }
 
 impl Wrap {
-    /// Whether the edges of this frame meet.
-    pub(super) fn of(self, frame: &Frame) -> bool {
+    /// Whether the edges of this part of a frame meet.
+    pub(super) fn of(self, frame: &Frame, part: usize) -> bool {
+        let across = |window: Window| (window.x, window.width);
+        let is_whole = across(frame.parts()[part].data_window) == across(frame.display_window());
         match self {
-            Self::Auto => frame.is_latitude_longitude(),
-            Self::X => true,
+            Self::Auto => frame.is_latitude_longitude() && is_whole,
+            Self::X => is_whole,
             Self::None => false,
         }
     }

@@ -139,7 +139,12 @@ impl Frame {
         let own_part = self.is_part_per_pass(beside);
         let (part_name, prefix) = match view {
             None => (name.to_owned(), name.to_owned()),
-            Some(view) if own_part => (format!("{name}-{view}"), name.to_owned()),
+            Some(view) if own_part => {
+                // A part that says nothing of its view has it in the names of its channels.
+                let is_of_part = self.parts[beside].view.is_some();
+                let prefix = if is_of_part { name.to_owned() } else { format!("{name}.{view}") };
+                (format!("{name}-{view}"), prefix)
+            }
             Some(view) => (name.to_owned(), format!("{name}.{view}")),
         };
         let named = channels.iter().map(|c| (format!("{prefix}.{}", c.component).into_bytes(), *c));
@@ -148,6 +153,15 @@ impl Frame {
         let holder = self.parts.iter().position(|p| {
             p.view == *beside_view && p.channels.iter().any(|c| c.name.as_bytes() == named[0].0)
         });
+        if let Some(holder) = holder
+            && self.parts[holder].data_window != self.parts[beside].data_window
+        {
+            let why = format!(
+                "holds the result '{name}', cropped since, beside a picture of another size; take it out of the file, or \
+                 choose another name (--layer NAME)"
+            );
+            return Err(Error::invalid(&self.path, why));
+        }
         let (part, recoded) = match holder {
             Some(part) => (part, self.set_channels(part, &named)?),
             None if own_part => {

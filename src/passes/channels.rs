@@ -91,7 +91,7 @@ impl ChannelName {
         let (view_layer, pass) = joined.or(prefix.rsplit_once('.')).unwrap_or(("", prefix));
         // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a
         // pass's: a view layer may be called like a pass.
-        let is_rendered = |name: &str| is_blender(name) || light_group(name).is_some();
+        let is_rendered = |name: &str| is_alike_blender(name) || light_group(name).is_some();
         let of_pass =
             view_layer.rsplit_once('.').filter(|(_, owner)| is_rendered(owner) && !is_rendered(pass));
         let (view_layer, pass) =
@@ -164,7 +164,8 @@ pub fn by_pass(frame: &Frame) -> Vec<(LayerKey, ByPass)> {
         }
     }
     take_unnamed_beauty(frame, &mut found);
-    if !frame.is_multi_part()
+    // Parts that say which view they are leave no channel without one.
+    if frame.parts().iter().all(|part| part.view.is_none())
         && let Some(default) = views.first()
     {
         join_default_view(&mut found, default);

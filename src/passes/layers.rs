@@ -61,7 +61,19 @@ pub fn layers(frame: &Frame) -> Vec<Layer> {
 /// As [`layers`], with a mapping that names the passes whose names are the user's own.
 pub fn layers_by(frame: &Frame, mapping: &Mapping) -> Vec<Layer> {
     let found = by_pass(frame).into_iter();
-    found.map(|((name, view), channels)| assign(name, view, channels, mapping)).collect()
+    found.map(|(key, channels)| assign_by_part(key, &channels, mapping)).collect()
+}
+
+/// As [`assign`]. Where several parts hold layers of the same names, those in the beauty's part belong to it.
+fn assign_by_part(key: LayerKey, channels: &ByPass, mapping: &Mapping) -> Layer {
+    let layer = assign(key.clone(), channels, mapping, None);
+    let is_twice = |places: &Vec<Place>| {
+        places.iter().any(|place| place.full_name == places[0].full_name && place.part != places[0].part)
+    };
+    match layer.passes.get(&Pass::Combined) {
+        Some(beauty) if channels.values().any(is_twice) => assign(key, channels, mapping, Some(beauty.part)),
+        _ => layer,
+    }
 }
 
 /// The view layers that hold R, G and B of a layer `name`, which may be any, such as `Denoised` or
@@ -72,7 +84,7 @@ pub fn rgb_layers(frame: &Frame, view_layer: Option<&str>, name: &str) -> Vec<La
     let found = found.filter(|((layer, _), _)| view_layer.is_none_or(|wanted| wanted == layer));
     let as_combined = |((layer, view), channels): (LayerKey, ByPass)| {
         let name = within(&layer, name);
-        let at = find_components(name, channels.get(name)?, Pass::Combined)?;
+        let at = find_components(name, channels.get(name)?, Pass::Combined, None)?;
         Some(Layer { passes: [(Pass::Combined, at)].into(), ..Layer::empty(layer, view) })
     };
     found.filter_map(as_combined).collect()
@@ -87,16 +99,17 @@ pub fn layers_of(frame: &Frame, pass: Pass) -> Vec<Layer> {
         return named;
     }
     let picture = |((name, view), channels): (LayerKey, ByPass)| {
-        let index = Index::of(&channels);
+        let index = Index::of(&channels, None);
         let at = BLENDER.names(Pass::Combined).find_map(|name| index.find(name, pass))?;
         Some(Layer { passes: [(pass, at)].into(), ..Layer::empty(name, view) })
     };
     by_pass(frame).into_iter().filter_map(picture).collect()
 }
 
-fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mapping) -> Layer {
+/// Finds out which channels are which passes, in `part` rather than in others.
+fn assign((name, view): LayerKey, channels: &ByPass, mapping: &Mapping, part: Option<usize>) -> Layer {
     let mut layer = Layer::empty(name, view);
-    let index = Index::of(&channels);
+    let index = Index::of(channels, part);
     let known_by = |renderer: &'static Renderer| {
         let found = Pass::ALL.iter().filter_map(|&pass| {
             let mut names = renderer.names(pass);
@@ -136,16 +149,41 @@ fn assign(name: String, view: Option<String>, channels: ByPass, mapping: &Mappin
             layer.passes.insert(pass, at);
         }
     }
-    for (pass_name, candidates) in &channels {
+    belong_alpha(&mut layer.passes, channels, mapping);
+    for (pass_name, candidates) in channels {
         let Some(group) = light_group(pass_name) else { continue };
-        let found = find_components(pass_name, candidates, Pass::Combined);
+        let found = find_components(pass_name, candidates, Pass::Combined, part);
         layer.light_groups.extend(found.map(|at| (group.to_owned(), at)));
     }
     let motion = |name: &&String| renderer.motion.iter().any(|known| plain(known) == plain(name));
     layer.motion = channels.keys().find(motion).cloned();
-    layer.position_averaged = layer.passes.get(&Pass::Position).is_some_and(|p| p.name == POSITION_AOV);
+    let position = layer.passes.get(&Pass::Position);
+    layer.position_averaged = position.is_some_and(|at| plain(&at.name) == plain(POSITION_AOV));
     layer.unrecognised = unrecognised(&layer, &index);
     layer
+}
+
+/// Leaves as alpha only that of the picture which is the beauty, unless the user names another.
+fn belong_alpha(passes: &mut BTreeMap<Pass, PassChannels>, channels: &ByPass, mapping: &Mapping) {
+    let named = |pass| mapping.iter().find(|(named, _)| *named == pass).map(|(_, name)| name);
+    if named(Pass::Alpha) != named(Pass::Combined) {
+        return;
+    }
+    let Some(beauty) = passes.get(&Pass::Combined) else { return };
+    let all = || channels.values().flatten();
+    let is_red = |place: &&Place| (place.part, place.channel) == (beauty.part, beauty.channels[0]);
+    let Some(red) = all().find(is_red) else { return };
+    let is_beside = |place: &&Place| (place.part, place.prefix()) == (red.part, red.prefix());
+    let alpha = all().filter(is_beside).find(|place| is_component(&place.component, "A"));
+    let found = alpha.map(|place| PassChannels {
+        part: place.part,
+        channels: vec![place.channel],
+        name: beauty.name.clone(),
+    });
+    match found {
+        Some(alpha) => passes.insert(Pass::Alpha, alpha),
+        None => passes.remove(&Pass::Alpha),
+    };
 }
 
 /// The names of the channels that are of no pass.
@@ -182,16 +220,18 @@ pub fn within<'a>(view_layer: &str, name: &'a str) -> &'a str {
 struct Index<'a> {
     channels: &'a ByPass,
     alike: HashMap<String, &'a str>,
+    /// The part whose channels are preferred.
+    part: Option<usize>,
 }
 
 impl<'a> Index<'a> {
-    fn of(channels: &'a ByPass) -> Self {
+    fn of(channels: &'a ByPass, part: Option<usize>) -> Self {
         let mut alike = HashMap::new();
         for name in channels.keys() {
             alike.entry(plain(name)).or_insert(name.as_str());
         }
         alike.remove("");
-        Self { channels, alike }
+        Self { channels, alike, part }
     }
 
     /// The channels of a pass of exactly that name, or else of one with the same [`plain`] form.
@@ -199,16 +239,21 @@ impl<'a> Index<'a> {
         let known =
             if self.channels.contains_key(name) { Some(name) } else { self.alike.get(&plain(name)).copied() };
         if let Some(known) = known {
-            return find_components(known, &self.channels[known], pass);
+            return find_components(known, &self.channels[known], pass, self.part);
         }
         // `beauty`, `rgba` and their like are Combined here.
         let places = self.channels.get(COMBINED).filter(|_| is_bare(name))?;
-        in_one_layer(name, places, pass, |prefix| prefix.eq_ignore_ascii_case(name))
+        in_one_layer(name, places, pass, self.part, |prefix| prefix.eq_ignore_ascii_case(name))
     }
 }
 
-/// The channels that make up a pass, all of one layer and in one part.
-fn find_components(name: &str, places: &[Place], pass: Pass) -> Option<PassChannels> {
+/// The channels that make up a pass, all of one layer and in one part, the `preferred` one if it has them.
+fn find_components(
+    name: &str,
+    places: &[Place],
+    pass: Pass,
+    preferred: Option<usize>,
+) -> Option<PassChannels> {
     // A file may hold the picture in bare channels and once more in a layer. The bare ones are what programs
     // show.
     let mut prefixes: Vec<&str> = Vec::new();
@@ -218,14 +263,16 @@ fn find_components(name: &str, places: &[Place], pass: Pass) -> Option<PassChann
         }
     }
     prefixes.sort_by_key(|prefix| !prefix.is_empty()); // keeps the order of the others
-    prefixes.into_iter().find_map(|of| in_one_layer(name, places, pass, |prefix| prefix == of))
+    prefixes.into_iter().find_map(|of| in_one_layer(name, places, pass, preferred, |prefix| prefix == of))
 }
 
-/// The channels that make up a pass, all in the part of the first, of those whose layer `is_it`.
+/// The channels that make up a pass, all in the `preferred` part or else in that of the first, of those whose layer
+/// `is_it`.
 fn in_one_layer(
     name: &str,
     places: &[Place],
     pass: Pass,
+    preferred: Option<usize>,
     is_it: impl Fn(&str) -> bool,
 ) -> Option<PassChannels> {
     components(pass).iter().find_map(|wanted| {
@@ -237,7 +284,7 @@ fn in_one_layer(
             let exact = in_part.clone().find(|place| place.component == wanted);
             exact.or_else(|| in_part.find(|place| is_component(&place.component, wanted)))
         };
-        let part = of(wanted[0], None)?.part;
+        let part = of(wanted[0], preferred).or_else(|| of(wanted[0], None))?.part;
         let channels = wanted.iter().map(|wanted| Some(of(wanted, Some(part))?.channel));
         Some(PassChannels { part, channels: channels.collect::<Option<_>>()?, name: name.into() })
     })

@@ -23,8 +23,8 @@ pub use layers::{
     read_light_groups, rgb_layers, told_samples,
 };
 pub use mapping::Mapping;
-pub(crate) use names::light_group;
 pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
+pub(crate) use names::{light_group, plain};
 pub use normals::{Change, Turn, to_camera_space};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};
