@@ -148,11 +148,19 @@ def settings_of(options, common, job):
 
 
 def state_of(blend):
-    """What tells a saved scene from another, or from itself after a change; none for a scene without a file."""
+    """What tells a saved scene from another, or from itself after a change of its file or of a library's; none for a scene
+    without a file."""
     if not os.path.isfile(blend):
         return None
     with open(blend, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        state = hashlib.file_digest(file, "sha256")
+    libraries = {os.path.realpath(bpy.path.abspath(library.filepath)) for library in bpy.data.libraries}
+    for path in sorted(path for path in libraries if os.path.isfile(path)):
+        with open(path, "rb") as file:
+            state.update(hashlib.file_digest(file, "sha256").digest())
+    # What is not saved cannot be told.
+    state.update(b"changed" if bpy.data.is_dirty else b"")
+    return state.hexdigest()
 
 
 def settings_in(path):
@@ -194,7 +202,8 @@ class Export:
     def frame(self, frame, numbered):
         """Renders what is missing of a frame and prints its line. Returns whether all went well."""
         done, errors = [], []
-        self.placed = self.scene.frame_current == frame
+        # Frames that are numbered are whole; a scene may have been saved between two.
+        self.placed = self.scene.frame_current == frame and not (numbered and self.scene.frame_subframe)
         for job in jobs_of_frame(self.options, self.name, frame, numbered):
             try:
                 done.append(f"{job.label} {self._image(job, frame)}")
@@ -233,7 +242,8 @@ def export(options):
     blend = bpy.data.filepath
     name = options.name or os.path.splitext(os.path.basename(blend))[0] or "untitled"
     scene = picking.chosen_scene(options.scene_name, os.path.basename(blend) or name)
-    options.out = os.path.abspath(options.out or os.path.join(os.path.dirname(blend), "demc"))
+    # As Blender has it, // is the folder of the .blend.
+    options.out = os.path.abspath(bpy.path.abspath(options.out or os.path.join(os.path.dirname(blend), "demc")))
     cl.make_folder(options.out)
     if not picking.has_camera(scene):
         raise RuntimeError(f"{name} has no camera in the scene {scene.name}: add one and make it the scene's, or choose "
@@ -241,6 +251,8 @@ def export(options):
     picking.warn_of_missing_files()
     numbered = options.frames != []
     frames = picking.chosen_frames(scene, options.frames) if numbered else [scene.frame_current]
+    if numbered:
+        picking.warn_of_simulations(scene)
     start, part, camera = scene.frame_current, scene.frame_subframe, scene.camera
     with Edits() as edits:
         # Markers on the timeline switch cameras.

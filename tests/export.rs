@@ -372,6 +372,32 @@ fn files_of_another_state_of_the_scene_are_told() {
     assert!(!shot.export("").contains("another state"));
     let said = shot.refuse("--ref-noise nan", 2);
     assert!(said.contains("nan is not a number from 0 to 1"), "{said}");
+    // What is linked belongs to the scene.
+    let shot = Shot::new(&python::python(), "linked");
+    shot.export("--ref-spp 0");
+    assert!(!shot.export("--ref-spp 0").contains("another state"));
+    let library = shot.folder.path().join("props.blend");
+    let bytes = [fs::read(&library).unwrap(), vec![0]].concat();
+    fs::write(&library, bytes).unwrap();
+    let said = shot.export("--ref-spp 0");
+    assert!(said.contains("1 files that are there were made of another state of shot.blend"), "{said}");
+}
+
+#[test]
+fn a_frame_shows_the_same_wherever_the_file_was_saved_and_simulations_are_told() {
+    for python in python::blenders() {
+        let shot = Shot::new(&python, "between");
+        shot.export("--frames 2 --ref-spp 0 --name alone");
+        let said = shot.export("--frames 1-2 --ref-spp 0 --name both");
+        assert!(!said.contains("simulated"), "{said}");
+        let [alone, both] = ["alone", "both"].map(|name| {
+            let set = shot.passes(&format!("{name}_0001spp.0002.exr"));
+            set.get(Pass::Position).unwrap().data.to_vec()
+        });
+        assert!(alone == both, "frame 2 is not that between 2 and 3");
+        let said = Shot::new(&python, "simulated").export("--frames 1 --ref-spp 0");
+        assert!(said.contains("warning: rigid bodies: simulated and not baked"), "{said}");
+    }
 }
 
 #[test]

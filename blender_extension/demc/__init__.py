@@ -18,6 +18,9 @@ def register():
 
 def unregister():
     """Called when it is disabled, and when Blender ends: nothing of it stays, no worker either."""
+    ran = jobs.is_running()
     jobs.abandon()
+    if ran:
+        panel.show_progress(None, "")
     for part in reversed(_PARTS):
         part.unregister()

@@ -12,6 +12,8 @@ _LOOK_SECONDS = 0.3
 # No operator is at hand to take a key.
 _CANCELS = "The X in Render Properties > demc Denoiser"
 
+# The scene whose render is under way: those of strips in its sequencer are rendered in between.
+_rendered = None
 # Files of the animation that the render under way has written.
 _written = []
 # When files of the current frame were written that were there before it: a single render that is written has
@@ -21,6 +23,10 @@ _before = {}
 
 @persistent
 def _on_init(scene, _depsgraph=None):
+    global _rendered
+    if _rendered is not None:
+        return
+    _rendered = scene.name
     _written.clear()
     _before.clear()
     if scene.demc.after_render:
@@ -29,7 +35,7 @@ def _on_init(scene, _depsgraph=None):
 
 @persistent
 def _on_write(scene, _depsgraph=None):
-    if not scene.demc.after_render:
+    if not scene.demc.after_render or scene.name != _rendered:
         return
     for path in _files(scene):
         if scene.render.is_movie_format or _written_at(path) not in (None, _before.get(path)):
@@ -49,7 +55,18 @@ def _written_at(path):
 
 
 @persistent
+def _on_cancel(scene, _depsgraph=None):
+    global _rendered
+    if scene.name == _rendered:
+        _rendered = None
+
+
+@persistent
 def _on_complete(scene, _depsgraph=None):
+    global _rendered
+    if scene.name != _rendered:
+        return
+    _rendered = None
     if not scene.demc.after_render:
         return
     frames = list(dict.fromkeys(_written))
@@ -65,6 +82,8 @@ def _on_complete(scene, _depsgraph=None):
 @persistent
 def _on_load(_path, _unused=None):
     """Another file is opened: nobody would take the result, and Blender takes the timer away."""
+    global _rendered
+    _rendered = None
     jobs.abandon()
 
 
@@ -85,8 +104,8 @@ def _begin(scene, written):
 
 
 def _begin_later(name, written):
-    """Called from a timer until the render's thread has ended."""
-    if bpy.app.is_job_running("RENDER"):
+    """Called from a timer until the render's thread has ended, and what is denoised by then is done."""
+    if bpy.app.is_job_running("RENDER") or jobs.is_running():
         return _LOOK_SECONDS
     scene = bpy.data.scenes.get(name)
     if scene is not None and _begin(scene, written):
@@ -112,12 +131,13 @@ def _finish(job):
     if outcome.take(job) is not None and not bpy.app.background:
         with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
             bpy.ops.ed.undo_push(message="Denoise After Render")
-    print(f"demc: {job.summary()}")
+    for line in (*dict.fromkeys(job.notes), job.summary()):
+        print(f"demc: {line}")
 
 
 _HANDLERS = (
     ("render_init", _on_init), ("render_write", _on_write), ("render_complete", _on_complete),
-    ("load_pre", _on_load),
+    ("render_cancel", _on_cancel), ("load_pre", _on_load),
 )
 
 

@@ -15,6 +15,8 @@ class _Denoise:
     bl_options = set()
     _timer = None
     _job = None
+    # The timers that run: Blender does not tell an operator that it is unregistered.
+    timers = []
 
     @classmethod
     def poll(cls, _context):
@@ -35,6 +37,7 @@ class _Denoise:
         if not self._begin(context):
             return {"CANCELLED"}
         self._timer = context.window_manager.event_timer_add(_LOOK_SECONDS, window=context.window)
+        self.timers.append(self._timer)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -48,14 +51,18 @@ class _Denoise:
         panel.show_progress(self._job, "Esc")
         if runs:
             return {"PASS_THROUGH"}
-        context.window_manager.event_timer_remove(self._timer)
+        self._remove_timer(context)
         return self._end()
 
     def cancel(self, context):
         """Called where Blender takes the operator away: its window closes, or another file is opened."""
-        context.window_manager.event_timer_remove(self._timer)
+        self._remove_timer(context)
         self._job.kill()
         panel.show_progress(self._job, "Esc")
+
+    def _remove_timer(self, context):
+        self.timers.remove(self._timer)
+        context.window_manager.event_timer_remove(self._timer)
 
     def _begin(self, context):
         try:
@@ -80,6 +87,14 @@ class DEMC_OT_denoise_render(_Denoise, bpy.types.Operator):
     bl_idname, bl_label = "demc.denoise_render", "Denoise This Render"
     bl_options = {"UNDO"}
     plan = staticmethod(plans.of_render)
+
+    @classmethod
+    def poll(cls, context):
+        # Blender would save what of it is there by then.
+        if bpy.app.is_job_running("RENDER"):
+            cls.poll_message_set("Blender is rendering: wait for it, or cancel it")
+            return False
+        return super().poll(context)
 
 
 class DEMC_OT_denoise_folder(_Denoise, bpy.types.Operator):
@@ -136,6 +151,8 @@ def register():
 
 
 def unregister():
-    """Takes them away."""
+    """Takes them away, and their timers."""
+    while _Denoise.timers:
+        bpy.context.window_manager.event_timer_remove(_Denoise.timers.pop())
     for operator in reversed(_CLASSES):
         bpy.utils.unregister_class(operator)

@@ -20,6 +20,9 @@ def take(job):
         image = bpy.data.images.load(job.picture)
         image.name = name
     else:
+        # A packed image is reloaded from what was packed.
+        if image.packed_file:
+            image.unpack(method="REMOVE")
         image.filepath = job.picture
         image.reload()
     # Radiance, as the render: without this, Blender would show it as if it were data.
@@ -27,8 +30,12 @@ def take(job):
     # Its colours are those that Blender computes in; Blender 5 lets a file choose them.
     if hasattr(bpy.data, "colorspace"):
         image.colorspace_settings.name = bpy.data.colorspace.working_space
+    if os.path.realpath(job.picture).startswith(os.path.join(os.path.realpath(bpy.app.tempdir), "")):
+        image.pack()
+        job.notes.append("the .blend has no folder yet: the result is kept in it, and gone unless it is saved")
     if scene is not None and scene.demc.use_compositor:
-        if compositor.wire(scene, image, scene.demc.view_layer) is None:
+        layer = job.results[0].get("view_layer") if job.results else None
+        if compositor.wire(scene, image, layer or scene.demc.view_layer) is None:
             job.notes.append("the compositor's Use Nodes is off: the result is not wired into it")
     _show(image)
     return image

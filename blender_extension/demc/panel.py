@@ -92,6 +92,8 @@ def _state(layout, context):
     else:
         failed = job.state == jobs.FAILED
         _paragraph(layout, context, job.summary(), "ERROR" if failed else "CHECKMARK")
+        for note in dict.fromkeys(job.notes):
+            _paragraph(layout, context, note, "INFO")
 
 
 def _paragraph(layout, context, text, icon):

@@ -1,6 +1,7 @@
 """What each button asks for, as a job: which files, which options, and where results go."""
 
 import os
+import re
 import tempfile
 
 import bpy
@@ -30,7 +31,9 @@ def of_render(scene):
     _refuse(scene, passes.missing(scene, still=True), "the render")
     scratch = tempfile.mkdtemp(prefix="demc-", dir=bpy.app.tempdir)
     name = os.path.splitext(os.path.basename(bpy.data.filepath))[0] or "render"
-    noisy = os.path.join(scratch, f"{name}_{scene.name}_{scene.frame_current:04}{_SUFFIX}".replace(os.sep, "_"))
+    # What some system lets no file be called.
+    plain = re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", f"{name}_{scene.name}")
+    noisy = os.path.join(scratch, f"{plain}_{scene.frame_current:04}{_SUFFIX}")
     _save(render, scene, noisy)
     beside = os.path.dirname(bpy.data.filepath) or bpy.app.tempdir
     job = Job(

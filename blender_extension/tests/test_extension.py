@@ -9,6 +9,7 @@ import pathlib
 import sys
 import tempfile
 import time
+import types
 import unittest
 
 ARCHIVE = pathlib.Path(sys.argv.pop(1)).resolve()
@@ -22,7 +23,7 @@ MODULE = "bl_ext.user_default.demc"
 
 def handlers():
     """All handlers there are, by name."""
-    names = ("render_init", "render_write", "render_complete", "load_pre")
+    names = ("render_init", "render_write", "render_complete", "render_cancel", "load_pre")
     return {name: list(getattr(bpy.app.handlers, name)) for name in names}
 
 
@@ -256,6 +257,103 @@ class Extension(unittest.TestCase):
         while handlers._follow() is not None:
             time.sleep(0.02)
         self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
+
+    def test_a_render_while_another_is_denoised_waits_for_it(self):
+        handlers = sys.modules[f"{MODULE}.handlers"]
+        jobs, job = self.begun()
+        self.assertEqual(handlers._begin_later(self.scene.name, []), handlers._LOOK_SECONDS)
+        job.wait()
+        self.assertIsNone(handlers._begin_later(self.scene.name, []))
+        self.assertIsNot(jobs.current(), job)
+        self.assertIsNone(jobs.refusal())
+        jobs.current().wait()
+
+    def test_what_is_being_rendered_is_not_saved(self):
+        operators = sys.modules[f"{MODULE}.operators"]
+        self.prepared()
+        self.assertTrue(bpy.ops.demc.denoise_render.poll())
+        kept, busy = operators.bpy, types.SimpleNamespace(is_job_running=lambda kind: kind == "RENDER")
+        operators.bpy = types.SimpleNamespace(app=busy)
+        try:
+            self.assertFalse(bpy.ops.demc.denoise_render.poll())
+        finally:
+            operators.bpy = kept
+
+    def test_strips_of_an_edit_are_no_renders_of_their_own(self):
+        jobs = sys.modules[f"{MODULE}.jobs"]
+        self.prepared()
+        self.scene.demc.after_render = True
+        edit = bpy.data.scenes.new("edit")
+        edit.render.resolution_x = edit.render.resolution_y = 16
+        edit.frame_start, edit.frame_end = 1, 2
+        edit.render.filepath = os.path.join(self.folder, "edit_")
+        sequences = edit.sequence_editor_create()
+        strips = sequences.strips if hasattr(sequences, "strips") else sequences.sequences  # before 4.4
+        strips.new_scene("shot", self.scene, 1, 1)
+        jobs.abandon()
+        bpy.ops.render.render(animation=True, scene="edit")
+        self.assertTrue(os.path.isfile(os.path.join(self.folder, "edit_0002.png")))
+        self.assertEqual((jobs.current(), jobs.refusal(), self.clean()), (None, None, []))
+        # The next render of the shot itself is one.
+        bpy.ops.render.render(scene=self.scene.name)
+        self.assertIsNotNone(jobs.current())
+
+    def test_what_scripts_render_is_not_denoised(self):
+        jobs = sys.modules[f"{MODULE}.jobs"]
+        sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / "blender_scripts"))
+        from demc_blender import rendering
+        from demc_blender.edits import Edits
+
+        self.prepared()
+        self.scene.demc.after_render = True
+        jobs.abandon()
+        with Edits() as edits:
+            rendering.prepare_scene(edits, self.scene)
+            bpy.ops.render.render(write_still=True)
+        self.assertIsNone(jobs.current())
+        self.assertTrue(self.scene.demc.after_render)
+
+    def brightness(self):
+        image = bpy.data.images[f"Denoised {self.scene.name}"]
+        return sum(image.pixels[:]) / len(image.pixels)
+
+    def test_a_picture_that_was_packed_shows_the_new_result(self):
+        self.prepared()
+        bpy.ops.render.render()
+        bpy.ops.demc.denoise_render()
+        before = self.brightness()
+        bpy.data.images[f"Denoised {self.scene.name}"].pack()
+        bpy.data.lights[0].energy = 8.0
+        bpy.ops.render.render()
+        bpy.ops.demc.denoise_render()
+        self.assertGreater(self.brightness(), 1.5 * before)
+
+    def test_the_result_of_an_unsaved_file_is_kept_in_it(self):
+        jobs = sys.modules[f"{MODULE}.jobs"]
+        self.prepared()
+        self.scene.demc.output = ""
+        bpy.ops.render.render()
+        bpy.ops.demc.denoise_render()
+        image = bpy.data.images[f"Denoised {self.scene.name}"]
+        self.assertIsNotNone(image.packed_file)
+        self.assertTrue(any("the result is kept in it" in note for note in jobs.current().notes))
+        os.remove(bpy.path.abspath(image.filepath))
+        self.assertGreater(self.brightness(), 0.0)
+        bpy.ops.render.render()
+        bpy.ops.demc.denoise_render()
+        self.assertTrue(os.path.isfile(bpy.path.abspath(image.filepath)))
+
+    def test_the_wipe_shows_the_view_layer_that_was_denoised(self):
+        self.prepared()
+        more = self.scene.view_layers.new("A richer one")
+        more.cycles.denoising_store_passes = more.use_pass_normal = more.use_pass_position = True
+        bpy.ops.render.render()
+        bpy.ops.demc.denoise_render()
+        tree = sys.modules[f"{MODULE}.compositor"]._tree(self.scene)
+        split = next(node for node in tree.nodes if node.bl_idname == "CompositorNodeSplit")
+        shown = [link.from_node for socket in split.inputs for link in socket.links]
+        layers = [node.layer for node in shown if node.bl_idname == "CompositorNodeRLayers"]
+        self.assertEqual(layers, ["A richer one"])
 
     def test_frames_that_are_rendered_again_are_denoised_again(self):
         self.prepared()

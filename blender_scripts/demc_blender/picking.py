@@ -92,6 +92,24 @@ def chosen_frames(scene, spans):
     return list(dict.fromkeys(frames))
 
 
+def warn_of_simulations(scene):
+    """Says what is simulated and not baked: what it shows depends on the frames that were rendered before."""
+    unbaked = []
+    world = scene.rigidbody_world
+    if world and world.enabled and world.collection and world.collection.objects and not world.point_cache.is_baked:
+        unbaked.append("rigid bodies")
+    for thing in scene.objects:
+        caches = [modifier.point_cache for modifier in thing.modifiers if modifier.show_render
+                  and modifier.type in ("CLOTH", "SOFT_BODY")]
+        caches += [system.point_cache for system in thing.particle_systems
+                   if system.settings.type == "EMITTER" or system.use_hair_dynamics]
+        if any(not cache.is_baked for cache in caches):
+            unbaked.append(thing.name)
+    if unbaked:
+        print(f"warning: {', '.join(unbaked[:4])}: simulated and not baked, so frames that are rendered apart, or again, show "
+              "another state; bake the caches first")
+
+
 def warn_of_missing_files():
     """Names textures, libraries, caches ... that the scene refers to and that are not there."""
     for path in bpy.utils.blend_paths(absolute=True, packed=False, local=False):

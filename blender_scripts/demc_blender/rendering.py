@@ -41,6 +41,9 @@ def prepare_scene(edits, scene, as_framed=False):
         for name in ("use_multiview", "use_border", "use_crop_to_border"):
             edits.set(render, name, False)
     edits.set(render, "use_overwrite", True)
+    # The extension would denoise every file that is rendered here.
+    if hasattr(scene, "demc"):
+        edits.set(scene.demc, "after_render", False)
     for name in ("use_denoising", "use_animated_seed", "use_sample_subset"):
         edits.set(cycles, name, False)
     edits.set(cycles, "time_limit", 0.0)

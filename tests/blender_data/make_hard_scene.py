@@ -2,7 +2,8 @@
 
 Two scenes, `Main` (active) and `Other`, 64x36 pixels each: a cube that moves, seen by a camera. What is
 hard about them comes by name, as further arguments: stereo, border, step, aspect, blur, texture, library, animated
-(what an export sets), catcher (of shadows), marked (cameras by markers alone), driven (by a script).
+(what an export sets), catcher (of shadows), marked (cameras by markers alone), driven (by a script), linked (to props.blend,
+which is there), between (saved at frame 2.5), simulated (rigid bodies, not baked).
 """
 
 import os
@@ -50,15 +51,16 @@ if "texture" in wanted:
     image.source, image.filepath = "FILE", os.path.join(os.path.dirname(path), "lost_paint.png")
     material.node_tree.nodes.new("ShaderNodeTexImage").image = image
     cube.materials.append(material)
-if "library" in wanted:
-    library = os.path.join(os.path.dirname(path), "lost_library.blend")
+if wanted & {"library", "linked"}:
+    library = os.path.join(os.path.dirname(path), "props.blend" if "linked" in wanted else "lost_library.blend")
     prop = bpy.data.meshes.new("prop")
     bpy.data.libraries.write(library, {prop})
     bpy.data.meshes.remove(prop)
     with bpy.data.libraries.load(library, link=True) as (there, here):
         here.meshes = ["prop"]
     main.collection.objects.link(bpy.data.objects.new("prop", here.meshes[0]))
-    os.remove(library)
+    if "library" in wanted:
+        os.remove(library)
 if "animated" in wanted:
     main.cycles.driver_add("seed").driver.expression = "frame"
     for frame, samples in ((1, 1), (9, 7)):
@@ -78,6 +80,12 @@ if "marked" in wanted:
     marker.camera, main.camera = camera, None
 if "driven" in wanted:
     card.driver_add("scale", 0).driver.expression = "len(bpy.data.objects)"
+if "between" in wanted:
+    main.frame_set(2, subframe=0.5)
+if "simulated" in wanted:
+    bpy.ops.rigidbody.world_add()
+    main.rigidbody_world.collection = bpy.data.collections.new("bodies")
+    main.rigidbody_world.collection.objects.link(card)
 bpy.ops.wm.save_as_mainfile(filepath=path)
 # bpy 4.5 waits for ever at its end to free a driver of Python's.
 os._exit(0)
