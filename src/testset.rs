@@ -237,11 +237,30 @@ impl TestSet {
 
     /// Names scenes apart and sorts, once all files are in.
     fn finish(&mut self) {
+        self.number_frames();
         self.name_apart();
         sort(&mut self.pairs);
         self.unmatched.sort_by_cached_key(|u| match u {
             Unmatched::Noisy(Pair { noisy: path, .. }) | Unmatched::Reference(path) => path.clone(),
         });
+    }
+
+    /// Takes the number at the end of a noisy file's name for the frame's where a scene has other references for other
+    /// files, and no frames by their names.
+    fn number_frames(&mut self) {
+        let mut references: HashMap<(String, u32), BTreeSet<PathBuf>> = HashMap::new();
+        for pair in &self.pairs {
+            let of_scene = references.entry((pair.scene.clone(), pair.spp)).or_default();
+            of_scene.insert(pair.reference.clone());
+        }
+        for pair in self.pairs.iter_mut().filter(|pair| pair.frame.is_none()) {
+            let stem = pair.noisy.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+            let number = stem.rsplit_once('.').map(|(_, number)| number);
+            let is_number = |text: &&str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+            if references[&(pair.scene.clone(), pair.spp)].len() > 1 {
+                pair.frame = number.filter(is_number).map(str::to_owned);
+            }
+        }
     }
 
     /// Adds to the names of scenes that are alike in different folders as much of the folder as tells them apart,

@@ -562,6 +562,57 @@ fn a_sequence_is_scored_as_it_is_denoised() {
     assert!(out.join("slices/shot_0004spp.png").is_file() && out.join("bars_flicker.svg").is_file());
 }
 
+/// Writes a frame of the shot without noise.
+fn write_truth(path: &Path, frame: i64) {
+    let channel = |(c, name): (usize, &str)| {
+        let truth = (0..SIZE.0 * SIZE.1).map(|i| SHOT.truth(c, i, frame)).collect();
+        AnyChannel::new(format!("ViewLayer.Combined.{name}").as_str(), FlatSamples::F32(truth))
+    };
+    let list = ["R", "G", "B"].into_iter().enumerate().map(channel).collect();
+    write_channels(path, SIZE, list, &[]);
+}
+
+#[test]
+fn noise_seeds_of_a_frame_are_no_frames_beside_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    write_truth(&at("truth.exr"), 1);
+    for seed in 1..=3u32 {
+        Shot { seed, ..SHOT }.write(&at(&format!("shot_0004spp_n{seed}.exr")), 1);
+    }
+    let lines: String = (1..=3).map(|n| format!("shot,shot_0004spp_n{n}.exr,truth.exr,4\n")).collect();
+    fs::write(at("set.csv"), format!("scene,noisy,reference,spp\n{lines}")).unwrap();
+    let mut command = Command::cargo_bin("demc").unwrap();
+    command.args(["eval", "--models", "demc-s", "--temporal", "--repeats", "1", "--no-sheets", "--test-set"]);
+    command.arg(at("set.csv")).arg("--out").arg(at("out")).assert().success();
+    let rows = table(&at("out").join("scores.csv"));
+    let of = |model: &str| {
+        let own = rows.iter().filter(|row| row["model"] == model);
+        own.map(|row| (row["relmse"].clone(), row["flicker"].clone())).collect::<Vec<_>>()
+    };
+    assert_eq!((of("demc-s").len(), of("demc-s")), (3, of("demc-s:temporal")));
+    assert!(rows.iter().all(|row| row["flicker"].is_empty()));
+}
+
+#[test]
+fn flicker_after_a_frame_that_is_not_finite_is_not_told() {
+    let dir = sequence(SHOT, 1..=3);
+    (1..=3).for_each(|n| write_truth(&dir.path().join(format!("shot_ref.{n:04}.exr")), n));
+    let mut channels = SHOT.channels("ViewLayer", "", 2);
+    let FlatSamples::F32(red) = &mut channels[0].sample_data else { unreachable!("all are floats") };
+    red[SIZE.0 * 18 + 24] = f32::NAN;
+    write_channels(&named(&dir, 2), SIZE, channels, &[]);
+    let mut command = Command::cargo_bin("demc").unwrap();
+    command.args(["eval", "--models", "noisy", "--repeats", "1", "--no-sheets", "--test-set"]);
+    command.arg(dir.path()).arg("--out").arg(dir.path().join("out")).assert().code(1);
+    let rows = table(&dir.path().join("out/scores.csv"));
+    let last = rows.iter().find(|row| row["scene"].ends_with('3')).unwrap();
+    assert!(
+        last["flicker"].is_empty() && last["note"].contains("no flicker: of the frame before"),
+        "{last:?}"
+    );
+}
+
 #[test]
 fn flicker_is_what_numpy_says() {
     let dir = tempfile::tempdir().unwrap();

@@ -2,7 +2,7 @@
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
 #   eval/rivals/train.sh DATA HELD_OUT OUT SECONDS [NAME...]
 # DATA and HELD_OUT are folders or manifests of pairs, to train on and to validate on. Learning rates fall over as many
-# steps as fit one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
+# steps as fit nine tenths of the time on one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
 # another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
 # the budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where
 # it was stopped: OUT/NAME.seconds holds the time used so far.
@@ -26,7 +26,8 @@ run() {
 
 for name in "$@"; do
     recipe "$name"
-    steps=$(awk "BEGIN { print int($rate * $seconds / 100 * ${SPEED:-1}) }")
+    # A tenth is left for validation, and so that none is cut before its rate has fallen.
+    steps=$(awk "BEGIN { print int(0.9 * $rate * $seconds / 100 * ${SPEED:-1}) }")
     spent=0
     if [ -e "$out/$name/checkpoint.safetensors" ]; then
         spent=$(cat "$out/$name.seconds")
@@ -52,6 +53,7 @@ for name in "$@"; do
     status=0
     wait $pid 2>/dev/null || status=$?
     # 130: it was interrupted when its time was over.
+    if [ $status -eq 130 ]; then echo "$name: cut before its $steps steps, at a rate that had not fallen to the end" >&2; fi
     if [ $status -ne 0 ] && [ $status -ne 130 ]; then
         echo "$name failed: $(grep -m 1 -E '^(error|demc):' "$out/$name.log")" >&2
         failed=1

@@ -59,7 +59,12 @@ impl Oidn {
     /// Where the program lies. For a bare name it is the first on the search path.
     pub fn program(&self) -> PathBuf {
         let path = std::env::var_os("PATH").unwrap_or_default();
-        let mut found = std::env::split_paths(&path).map(|folder| folder.join(&self.program));
+        // As systems find programs: Windows adds what their names end in.
+        let mut named = self.program.clone().into_os_string();
+        if self.program.extension().is_none() {
+            named.push(std::env::consts::EXE_SUFFIX);
+        }
+        let mut found = std::env::split_paths(&path).map(|folder| folder.join(&named));
         found.find(|program| program.is_file()).unwrap_or_else(|| self.program.clone())
     }
 

@@ -206,6 +206,11 @@ pub struct PassSet {
 const FILLED: f64 = 0.9;
 
 impl PassSet {
+    /// Whether another set has the same passes with the same values.
+    pub fn holds_the_same(&self, other: &Self) -> bool {
+        self.planes == other.planes
+    }
+
     /// An empty set.
     pub fn new(path: impl Into<PathBuf>, view_layer: &str, width: usize, height: usize) -> Self {
         let (path, view_layer) = (path.into(), view_layer.into());

@@ -10,7 +10,10 @@ use super::{
 use crate::{
     denoise::follows,
     error::attempt,
-    metrics::flicker::{self, flicker},
+    metrics::{
+        self,
+        flicker::{self, flicker},
+    },
     passes::Pass,
     planes::Planes,
     testset::Pair,
@@ -22,6 +25,7 @@ pub const NO_FLICKER: &str = "no flicker";
 /// A frame that another follows, and the methods' results on it.
 pub struct Before<'a> {
     pair: &'a Pair,
+    pairs: &'a [Pair],
     view_layer: Option<&'a str>,
     reference: Option<Planes>,
     images: HashMap<String, Planes>,
@@ -42,14 +46,20 @@ impl<'a> Followed<'a> {
         Self { pairs, view_layer, held: HashMap::new() }
     }
 
+    /// The test set.
+    pub fn pairs(&self) -> &'a [Pair] {
+        self.pairs
+    }
+
     /// Keeps a method's result on a frame, if another frame follows it.
     pub fn keep(&mut self, pair: &Pair, reference: &Planes, method: &str, image: &Planes) {
         let Some(own) = self.pairs.iter().find(|other| *other == pair) else { return };
         if !self.pairs.iter().any(|other| is_next(other, pair)) {
             return;
         }
-        let view_layer = self.view_layer;
-        let held = self.held.entry(own.noisy.as_path()).or_insert_with(|| Before::new(own, view_layer));
+        let (pairs, view_layer) = (self.pairs, self.view_layer);
+        let held =
+            self.held.entry(own.noisy.as_path()).or_insert_with(|| Before::new(own, pairs, view_layer));
         held.reference.get_or_insert_with(|| reference.clone());
         held.images.insert(method.into(), image.clone());
     }
@@ -58,19 +68,27 @@ impl<'a> Followed<'a> {
     /// were kept are given away.
     pub fn before(&mut self, pair: &Pair) -> Option<Before<'a>> {
         let before = self.pairs.iter().find(|other| is_next(pair, other))?;
-        Some(self.held.remove(before.noisy.as_path()).unwrap_or_else(|| Before::new(before, self.view_layer)))
+        let new = || Before::new(before, self.pairs, self.view_layer);
+        Some(self.held.remove(before.noisy.as_path()).unwrap_or_else(new))
     }
 }
 
 /// Whether `pair` is the frame right after `before` in the same scene, at the same sample count.
 pub fn is_next(pair: &Pair, before: &Pair) -> bool {
     let is_same = (&pair.scene, pair.spp) == (&before.scene, before.spp);
-    is_same && follows(&pair.noisy, &before.noisy)
+    is_same && follows(&pair.noisy, &before.noisy) && !are_seeds(pair, before)
+}
+
+/// Whether two pairs show one frame with other noise, whatever the numbers in their names: without frames of their own,
+/// they have one reference.
+pub fn are_seeds(pair: &Pair, other: &Pair) -> bool {
+    let is_frame = |pair: &Pair| pair.frame.is_some();
+    pair.reference == other.reference && !(is_frame(pair) && is_frame(other))
 }
 
 impl<'a> Before<'a> {
-    fn new(pair: &'a Pair, view_layer: Option<&'a str>) -> Self {
-        Self { pair, view_layer, reference: None, images: HashMap::new(), loaded: None }
+    fn new(pair: &'a Pair, pairs: &'a [Pair], view_layer: Option<&'a str>) -> Self {
+        Self { pair, pairs, view_layer, reference: None, images: HashMap::new(), loaded: None }
     }
 
     /// The flicker of a method from this frame to `next`, on which its result is `image`; none where no pixel
@@ -106,11 +124,10 @@ impl<'a> Before<'a> {
     fn make(&mut self, method: &Contender) -> Result<(), String> {
         let lost = |why: &dyn std::fmt::Display| format!("of the frame before: {why}");
         if self.loaded.is_none() {
-            let mut loaded = load(self.pair, self.view_layer).map_err(|e| lost(&e))?;
-            loaded.read_neighbours(super::settings::REACH, self.view_layer);
-            self.loaded = Some(loaded);
+            self.loaded = Some(load(self.pair, self.view_layer).map_err(|e| lost(&e))?);
         }
         let loaded = self.loaded.as_mut().expect("it was loaded above");
+        loaded.read_neighbours(method.denoiser.reach(), self.view_layer, (self.pair, self.pairs));
         if method.denoiser.reads_halves() {
             loaded.shot.read_halves().map_err(|e| lost(&e))?;
         }
@@ -118,6 +135,7 @@ impl<'a> Before<'a> {
             NOISY => loaded.noisy().clone(),
             _ => attempt(&self.pair.noisy, || method.denoiser.denoise(&loaded.shot)).map_err(|e| lost(&e))?,
         };
+        metrics::check(&image, &loaded.reference).map_err(|why| lost(&why))?;
         self.reference.get_or_insert_with(|| loaded.reference.clone());
         self.images.insert(method.name.clone(), image);
         Ok(())

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 
 use super::{
     Contender, EvalOptions, NOISY,
-    followed::{Before, Followed, NO_FLICKER},
+    followed::{Before, Followed, NO_FLICKER, are_seeds},
     rows::Row,
     sheet::Shown,
 };
@@ -82,9 +82,18 @@ impl Loaded {
     }
 
     /// Reads the frames around the noisy one that lie beside it, for methods that make use of them; those
-    /// that cannot be read are left out.
-    pub fn read_neighbours(&mut self, reach: usize, view_layer: Option<&str>) {
+    /// that cannot be read are left out, as are those that the test set says are the same frame. What is read stays.
+    pub fn read_neighbours(
+        &mut self,
+        reach: usize,
+        view_layer: Option<&str>,
+        (pair, pairs): (&Pair, &[Pair]),
+    ) {
         for (offset, path) in denoise::neighbours(&self.shot.passes.path, reach) {
+            let is_seed = pairs.iter().any(|other| other.noisy == path && are_seeds(pair, other));
+            if is_seed || self.shot.neighbours.contains_key(&offset) {
+                continue;
+            }
             if let Ok(shot) = shot::prepare(&path, view_layer) {
                 self.shot.neighbours.insert(offset, shot.passes);
             }
@@ -137,7 +146,7 @@ impl PairRun<'_> {
             Ok(())
         };
         let reach = self.methods.iter().map(|method| method.denoiser.reach()).max().unwrap_or(0);
-        loaded.read_neighbours(reach, view_layer);
+        loaded.read_neighbours(reach, view_layer, (self.pair, carried.followed.pairs()));
         let mut before = carried.followed.before(self.pair);
         let mut rows: Vec<Option<Row>> = Vec::new();
         let mut images = Vec::new();

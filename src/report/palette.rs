@@ -23,10 +23,11 @@ pub fn is_own(name: &str) -> bool {
     family(name) == Family::Own
 }
 
-/// The family of a method by its name. A name that is not in the catalogue is a weights file and counts as
-/// own.
+/// The family of a method by its name, whatever its variant (`kpcn:f32`). A name that is not in the catalogue is a weights
+/// file and counts as own.
 fn family(name: &str) -> Family {
-    catalogue::find(name).map_or(Family::Own, |method| method.family)
+    let plain = name.split(':').next().unwrap_or(name);
+    catalogue::find(plain).map_or(Family::Own, |method| method.family)
 }
 
 fn hue(family: Family) -> RGBColor {
@@ -73,6 +74,14 @@ mod tests {
     use std::collections::HashSet;
 
     use super::*;
+
+    #[test]
+    fn variants_are_of_their_methods_family() {
+        assert!(
+            ["demc-s:temporal", "demc-m:unrestrained", "run/best.safetensors:f32"].into_iter().all(is_own)
+        );
+        assert!(["lbf:f32", "kpcn:bf16", "noisy"].into_iter().all(|name| !is_own(name)));
+    }
 
     #[test]
     fn every_method_of_the_contract_has_a_colour_of_its_own() {

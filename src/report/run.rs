@@ -71,6 +71,8 @@ struct Evaluation<'a> {
     /// What the rows in the folder are made with; stored in `run.json`.
     settings: Settings,
     table: Table,
+    /// How many rows earlier runs measured.
+    kept: usize,
 }
 
 impl<'a> Evaluation<'a> {
@@ -104,11 +106,12 @@ impl<'a> Evaluation<'a> {
                 earlier.dropped
             )));
         }
-        on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept: earlier.kept.len() });
+        let kept = earlier.kept.len();
+        on(EvalEvent::Start { rows: pairs.len() * methods.len(), kept });
         let table = Table::create(scores, earlier.kept, earlier.others)?;
         let sheets: Vec<String> = pairs.iter().map(|pair| sheet_name(pairs, pair)).collect();
         let mut evaluation =
-            Self { pairs, methods, options, sheets: sheets.clone(), provenance, settings, table };
+            Self { pairs, methods, options, sheets: sheets.clone(), provenance, settings, table, kept };
         for (pair, sheet) in pairs.iter().zip(sheets) {
             // It is noted again when it is drawn. If this run is killed before that, the old sheet is not taken
             // for one of the new rows.
@@ -179,6 +182,7 @@ impl<'a> Evaluation<'a> {
             summaries: &summaries,
             charts: &charts,
             scenes: &scenes,
+            kept: self.kept,
             options: self.options,
             provenance: &self.provenance,
         }

@@ -129,9 +129,15 @@ impl Sequence<'_> {
         let Some(size) = sizes().next().filter(|size| sizes().all(|other| other == *size)) else {
             return Ok(None);
         };
-        // The name of the first frame's sheet, without the frame.
+        // The name of the first frame's sheet, without the frame where all that there are follow each other.
+        let is_apart = |pair: &Pair| {
+            let first = self.first();
+            (&pair.scene, pair.spp) == (&first.scene, first.spp) && !self.pairs.contains(&pair)
+        };
+        let name = sheet_name(self.all, self.first());
         let frame = self.first().frame.as_ref().map(|frame| format!(".{frame}")).unwrap_or_default();
-        let path = out.join("slices").join(sheet_name(self.all, self.first()).replacen(&frame, "", 1));
+        let name = if self.all.iter().any(is_apart) { name } else { name.replacen(&frame, "", 1) };
+        let path = out.join("slices").join(name);
         prepare_folder(path.parent().expect("it lies in a folder"))?;
         write_png(&path, &stack(&strips, size)?)?;
         Ok(Some(path))

@@ -9,7 +9,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    path::PathBuf,
+    path::{Path, PathBuf},
 };
 
 use super::{Trial, TrialRow};
@@ -103,27 +103,28 @@ impl Case {
 /// The cases of all frames as they were rendered, in the order of the rows.
 pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
     let mut groups: BTreeMap<usize, Vec<&TrialRow>> = BTreeMap::new();
-    let mut order: Vec<(&str, u32, &str)> = Vec::new();
+    let mut order: Vec<(&str, &Path, u32, &str)> = Vec::new();
     for row in rows.iter().filter(|row| row.trial == Trial::AsRendered.name()) {
-        let key = (row.scene.as_str(), row.spp, row.model.as_str());
+        let key = (row.scene.as_str(), row.reference.as_path(), row.spp, row.model.as_str());
         let at = order.iter().position(|known| *known == key).unwrap_or_else(|| {
             order.push(key);
             order.len() - 1
         });
         groups.entry(at).or_default().push(row);
     }
-    let of = |scene: &str, spp: u32, model: &str| {
-        let at = order.iter().position(|known| *known == (scene, spp, model));
+    let of = |(scene, reference, spp): (&str, &Path, u32), model: &str| {
+        let at = order.iter().position(|known| *known == (scene, reference, spp, model));
         at.map(|at| groups[&at].as_slice()).unwrap_or_default()
     };
     let case = |(at, own): (&usize, &Vec<&TrialRow>)| {
-        let (scene, spp, model) = order[*at];
+        let (scene, reference, spp, model) = order[*at];
+        let frame = (scene, reference, spp);
         let values = |value: fn(&TrialRow) -> Option<f64>| -> Vec<f64> {
             own.iter().filter_map(|row| value(row)).collect()
         };
         let relmse = values(|row| row.relmse);
         let against = |other: &str| {
-            let other = of(scene, spp, other);
+            let other = of(frame, other);
             let ratios = own.iter().filter_map(|row| {
                 let twin = other.iter().find(|twin| twin.noisy == row.noisy)?;
                 Some(row.relmse? / twin.relmse.filter(|error| *error > 0.0)?)
@@ -131,10 +132,10 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
             geometric_mean(&ratios.collect::<Vec<f64>>())
         };
         let is_exact = |row: &&&TrialRow| {
-            of(scene, spp, NOISY).iter().any(|twin| twin.noisy == row.noisy && twin.relmse == Some(0.0))
+            of(frame, NOISY).iter().any(|twin| twin.noisy == row.noisy && twin.relmse == Some(0.0))
         };
         let harm = own.iter().filter(is_exact).filter_map(|row| row.relmse).fold(0.0, f64::max);
-        let input: Vec<f64> = of(scene, spp, NOISY).iter().filter_map(|row| row.energy).collect();
+        let input: Vec<f64> = of(frame, NOISY).iter().filter_map(|row| row.energy).collect();
         let mut case = Case {
             scene: scene.into(),
             spp,

@@ -44,6 +44,8 @@ pub struct TrialRow {
     pub spp: u32,
     /// The noisy file: renders of one scene and sample count differ in their noise.
     pub noisy: PathBuf,
+    /// The reference; renders of one scene with several of them are different frames.
+    pub reference: PathBuf,
     /// Name of the trial.
     pub trial: &'static str,
     /// RelMSE against the part of the reference that the changed frame shows.
@@ -138,6 +140,7 @@ pub fn run(
                     model: method.name.clone(),
                     spp: pair.spp,
                     noisy: pair.noisy.clone(),
+                    reference: pair.reference.clone(),
                     trial: trial.name(),
                     ..TrialRow::default()
                 };
@@ -270,6 +273,10 @@ fn measure(
     }
     // Half buffers beside the frame do not have the change, so the shot is made without them.
     let shot = Shot::new(trial.change(&loaded.shot.passes));
+    if !trial.touches(&loaded.shot.passes, &shot.passes) {
+        row.note = "skipped: the frame holds nothing that this changes".into();
+        return Ok(());
+    }
     let image = trial.undo(method.denoiser.denoise(&shot)?);
     let reference = trial.seen(&loaded.reference);
     metrics::check(&image, &reference).map_err(|why| Error::invalid(&shot.passes.path, why))?;

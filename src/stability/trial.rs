@@ -175,6 +175,16 @@ impl Trial {
         }
     }
 
+    /// Whether a frame holds anything that this changes, by what [`Trial::change`] made of it.
+    pub fn touches(self, before: &PassSet, after: &PassSet) -> bool {
+        match self {
+            Self::AsRendered => true,
+            // As they are read, normals of other renderers may be put right to the last bit.
+            Self::UnitNormals | Self::WorldNormals => before.get(Pass::DenoisingNormal).is_some(),
+            _ => !after.holds_the_same(before),
+        }
+    }
+
     /// The changed frame; values may be NaN.
     pub fn change(self, passes: &PassSet) -> PassSet {
         if let Some(augment) = self.augment() {

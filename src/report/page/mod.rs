@@ -38,6 +38,8 @@ pub struct Page<'a> {
     pub scenes: &'a [(&'a Pair, Option<PathBuf>)],
     /// What sequences look like over time, where there are any.
     pub sequences: Option<&'a Markup>,
+    /// How many of the rows earlier runs measured.
+    pub kept: usize,
     /// How it was run.
     pub options: &'a EvalOptions,
     /// What it was run with and on.
@@ -264,10 +266,17 @@ impl Page<'_> {
             (
                 "times",
                 format!(
-                    "denoising alone, without file traffic; all methods took turns{}, each run after one that warms up",
+                    "denoising alone, without file traffic; all methods took turns{}, each run after one that warms up{}",
                     match self.options.repeats {
                         1 => String::new(),
                         repeats => format!(" {repeats} times, whose median counts"),
+                    },
+                    match self.kept {
+                        0 => String::new(),
+                        kept => format!(
+                            "; {kept} of {} rows are of earlier runs, and times of different runs are not comparable",
+                            self.rows.len()
+                        ),
                     }
                 ),
             ),
