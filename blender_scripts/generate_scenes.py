@@ -25,11 +25,13 @@ import csv
 import logging
 import os
 import random
+import re
 import sys
 import time
 import traceback
 
 import bpy
+import numpy
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 
@@ -46,6 +48,7 @@ from demc_scenes.kinds import KINDS
 _LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
 _LEAST_CLEAN = 512  # of a pixel in a clean one
 _CLEAN_RATIO = 8  # frames of more than one in so many of its samples, a denoised reference is too coarse for
+_LIT = re.compile(r"(Diffuse|Glossy|Transmission) (?:Direct|Indirect)\.([RGB])$")
 _DROPPED = (".Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
@@ -423,12 +426,20 @@ def render_compact(scene, path):
 
 
 def write_mean(folder, name, files):
-    """Writes the mean of several renders, of the guides too."""
+    """Writes the mean of several renders, of the guides too. Light that Cycles stores divided by a colour is averaged as
+    light."""
     frames = [exr.read(os.path.join(folder, file)) for file in files]
-    exr.write_half(
-        os.path.join(folder, name),
-        {c: sum(frame[c].astype("f4") for frame in frames) / len(frames) for c in frames[0]},
-    )
+
+    def mean(of):
+        return sum(of(frame) for frame in frames) / len(frames)
+
+    means = {c: mean(lambda frame, c=c: frame[c].astype("f4")) for c in frames[0]}
+    for c in frames[0]:
+        colour = _LIT.sub(r"\1 Color.\2", c)
+        if colour != c and colour in means:
+            lit = mean(lambda frame, c=c, colour=colour: frame[c].astype("f4") * frame[colour].astype("f4"))
+            means[c] = lit / numpy.maximum(means[colour], 1e-6) * (means[colour] > 0)
+    exr.write_half(os.path.join(folder, name), means)
 
 
 def render_scene(options, library, records, ledger, seed, kind, scene_name):
