@@ -557,7 +557,9 @@ mod tests {
         let (w, _) = SIZE;
         let wall = noisy(0.3);
         let radiance = planes(|c, x, y| if x < 40 { wall.channel(c)[y * w + x] } else { 0.0 });
-        let alpha = Planes::from_rows(1, SIZE, |_, _, row| row[..40].fill(1.0));
+        let alpha = Planes::from_rows(1, SIZE, |_, _, row| {
+            row.iter_mut().enumerate().for_each(|(x, alpha)| *alpha = if x < 40 { 1.0 } else { 0.0 });
+        });
         let mut image = planes(|c, x, y| picture(c, x, y) * if x < 40 { 1.0 } else { 1e-3 });
         let before = image.clone();
         let render = Render {
