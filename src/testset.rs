@@ -237,27 +237,29 @@ impl TestSet {
 
     /// Names scenes apart and sorts, once all files are in.
     fn finish(&mut self) {
-        self.number_frames();
         self.name_apart();
+        self.number_frames();
         sort(&mut self.pairs);
         self.unmatched.sort_by_cached_key(|u| match u {
             Unmatched::Noisy(Pair { noisy: path, .. }) | Unmatched::Reference(path) => path.clone(),
         });
     }
 
-    /// Takes the number at the end of a noisy file's name for the frame's where a scene has other references for other
-    /// files, and no frames by their names.
+    /// Where a scene has several files, each with a reference of its own, takes the number at the end of a noisy file's
+    /// name for the frame's. Noise seeds share a reference.
     fn number_frames(&mut self) {
-        let mut references: HashMap<(String, u32), BTreeSet<PathBuf>> = HashMap::new();
+        let mut references: HashMap<(String, u32), Vec<PathBuf>> = HashMap::new();
         for pair in &self.pairs {
             let of_scene = references.entry((pair.scene.clone(), pair.spp)).or_default();
-            of_scene.insert(pair.reference.clone());
+            of_scene.push(pair.reference.clone());
         }
+        let are_frames =
+            |all: &Vec<PathBuf>| all.len() > 1 && all.iter().collect::<BTreeSet<_>>().len() == all.len();
         for pair in self.pairs.iter_mut().filter(|pair| pair.frame.is_none()) {
             let stem = pair.noisy.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
             let number = stem.rsplit_once('.').map(|(_, number)| number);
             let is_number = |text: &&str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-            if references[&(pair.scene.clone(), pair.spp)].len() > 1 {
+            if are_frames(&references[&(pair.scene.clone(), pair.spp)]) {
                 pair.frame = number.filter(is_number).map(str::to_owned);
             }
         }
@@ -503,6 +505,28 @@ mod tests {
         assert_eq!(ids(&set), ["s_0008spp.0002", "z_0004spp"]);
         assert_eq!(set.pairs[1].noisy, dir.path().join("x.exr"));
         assert!(set.unmatched[0].to_string().contains("gone.exr"));
+    }
+
+    #[test]
+    fn frames_of_a_manifest_have_references_of_their_own_and_noise_seeds_share_one() {
+        let names = ["beauty.1.exr", "beauty.2.exr", "clean.1.exr", "clean.2.exr"];
+        let dir = folder(&names);
+        for inner in ["day", "night"] {
+            std::fs::create_dir(dir.path().join(inner)).unwrap();
+            names.iter().for_each(|name| std::fs::write(dir.path().join(inner).join(name), b"").unwrap());
+        }
+        let frames = |lines: &str| {
+            let file = dir.path().join("set.csv");
+            std::fs::write(&file, format!("scene,noisy,reference,spp\n{lines}")).unwrap();
+            let set = read(file.to_str().unwrap()).unwrap();
+            set.pairs.into_iter().map(|pair| pair.frame).collect::<Vec<_>>()
+        };
+        let numbers = [Some("1".to_owned()), Some("2".to_owned())];
+        assert_eq!(frames("s,beauty.1.exr,clean.1.exr,4\ns,beauty.2.exr,clean.2.exr,4\n"), numbers);
+        let seeds = "s,day/beauty.1.exr,day/clean.1.exr,4\ns,day/beauty.2.exr,day/clean.1.exr,4\n";
+        assert_eq!(frames(seeds), [None, None]);
+        let more = format!("{seeds}s,night/beauty.1.exr,night/clean.1.exr,4\n");
+        assert_eq!(frames(&more), [None, None, None], "another folder changes nothing");
     }
 
     #[test]

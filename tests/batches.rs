@@ -191,12 +191,17 @@ fn results_that_were_made_otherwise_are_told_and_kept() {
         let why = format!("was made with {made}, and was kept; --overwrite makes it with {now}");
         contains(format!("demc: note: out{}a.exr: {why}", std::path::MAIN_SEPARATOR))
     };
-    let made = "--model mine.safetensors:f32 --alpha keep";
+    let made = "--model weights/mine.safetensors:f32 --alpha keep";
     run("a.exr --out out --model demc-s").stderr(told(made, "--model demc-s"));
     run("a.exr --out out --model weights/mine.safetensors:f32 --wrap x")
-        .stderr(told(made, "--model mine.safetensors:f32 --wrap x"));
+        .stderr(told(made, "--model weights/mine.safetensors:f32 --wrap x"));
     run("a.exr --out out --model weights/mine.safetensors:f32 --alpha keep --map albedo=Colour")
         .stderr(told(made, &format!("{made} --map 'Denoising Albedo=Colour'")));
+    // Weights of every run are called alike.
+    fs::create_dir(folder.path().join("other")).unwrap();
+    fs::copy(weights, folder.path().join("other/mine.safetensors")).unwrap();
+    run("a.exr --out out --model other/mine.safetensors:f32 --alpha keep")
+        .stderr(told(made, "--model other/mine.safetensors:f32 --alpha keep"));
     // Each layer was made in its own way.
     run("out --out more --layer Second --model demc-s");
     run("out --out more --layer Second --model demc-s").stderr(is_made().not());

@@ -516,6 +516,29 @@ fn alpha_is_that_of_the_picture_it_was_rendered_with() {
 }
 
 #[test]
+fn view_layers_called_like_passes_keep_their_results() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("env.exr");
+    let names = ["Combined.R", "Combined.G", "Combined.B"].map(|name| format!("forest.env.{name}"));
+    Render::new().write(&path, &names.iter().map(String::as_str).zip(0..).collect::<Vec<_>>());
+    for said in ["128x128", "is there already"] {
+        let mut command = demc();
+        command.args(["denoise", "--model", "noisy"]).arg(&path).arg("--out").arg(dir.path().join("out"));
+        command.assert().success().stdout(predicates::str::contains(said));
+    }
+}
+
+#[test]
+fn an_alpha_of_no_other_picture_is_the_beautys() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("renderman.exr");
+    let guides = [("albedo.R", 3), ("albedo.G", 4), ("albedo.B", 5), ("N.X", 6), ("N.Y", 7), ("N.Z", 8)];
+    Render::new().write(&path, &[&[("Ci.r", 0), ("Ci.g", 1), ("Ci.b", 2), ("a", 3)][..], &guides].concat());
+    let result = read_exr(denoise(&path, &["--map", "beauty=Ci", "--alpha", "keep"]));
+    assert_eq!(values(&result, "Denoised.A"), values(&result, "a"));
+}
+
+#[test]
 fn what_was_replaced_is_told_by_its_own_name() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("two.exr");

@@ -24,7 +24,7 @@ _before = {}
 @persistent
 def _on_init(scene, _depsgraph=None):
     global _rendered
-    if _rendered is not None:
+    if _rendered is not None and _is_strip(scene, bpy.data.scenes.get(_rendered)):
         return
     _rendered = scene.name
     _written.clear()
@@ -40,6 +40,15 @@ def _on_write(scene, _depsgraph=None):
     for path in _files(scene):
         if scene.render.is_movie_format or _written_at(path) not in (None, _before.get(path)):
             _written.append(path)
+
+
+def _is_strip(scene, edit):
+    """Whether a scene is rendered for a strip of another one's sequencer."""
+    editor = edit.sequence_editor if edit else None
+    if editor is None or edit.name == scene.name:
+        return False
+    strips = editor.strips_all if hasattr(editor, "strips_all") else editor.sequences_all  # before 4.4
+    return any(strip.type == "SCENE" and strip.scene and strip.scene.name == scene.name for strip in strips)
 
 
 def _files(scene):

@@ -85,12 +85,21 @@ impl Default for Options {
     }
 }
 
+/// What the names of weights files end in.
+const WEIGHTS: &str = ".safetensors";
+
 impl Options {
     /// How a result is made: the options that decide what is in it and that nothing else in the file tells, as they
-    /// are said on the command line. Files go by their names, wherever they lie.
+    /// are said on the command line. Guides go by their names, wherever they lie, and weights by that of their folder too,
+    /// since every run's are called alike.
     fn method(&self, model: &dyn Denoiser) -> String {
         let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-        let mut said = vec![format!("--model {}", name(Path::new(model.name())))];
+        let weights = model.name().find(WEIGHTS).and_then(|at| {
+            let (file, variant) = model.name().split_at(at + WEIGHTS.len());
+            let place = Path::new(file).canonicalize().ok()?;
+            Some(format!("{}/{}{variant}", name(place.parent()?), name(&place)))
+        });
+        let mut said = vec![format!("--model {}", weights.as_deref().unwrap_or(model.name()))];
         match self.alpha {
             Alpha::Auto => {}
             Alpha::Denoise => said.push("--alpha denoise".into()),
@@ -219,7 +228,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         let mut shot = shot::prepare_layer(&frame, layer, &wanted, &options.sources)?;
         shot.wraps = options.wrap.of(&frame, layer.passes[&Pass::Combined].part);
         if options.wrap == Wrap::X && !shot.wraps {
-            let why = "the frame is a part of the panorama's width, whose edges do not meet (--wrap x)";
+            let why = "the data window is not as wide as the display window, so that its edges do not meet (--wrap x)";
             report.notes.push(why.into());
         }
         report.notes.extend(shot.normals.take());

@@ -2,12 +2,7 @@
 //! together with columns from the other side of the frame, so that no seam shows where a viewer joins them.
 
 use crate::{
-    Result,
-    companion::Companion,
-    frame::{Frame, Window},
-    models::ExpectedError,
-    passes::PassSet,
-    planes::Planes,
+    Result, companion::Companion, frame::Frame, models::ExpectedError, passes::PassSet, planes::Planes,
     shot::Shot,
 };
 
@@ -18,7 +13,7 @@ pub enum Wrap {
     /// wide as the whole.
     #[default]
     Auto,
-    /// They meet.
+    /// They meet, in parts that are as wide as the whole.
     X,
     /// They do not, whatever the file says.
     None,
@@ -27,8 +22,8 @@ pub enum Wrap {
 impl Wrap {
     /// Whether the edges of this part of a frame meet.
     pub(super) fn of(self, frame: &Frame, part: usize) -> bool {
-        let across = |window: Window| (window.x, window.width);
-        let is_whole = across(frame.parts()[part].data_window) == across(frame.display_window());
+        // A region of the whole, or one with more around it, ends where it ends.
+        let is_whole = frame.parts()[part].data_window.width == frame.display_window().width;
         match self {
             Self::Auto => frame.is_latitude_longitude() && is_whole,
             Self::X => is_whole,

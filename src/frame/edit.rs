@@ -41,13 +41,12 @@ const MARK: &str = "demc";
 /// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
 /// view layer.
 const EXPECTED_ERROR: &str = "demcExpectedError";
-/// Attributes with something of each layer that demc made: two lines a layer, its [`UNSTORABLE`]-free name first.
-///
-/// The frames by number that it was made without.
+// What is noted of each layer that demc made, in pairs of lines: the layer's name, and below it what is noted.
+/// Attribute with the frames by number that layers were made without.
 const LACKED: &str = "demcLacked";
-/// How many frames before and after it was made with.
+/// Attribute with how many frames before and after layers were made with.
 const REACH: &str = "demcNeighbours";
-/// How it was made.
+/// Attribute with how layers were made.
 const METHOD: &str = "demcMethod";
 /// Attributes that another part of the same picture does not take over; nor does it take those of
 /// cryptomattes.

@@ -91,7 +91,7 @@ impl ChannelName {
         let (view_layer, pass) = joined.or(prefix.rsplit_once('.')).unwrap_or(("", prefix));
         // A denoised pass: `ViewLayer.Diffuse Direct.Denoised`. Two names alone are a view layer's and a
         // pass's: a view layer may be called like a pass.
-        let is_rendered = |name: &str| is_alike_blender(name) || light_group(name).is_some();
+        let is_rendered = |name: &str| is_blender(name) || light_group(name).is_some();
         let of_pass =
             view_layer.rsplit_once('.').filter(|(_, owner)| is_rendered(owner) && !is_rendered(pass));
         let (view_layer, pass) =
@@ -255,8 +255,8 @@ fn take_unnamed_beauty(frame: &Frame, found: &mut Vec<(LayerKey, ByPass)>) {
     }
 }
 
-/// In files of one part, passes without a view in their names belong to the default view, unless that has a
-/// pass of the same name.
+/// Where no part says of which view it is, passes without a view in their names belong to the default view, unless that has
+/// a pass of the same name.
 fn join_default_view(found: &mut Vec<(LayerKey, ByPass)>, default: &str) {
     let without: Vec<LayerKey> =
         found.iter().filter(|((_, view), _)| view.is_none()).map(|(key, _)| key.clone()).collect();

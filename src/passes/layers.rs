@@ -163,7 +163,8 @@ fn assign((name, view): LayerKey, channels: &ByPass, mapping: &Mapping, part: Op
     layer
 }
 
-/// Leaves as alpha only that of the picture which is the beauty, unless the user names another.
+/// Leaves as alpha that of the picture which is the beauty, or one that is of no other picture, unless the user names
+/// another.
 fn belong_alpha(passes: &mut BTreeMap<Pass, PassChannels>, channels: &ByPass, mapping: &Mapping) {
     let named = |pass| mapping.iter().find(|(named, _)| *named == pass).map(|(_, name)| name);
     if named(Pass::Alpha) != named(Pass::Combined) {
@@ -173,17 +174,22 @@ fn belong_alpha(passes: &mut BTreeMap<Pass, PassChannels>, channels: &ByPass, ma
     let all = || channels.values().flatten();
     let is_red = |place: &&Place| (place.part, place.channel) == (beauty.part, beauty.channels[0]);
     let Some(red) = all().find(is_red) else { return };
-    let is_beside = |place: &&Place| (place.part, place.prefix()) == (red.part, red.prefix());
-    let alpha = all().filter(is_beside).find(|place| is_component(&place.component, "A"));
-    let found = alpha.map(|place| PassChannels {
-        part: place.part,
-        channels: vec![place.channel],
-        name: beauty.name.clone(),
-    });
-    match found {
-        Some(alpha) => passes.insert(Pass::Alpha, alpha),
-        None => passes.remove(&Pass::Alpha),
+    let beside = |of: &Place, component: &str| {
+        let is_it = |place: &&Place| {
+            (place.part, place.prefix()) == (of.part, of.prefix())
+                && is_component(&place.component, component)
+        };
+        all().find(is_it)
     };
+    if let Some(own) = beside(red, "A") {
+        let (part, channels, name) = (own.part, vec![own.channel], beauty.name.clone());
+        passes.insert(Pass::Alpha, PassChannels { part, channels, name });
+    } else if let Some(found) = passes.get(&Pass::Alpha) {
+        let is_found = |place: &&Place| (place.part, place.channel) == (found.part, found.channels[0]);
+        if all().find(is_found).is_some_and(|place| beside(place, "R").is_some()) {
+            passes.remove(&Pass::Alpha);
+        }
+    }
 }
 
 /// The names of the channels that are of no pass.
