@@ -141,7 +141,7 @@ fn has_cycles_normal(layer: &Layer) -> bool {
     // Programs write spaces and capitals otherwise.
     let names = Pass::DenoisingNormal.blender_names();
     let found = layer.passes.get(&Pass::DenoisingNormal);
-    found.is_some_and(|at| names.iter().any(|name| passes::plain(name) == passes::plain(&at.name)))
+    found.is_some_and(|at| names.iter().any(|name| passes::is_alike(name, &at.name)))
 }
 
 /// A guide in a file of its own: the pass, by its name, or what the file holds without one.

@@ -160,12 +160,7 @@ fn parse_name(file_name: &str) -> Option<Name<'_>> {
     if !extension.eq_ignore_ascii_case("exr") {
         return None;
     }
-    let all_digits = |s: &str| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit());
-    // A negative frame is written `-0003` by Blender.
-    let (stem, frame) = match stem.rsplit_once('.') {
-        Some((rest, frame)) if all_digits(frame.strip_prefix('-').unwrap_or(frame)) => (rest, Some(frame)),
-        _ => (stem, None),
-    };
+    let (stem, frame) = split_frame(stem);
     let (scene, kind) = stem.rsplit_once('_')?;
     if scene.is_empty() {
         return None;
@@ -175,6 +170,19 @@ fn parse_name(file_name: &str) -> Option<Name<'_>> {
     }
     let digits = kind.strip_suffix("spp").filter(|d| all_digits(d))?;
     Some(Name { scene, spp: Some(digits.parse().ok()?), frame })
+}
+
+/// Whether a text is a number.
+fn all_digits(text: &str) -> bool {
+    !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit())
+}
+
+/// A name without its extension, and the frame behind its last dot. A negative one is written `-0003` by Blender.
+fn split_frame(stem: &str) -> (&str, Option<&str>) {
+    match stem.rsplit_once('.') {
+        Some((rest, frame)) if all_digits(frame.strip_prefix('-').unwrap_or(frame)) => (rest, Some(frame)),
+        _ => (stem, None),
+    }
 }
 
 /// Pairs files by name within their directory. If `report_references`, references without a noisy render are
@@ -257,10 +265,8 @@ impl TestSet {
             |all: &Vec<PathBuf>| all.len() > 1 && all.iter().collect::<BTreeSet<_>>().len() == all.len();
         for pair in self.pairs.iter_mut().filter(|pair| pair.frame.is_none()) {
             let stem = pair.noisy.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
-            let number = stem.rsplit_once('.').map(|(_, number)| number);
-            let is_number = |text: &&str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
             if are_frames(&references[&(pair.scene.clone(), pair.spp)]) {
-                pair.frame = number.filter(is_number).map(str::to_owned);
+                pair.frame = split_frame(stem).1.map(str::to_owned);
             }
         }
     }

@@ -72,6 +72,9 @@ impl Render {
     }
 }
 
+/// Names that many programs use.
+const PLAIN: [&str; 9] = ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"];
+
 /// The names of colours, albedo and normal, in the order of a render's planes.
 fn channels<'a>(names: &[&'a str; 9]) -> Vec<(&'a str, usize)> {
     names.iter().enumerate().map(|(plane, name)| (*name, plane)).collect()
@@ -277,9 +280,8 @@ fn normals_of_any_kind_become_those_of_cycles() {
     let dir = tempfile::tempdir().unwrap();
     let expected = expected(dir.path());
     let path = dir.path().join("arnold.exr");
-    let names = ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"];
     let check = |change: &dyn Fn([f32; 3]) -> [f32; 3], word: &str| {
-        Render::new().with_normals(change).write(&path, &channels(&names));
+        Render::new().with_normals(change).write(&path, &channels(&PLAIN));
         let said = said(&path, &[]);
         assert!(said.contains(word), "{word}: {said}");
         let got = layer(&path.with_extension("out").join("arnold.exr"), "Denoised");
@@ -367,7 +369,7 @@ fn a_picture_that_a_file_holds_twice_is_read_once() {
     let folder = tempfile::tempdir().unwrap();
     let render = Render::new();
     let expected = expected(folder.path());
-    let guides = [("albedo.R", 3), ("albedo.G", 4), ("albedo.B", 5), ("N.X", 6), ("N.Y", 7), ("N.Z", 8)];
+    let guides = &channels(&PLAIN)[3..];
     for (name, other) in
         [("upper", ["Beauty.R", "Beauty.G", "Beauty.B"]), ("lower", ["rgb.R", "rgb.G", "rgb.B"])]
     {
@@ -375,7 +377,7 @@ fn a_picture_that_a_file_holds_twice_is_read_once() {
         let path = folder.path().join(format!("{name}.exr"));
         let bare = [("R", 0), ("G", 1), ("B", 2)];
         let twice: Vec<(&str, usize)> = other.iter().zip(3..).map(|(name, plane)| (*name, plane)).collect();
-        render.write(&path, &[&bare[..], &twice, &guides].concat());
+        render.write(&path, &[&bare[..], &twice, guides].concat());
         assert!(layer(&denoise(&path, &[]), "Denoised") == expected, "{name}");
         // The layer can be asked for.
         let (layer_name, _) = other[0].split_once('.').unwrap();
@@ -406,7 +408,7 @@ fn names_of_parts_mean_nothing_where_channels_say_it() {
         .write_parts(&path, &[("whatever", None, colour), ("N", None, normal), ("albedo", None, albedo)]);
     assert!(layer(&denoise(&path, &[]), "Denoised") == expected);
     // Channels with names of their own in a part of another.
-    let full = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    let full = channels(&PLAIN);
     Render::new().write_parts(&path, &[("rgbleft", Some("left"), &full), ("rgbright", Some("right"), &full)]);
     let result = read_exr(denoise(&path, &[]));
     let added: Vec<_> = result
@@ -481,7 +483,6 @@ fn alpha_is_that_of_the_picture_it_was_rendered_with() {
     let dir = tempfile::tempdir().unwrap();
     let bare = [("R", 0), ("G", 1), ("B", 2), ("A", 3)];
     // A layer of the user's, and MoonRay's, beside what programs show.
-    let any = ["albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"];
     let moonray = [
         "denoise_albedo.R",
         "denoise_albedo.G",
@@ -491,9 +492,9 @@ fn alpha_is_that_of_the_picture_it_was_rendered_with() {
         "denoise_normal.Z",
     ];
     for (name, options, guides) in
-        [("key", &["--map", "beauty=key"][..], any), ("denoise_rgba", &[], moonray)]
+        [("key", &["--map", "beauty=key"][..], &PLAIN[3..]), ("denoise_rgba", &[], &moonray)]
     {
-        let guides: Vec<(&str, usize)> = guides.into_iter().zip(3..).collect();
+        let guides: Vec<(&str, usize)> = guides.iter().copied().zip(3..).collect();
         for has_alpha in [false, true] {
             let path = dir.path().join(format!("{name}_{has_alpha}.exr"));
             let own: Vec<String> = ["R", "G", "B", "A"].map(|c| format!("{name}.{c}")).into();
@@ -532,8 +533,8 @@ fn view_layers_called_like_passes_keep_their_results() {
 fn an_alpha_of_no_other_picture_is_the_beautys() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("renderman.exr");
-    let guides = [("albedo.R", 3), ("albedo.G", 4), ("albedo.B", 5), ("N.X", 6), ("N.Y", 7), ("N.Z", 8)];
-    Render::new().write(&path, &[&[("Ci.r", 0), ("Ci.g", 1), ("Ci.b", 2), ("a", 3)][..], &guides].concat());
+    let guides = &channels(&PLAIN)[3..];
+    Render::new().write(&path, &[&[("Ci.r", 0), ("Ci.g", 1), ("Ci.b", 2), ("a", 3)][..], guides].concat());
     let result = read_exr(denoise(&path, &["--map", "beauty=Ci", "--alpha", "keep"]));
     assert_eq!(values(&result, "Denoised.A"), values(&result, "a"));
 }
@@ -542,7 +543,7 @@ fn an_alpha_of_no_other_picture_is_the_beautys() {
 fn what_was_replaced_is_told_by_its_own_name() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("two.exr");
-    let bare = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    let bare = channels(&PLAIN);
     Render::new().write(&path, &[&bare[..], &[("key.R", 2), ("key.G", 1), ("key.B", 0)]].concat());
     let key = ["--replace", "--map", "beauty=key"];
     let result = denoise(&path, &key);
@@ -578,7 +579,7 @@ fn parts_that_hold_the_same_names_are_not_mixed() {
         ("N.Y", 6),
         ("N.Z", 7),
     ];
-    let own = channels(&["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z"]);
+    let own = channels(&PLAIN);
     Render::new().write_parts(&path, &[("subimage00", None, &other), ("subimage01", None, &own)]);
     assert!(layer(&denoise(&path, &["--map", "beauty=subimage01"]), "Denoised") == expected);
 }

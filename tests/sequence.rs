@@ -509,14 +509,7 @@ fn stills_and_single_frames_are_denoised_as_ever() {
 fn a_sequence_is_scored_as_it_is_denoised() {
     let dir = sequence(SHOT, 1..=4);
     let reference = |n: i64| dir.path().join(format!("shot_ref.{n:04}.exr"));
-    for n in 1..=4 {
-        let channel = |(c, name): (usize, &str)| {
-            let truth = (0..SIZE.0 * SIZE.1).map(|i| SHOT.truth(c, i, n)).collect();
-            AnyChannel::new(format!("ViewLayer.Combined.{name}").as_str(), FlatSamples::F32(truth))
-        };
-        let list = ["R", "G", "B"].into_iter().enumerate().map(channel).collect();
-        write_channels(&reference(n), SIZE, list, &[]);
-    }
+    (1..=4).for_each(|n| write_truth(&reference(n), n));
     let out = dir.path().join("report");
     let eval = || {
         let mut command = Command::cargo_bin("demc").unwrap();

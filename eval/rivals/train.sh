@@ -2,8 +2,8 @@
 # Trains the paper's networks and the learned rivals on the same data, each for the same processor time:
 #   eval/rivals/train.sh DATA HELD_OUT OUT SECONDS [NAME...]
 # DATA and HELD_OUT are folders or manifests of pairs, to train on and to validate on. Learning rates fall over as many
-# steps as fit nine tenths of the time on one thread with AVX512-BF16 beside a busy one; the environment variable SPEED corrects that for
-# another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
+# steps as fit nine tenths of the time on one thread with AVX512-BF16 beside a busy one; the environment variable SPEED
+# corrects that for another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
 # the budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where
 # it was stopped: OUT/NAME.seconds holds the time used so far.
 set -eu

@@ -134,12 +134,13 @@ pub fn parse_reach(text: &str) -> Result<u8> {
 pub fn short_name(name: &str, all: &[&str]) -> String {
     let Some(file) = weights_file(name) else { return name.into() };
     let stem = |name: &str| {
-        let plain = plain(name);
+        let plain = models::without_variant(name);
         let stem = Path::new(plain).file_stem()?.to_string_lossy().into_owned();
         Some(stem + &name[plain.len()..])
     };
     let with_folder = |name: &str| {
-        let folder = Path::new(plain(name)).parent()?.file_name()?.to_string_lossy().into_owned();
+        let folder =
+            Path::new(models::without_variant(name)).parent()?.file_name()?.to_string_lossy().into_owned();
         Some(format!("{folder}/{}", stem(name)?))
     };
     let tells_nothing = file.file_stem().is_none_or(|stem| {
@@ -159,19 +160,16 @@ fn is_unique(own: &str, name: &str, all: &[&str], named: impl Fn(&str) -> Option
 
 /// The weights file that a method's name names.
 fn weights_file(name: &str) -> Option<&Path> {
-    Some(Path::new(plain(name))).filter(|path| path.is_file())
+    Some(Path::new(models::without_variant(name))).filter(|path| path.is_file())
 }
 
 /// The weights file of a method, by its name or by that of the file; none where the program holds them.
 fn weights_of(name: &str) -> Option<PathBuf> {
-    let known = || models::catalogue::find(plain(name)).and_then(models::catalogue::Method::weights_file);
+    let known = || {
+        models::catalogue::find(models::without_variant(name))
+            .and_then(models::catalogue::Method::weights_file)
+    };
     weights_file(name).map(Into::into).or_else(known)
-}
-
-/// What names the method or the file, without what is asked for behind it.
-fn plain(name: &str) -> &str {
-    let name = models::split_precision(name).0;
-    models::split_precision(name.strip_suffix(models::UNRESTRAINED).unwrap_or(name)).0
 }
 
 /// The noisy renders of a test set. References without a noisy render are named on stderr; renders without a

@@ -16,7 +16,7 @@ use crate::{
     Error, Result,
     companion::Companion,
     frame::{Frame, NewChannel, Recoded, SampleKind, UNSTORABLE},
-    models::{Denoiser, ExpectedError, check_expects},
+    models::{Denoiser, ExpectedError, check_expects, without_variant},
     passes::{
         self, COMBINED, COMPOSITE, Layer, NOISY_IMAGE, Pass, PassChannels, PassSet, is_bare, light_group,
     },
@@ -85,18 +85,15 @@ impl Default for Options {
     }
 }
 
-/// What the names of weights files end in.
-const WEIGHTS: &str = ".safetensors";
-
 impl Options {
     /// How a result is made: the options that decide what is in it and that nothing else in the file tells, as they
     /// are said on the command line. Guides go by their names, wherever they lie, and weights by that of their folder too,
     /// since every run's are called alike.
     fn method(&self, model: &dyn Denoiser) -> String {
         let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-        let weights = model.name().find(WEIGHTS).and_then(|at| {
-            let (file, variant) = model.name().split_at(at + WEIGHTS.len());
-            let place = Path::new(file).canonicalize().ok()?;
+        let file = Path::new(without_variant(model.name()));
+        let weights = file.extension().and_then(|_| {
+            let (place, variant) = (file.canonicalize().ok()?, &model.name()[file.as_os_str().len()..]);
             Some(format!("{}/{}{variant}", name(place.parent()?), name(&place)))
         });
         let mut said = vec![format!("--model {}", weights.as_deref().unwrap_or(model.name()))];

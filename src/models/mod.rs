@@ -85,6 +85,12 @@ pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
     }
 }
 
+/// What names a method or a weights file, without the variant asked for behind it.
+pub fn without_variant(name_or_file: &str) -> &str {
+    let name = split_precision(name_or_file).0;
+    split_precision(name.strip_suffix(UNRESTRAINED).unwrap_or(name)).0
+}
+
 /// The widths of a network when the widths `asked` are wanted. `semc` gets those at which it is as large as a
 /// `demc` of the widths asked for, and every other network gets the latter as they are.
 pub fn widths(architecture: Architecture, asked: &[usize]) -> Vec<usize> {

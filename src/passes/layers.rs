@@ -6,8 +6,8 @@ use super::{
     Mapping, Pass, PassSet, Quantity,
     channels::{ByPass, LayerKey, Place, by_pass, is_component},
     names::{
-        BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_bare, is_common,
-        light_group, plain,
+        BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_alike, is_bare,
+        is_common, light_group, plain,
     },
 };
 use crate::{
@@ -155,10 +155,10 @@ fn assign((name, view): LayerKey, channels: &ByPass, mapping: &Mapping, part: Op
         let found = find_components(pass_name, candidates, Pass::Combined, part);
         layer.light_groups.extend(found.map(|at| (group.to_owned(), at)));
     }
-    let motion = |name: &&String| renderer.motion.iter().any(|known| plain(known) == plain(name));
+    let motion = |name: &&String| renderer.motion.iter().any(|known| is_alike(known, name));
     layer.motion = channels.keys().find(motion).cloned();
     let position = layer.passes.get(&Pass::Position);
-    layer.position_averaged = position.is_some_and(|at| plain(&at.name) == plain(POSITION_AOV));
+    layer.position_averaged = position.is_some_and(|at| is_alike(&at.name, POSITION_AOV));
     layer.unrecognised = unrecognised(&layer, &index);
     layer
 }

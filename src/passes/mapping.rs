@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, fs, path::Path};
 
-use super::{Layer, Pass, layers::within, names::plain};
+use super::{Layer, Pass, layers::within, names::is_alike};
 use crate::{Error, Result};
 
 /// Short words for what is named most; any pass of Blender's is known by its own name as well.
@@ -32,7 +32,7 @@ impl Mapping {
         }
         let short =
             WORDS.iter().find(|(short, _)| short.eq_ignore_ascii_case(word)).map(|(_, passes)| *passes);
-        let own = Pass::ALL.iter().position(|pass| plain(&pass.to_string()) == plain(word));
+        let own = Pass::ALL.iter().position(|pass| is_alike(&pass.to_string(), word));
         let own = own.map(|at| &Pass::ALL[at..=at]);
         let passes = short.or(own).ok_or_else(|| {
             let words: Vec<&str> = WORDS.iter().map(|(word, _)| *word).collect();
@@ -80,8 +80,8 @@ impl Mapping {
         // An alpha that goes with the beauty need not be there.
         let mut wanted = self.iter().filter(|(pass, _)| *pass != Pass::Alpha);
         let is_found = |(pass, name): &(Pass, &str)| {
-            let own = plain(within(&layer.name, name));
-            layer.passes.get(pass).is_some_and(|at| plain(&at.name) == own)
+            let own = within(&layer.name, name);
+            layer.passes.get(pass).is_some_and(|at| is_alike(&at.name, own))
         };
         let Some((pass, name)) = wanted.find(|named| !is_found(named)) else { return Ok(()) };
         let mut held: Vec<&str> = layer.passes.values().map(|at| at.name.as_str()).collect();

@@ -24,7 +24,7 @@ pub use layers::{
 };
 pub use mapping::Mapping;
 pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
-pub(crate) use names::{light_group, plain};
+pub(crate) use names::{is_alike, light_group};
 pub use normals::{Change, Turn, to_camera_space};
 
 use crate::{Error, Result, frame::Frame, planes::Planes};

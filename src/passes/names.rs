@@ -394,6 +394,11 @@ pub fn plain(name: &str) -> String {
     name.chars().filter(|c| c.is_alphanumeric()).flat_map(char::to_lowercase).collect()
 }
 
+/// Whether two names are the same but for what programs change about them.
+pub fn is_alike(one: &str, other: &str) -> bool {
+    plain(one) == plain(other)
+}
+
 /// Every name of every renderer, [`plain`].
 static KNOWN: LazyLock<HashSet<String>> = LazyLock::new(|| {
     let rows = RENDERERS.iter().flat_map(|renderer| renderer.rows);
