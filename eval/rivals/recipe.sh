@@ -11,7 +11,7 @@ recipe() {
         demc) rate=345 ;;
         demc-nofusion) rate=400 ;;
         semc) rate=290 ;;
-        demc-paper) model=demc optimizer=adam widths=64,128,256,512,512 rate=69 lr=3e-4 batch=4 ;;
+        demc-paper) model=demc optimizer=adam widths=64,128,256,512,512 rate=69 lr=1e-4 decay=0 leak=0 batch=4 ;;
         # In two streams it takes light passes; of Combined alone, any frame.
         kpcn) widths=64 rate=111 loss=smape lr=2e-3 decay=0.1 leak=0 patch=32 ;;
         kpcn-combined) widths=64 rate=215 loss=smape lr=2e-3 decay=0.1 leak=0 patch=32 ;;
@@ -20,11 +20,13 @@ recipe() {
     esac
 }
 
-# Prints the options of `demc train` for the method whose recipe is set, and a number of steps.
+# Prints the options of `demc train` for the method whose recipe is set, and a number of steps. Another SEED in the
+# environment begins with other weights and draws other crops; RAW=1 is for references that were cleaned.
 options() {
     # Weights are averaged over the last 20th of the steps.
     average=$(awk "BEGIN { print ($1 > 20 ? 1 - 20 / $1 : 0) }")
     last=$(awk "BEGIN { print $lr / 100 }")
     echo "--model $model --widths $widths --steps $1 --average $average --lr $lr:$last --loss $loss --patch $patch" \
-        "--batch $batch --tint $tint --optimizer $optimizer --weight-decay $decay --leak $leak --seed 1"
+        "--batch $batch --tint $tint --optimizer $optimizer --weight-decay $decay --leak $leak" \
+        "--seed ${SEED:-1} ${RAW:+--raw-references}"
 }

@@ -3,9 +3,11 @@
 #   eval/rivals/train.sh DATA HELD_OUT OUT SECONDS [NAME...]
 # DATA and HELD_OUT are folders or manifests of pairs, to train on and to validate on. Learning rates fall over as many
 # steps as fit nine tenths of the time on one thread with AVX512-BF16 beside a busy one; the environment variable SPEED
-# corrects that for another processor (0.5 for one of half the speed). One thread each, one after another. A run that is cut by
-# the budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where
-# it was stopped: OUT/NAME.seconds holds the time used so far.
+# corrects that for another processor (0.5 for one of half the speed), SEED takes another seed than 1, RAW=1 has errors taken
+# against what clean_references.py cleaned as it was rendered. One thread each, one after another. A run that is cut by the
+# budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where it was stopped,
+# also with more SECONDS: OUT/NAME.seconds holds the time used so far. Of a run that goes astray, OUT/NAME/at-*.safetensors
+# are checkpoints to go back to.
 set -eu
 data=$1 held_out=$2 out=$3 seconds=$4
 shift 4
@@ -34,20 +36,26 @@ for name in "$@"; do
         if [ "$spent" -ge "$seconds" ]; then continue; fi
         run "$name" --resume &
     else
-        every=$((steps / 15 > 0 ? steps / 15 : 1))
+        every=$((steps / 30 > 0 ? steps / 30 : 1))
         # shellcheck disable=SC2046 # the options are words
         run "$name" --data "$data" --val "$held_out" --every "$every" $(options "$steps") &
     fi
     pid=$!
     # A shell's background jobs do not hear Ctrl-C.
     trap 'kill -TERM $pid 2>/dev/null; wait $pid; exit 130' INT TERM HUP
-    used=$spent
+    used=$spent kept=0
     while kill -0 $pid 2>/dev/null; do
         sleep 1
         # Processor time, so that a busy machine takes nothing from any of them.
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
         if [ -n "$time" ]; then used=$((spent + time)); fi
         echo "$used" >"$out/$name.seconds"
+        # The checkpoint is of the last minute, so one is kept for every five validations.
+        rows=$(wc -l <"$out/$name/log.csv" 2>/dev/null || echo 0)
+        if [ "$rows" -ge $((kept + 5)) ] && [ -e "$out/$name/checkpoint.safetensors" ]; then
+            cp "$out/$name/checkpoint.safetensors" "$out/$name/at-$rows.safetensors"
+            kept=$rows
+        fi
         if [ "$used" -ge "$seconds" ]; then kill -TERM $pid 2>/dev/null || true; break; fi
     done
     status=0

@@ -4,7 +4,7 @@
 
 Each <scene>_ref[.FRAME].exr is denoised by Open Image Denoise, quality high. Its guides, which are denoised
 first, are its own albedo and normal, or those of the scene's noisy frame where it has none. The reference as
-rendered is kept in it as Noisy Image. Noisy frames are copied as they are, and files that exist already are
+rendered is kept in it as Noisy Image. Noisy frames and manifest.csv are copied as they are, and files that exist already are
 kept. With --join N, for references of N samples, the reference is first averaged with the scene's frame of N
 samples. That frame is then no longer one of the pairs, since a network would learn to keep the noise that
 both share.
@@ -108,6 +108,9 @@ def main():
     parser.add_argument("--join", type=int, metavar="N", help="average references with the frames of N samples")
     options = parser.parse_args()
     os.makedirs(options.out, exist_ok=True)
+    manifest = os.path.join(options.pairs, "manifest.csv")
+    if options.join is None and os.path.exists(manifest):
+        shutil.copy(manifest, options.out)
     with tempfile.TemporaryDirectory() as folder:
         for scene, source, noisy in pairs(options.pairs):
             target = os.path.join(options.out, os.path.basename(source))
