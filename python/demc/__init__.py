@@ -1,7 +1,8 @@
 """Removes Monte Carlo noise from Blender Cycles renders.
 
 `denoise` takes numpy arrays, `denoise_file` an EXR file; `inspect` tells what a file holds, `compare` how far
-one file is from another. The command `demc` is installed beside this module and makes the same bits.
+one file is from another, `models` which models there are. The command `demc` is installed beside this module and makes the
+same bits.
 """
 
 import atexit
@@ -14,7 +15,7 @@ import numpy as np
 from . import _demc
 from ._demc import Error, __version__
 
-__all__ = ["Error", "Report", "__version__", "compare", "denoise", "denoise_file", "inspect"]
+__all__ = ["Error", "Report", "__version__", "compare", "denoise", "denoise_file", "inspect", "models"]
 
 # Daemon threads may be in a call when Python ends, and must not take its lock any more.
 atexit.register(_demc.leave)
@@ -29,6 +30,9 @@ class Report(typing.TypedDict):
     view_layer: str
     width: int
     height: int
+    samples: int | None
+    was_denoised: bool
+    expected_error: float | None
     seconds: float
     repaired: dict[str, int]
     notes: list[str]
@@ -37,9 +41,12 @@ class Report(typing.TypedDict):
 def _image(name, image, shape=None):
     if not isinstance(image, np.ndarray):
         raise ValueError(f"{name} is a {type(image).__name__}; give a numpy array of shape (H, W, 3)")
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise ValueError(f"{name} has shape {image.shape}; give (H, W, 3), without alpha")
-    if image.dtype not in (np.float32, np.float16):
+    if shape is not None and len(shape) == 2:
+        if image.ndim != 2:
+            raise ValueError(f"{name} has shape {image.shape}; give (H, W)")
+    elif image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{name} has shape {image.shape}; give (H, W, 3), and alpha by itself")
+    if image.dtype.type not in (np.float32, np.float16):
         raise ValueError(f"{name} is of {image.dtype}; give float32 or float16")
     if shape is not None and image.shape != shape:
         raise ValueError(f"{name} has shape {image.shape}, color {shape}; give arrays of one render")
@@ -73,13 +80,23 @@ def _lines(names):
     return [f"{word}={name}" for word, name in (names or {}).items()]
 
 
-def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, threads=None):
-    """Denoised radiance, an array of the shape and dtype of `color`.
+def _like(values, image):
+    """A flat float32 array, shaped and typed like an image."""
+    values = values.reshape(image.shape)
+    if image.dtype.type is np.float16:
+        values = values.clip(-_HALF_MAX, _HALF_MAX)
+    return values.astype(image.dtype, copy=False)
+
+
+def denoise(color, albedo=None, normal=None, model="demc-m", *, alpha=None, samples=None, threads=None):
+    """Denoised radiance, an array of the shape and dtype of `color`; with `alpha`, a pair of radiance and alpha.
 
     color: noisy linear radiance (Combined), shape (H, W, 3), float32 or float16.
     albedo, normal: Cycles' Denoising Albedo (0 to 1) and Denoising Normal (-1 to 1, camera space), of the
         same shape, float32 or float16. The built-in networks do without either, at a loss of detail.
-    model: a name that `demc models` lists, or a weights file.
+    model: a name that `models` lists, or a weights file.
+    alpha: of a transparent film, shape (H, W), float32 or float16. The built-in networks denoise it where it differs from
+        pixel to pixel, so that it fits the colours over any background, and leave empty pixels empty; others return it.
     samples: samples per pixel of the render. Some models decide by it how much they trust a pixel; files tell
         it in their metadata, arrays cannot.
     threads: how many threads to use; None for all cores.
@@ -88,47 +105,57 @@ def denoise(color, albedo=None, normal=None, model="demc-m", *, samples=None, th
     released; after Ctrl-C the call ends at once, and the work in the background when the model has done.
 
     ValueError: arrays that do not fit, an unknown model, or arrays that the model needs and that are missing.
-    Error: the model cannot denoise the frame.
+    Error: the model cannot denoise the frame, or most of it is not finite.
     """
     radiance = _image("color", color)
     guides = [
         None if guide is None else _image(name, guide, color.shape)
         for name, guide in [("albedo", albedo), ("normal", normal)]
     ]
+    coverage = None if alpha is None else _image("alpha", alpha, color.shape[:2])
     counts = _count("samples", samples, 65535), _count("threads", threads, _demc.MOST_THREADS)
-    result = _demc.denoise_arrays(radiance, *guides, _path("model", model), *counts).reshape(color.shape)
-    if color.dtype == np.float16:
-        result = result.clip(-_HALF_MAX, _HALF_MAX).astype(np.float16)
-    return result
+    result, share = _demc.denoise_arrays(radiance, *guides, coverage, _path("model", model), *counts)
+    result = _like(result, color)
+    return result if alpha is None else (result, _like(share, alpha))
 
 
 def denoise_file(
-    source, out, model="demc-m", *, overwrite=False, view_layer=None, albedo=None, normal=None, names=None, threads=None
+    source, out, model="demc-m", *, overwrite=False, view_layer=None, layer="Denoised", passes=False, alpha="auto",
+    confidence=False, albedo=None, normal=None, names=None, threads=None
 ):
     """Denoises an EXR file into another: all that it held, and the layer `Denoised`. Byte for byte what the
     command writes.
 
     source, out: paths of two files; the folder of `out` must exist.
-    model: a name that `demc models` lists, or a weights file.
+    model: a name that `models` lists, or a weights file.
     overwrite: whether a file at `out` is replaced.
     view_layer: the view layer to denoise; None for the one with the most passes.
+    layer: the name of the layer added; None to replace the beauty in place of that.
+    passes: whether light passes and light groups are denoised too, so that they add up to the beauty.
+    alpha: "auto", "denoise" or "keep", as of `demc denoise --alpha`.
+    confidence: whether a layer is added that tells how far off each pixel is expected to be.
     albedo, normal: paths of files that hold those alone, of renderers that write a file for each pass.
     names: a dict of what the file calls passes, where their names do not tell: {"albedo": "my colour"}; the
         words are those of `demc denoise --map`.
     threads: how many threads to use; None for all cores.
 
-    Returns a `Report`, a dict: view_layer; width and height in pixels; seconds in the model; repaired, the count of
-    values that were not finite by pass; notes, a list of what is good to know.
+    Returns a `Report`, a dict: view_layer; width and height in pixels; samples of a pixel, None where the file does not
+    tell; was_denoised, whether Blender had done so and its Noisy Image was taken; expected_error, the RelMSE expected of
+    the result, None where the model does not tell; seconds in the model; repaired, the count of values that were not finite
+    by pass; notes, a list of what is good to know.
 
-    ValueError: an unknown model, or `out` is `source`.
+    ValueError: an unknown model, options that it cannot meet, or `out` is `source`.
     Error: a file cannot be read or written, lacks a pass, or exists without `overwrite`. `out` is whole, or
-    not there; after Ctrl-C it is not begun.
+    not there; after Ctrl-C it is not begun. A process that ends within that may leave a file `.demc-*.tmp` beside it.
     """
     source, out, model = _path("source", source), _path("out", out), _path("model", model)
     guides = tuple(None if path is None else _path(name, path) for name, path in (("albedo", albedo), ("normal", normal)))
     lines = _lines(names)
-    if not isinstance(view_layer, str | None):
-        raise ValueError(f"view_layer is a {type(view_layer).__name__}; give its name, or None")
+    for name, text in (("view_layer", view_layer), ("layer", layer)):
+        if not isinstance(text, str | None):
+            raise ValueError(f"{name} is a {type(text).__name__}; give its name, or None")
+    if not isinstance(alpha, str):
+        raise ValueError(f'alpha is a {type(alpha).__name__}; give "auto", "denoise" or "keep"')
     if os.path.exists(out):
         read = [source, *(path for path in guides if path is not None)]
         if any(os.path.exists(path) and os.path.samefile(path, out) for path in read):
@@ -136,8 +163,16 @@ def denoise_file(
         if not overwrite:
             raise Error(f"{out}: exists; overwrite=True replaces it, or choose another out")
     threads = _count("threads", threads, _demc.MOST_THREADS)
-    values = _demc.denoise_path(source, out, model, view_layer, guides, lines, threads)
-    return dict(zip(("view_layer", "width", "height", "seconds", "repaired", "notes"), values))
+    options = layer, bool(passes), alpha, bool(confidence)
+    return _demc.denoise_path(source, out, model, view_layer, guides, lines, options, threads)
+
+
+def models():
+    """The models there are: the list of dicts of `demc models --json` (model, weights, parameters, passes ...).
+
+    Error: a weights file cannot be read.
+    """
+    return json.loads(_demc.models_json())
 
 
 def inspect(path):
@@ -149,12 +184,20 @@ def inspect(path):
     return json.loads(_demc.inspect_json(_path("path", path)))
 
 
-def compare(image, reference):
+def compare(image, reference, *, view_layer=None, layer=None, reference_layer=None):
     """How far an EXR file is from its reference: a dict of the metrics of `demc compare`, by name.
 
-    Where `image` has a layer `Denoised`, that is judged, else Combined. A metric that is not defined on the
-    two is None.
+    view_layer: the view layer to compare; None for the one of `image` with the most passes and its namesake.
+    layer: the layer of `image` to judge; None for `Denoised` where there is one, else Combined.
+    reference_layer: the layer of `reference` to judge it by; None for Combined.
 
-    Error: a file cannot be read, or the images differ in size or place or hold values that are not finite.
+    A metric that is not defined on the two is None.
+
+    Error: a file cannot be read or lacks a layer, or the images differ in size or place or hold values that are not
+    finite.
     """
-    return dict(_demc.compare_files(_path("image", image), _path("reference", reference)))
+    layers = {"view_layer": view_layer, "layer": layer, "reference_layer": reference_layer}
+    for name, text in layers.items():
+        if not isinstance(text, str | None):
+            raise ValueError(f"{name} is a {type(text).__name__}; give its name, or None")
+    return dict(_demc.compare_files(_path("image", image), _path("reference", reference), list(layers.values())))

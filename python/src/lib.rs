@@ -11,24 +11,24 @@ use std::{
     path::PathBuf,
     process,
     sync::{
-        Arc, LazyLock, Mutex, PoisonError,
+        Arc, LazyLock, Mutex, OnceLock, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
         mpsc::{RecvTimeoutError, channel},
     },
-    thread,
+    thread::{self, ThreadId},
     time::Duration,
 };
 
 use demc::{
     Error as Failure,
-    denoise::{self, Options},
+    denoise::{self, Alpha, Options},
     models::{self, Denoiser},
     passes::{Mapping, Pass, PassSet},
     planes::Planes,
     shot::Shot,
     sources::Sources,
 };
-use numpy::{PyArray1, PyReadonlyArray3, ndarray::Axis};
+use numpy::{PyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::{create_exception, exceptions, prelude::*};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
@@ -77,17 +77,18 @@ static LOADED_IN: LazyLock<u32> = LazyLock::new(process::id);
 /// `work`.
 fn detached<T: Send + 'static>(
     py: Python<'_>,
-    threads: Option<usize>,
+    threads: Option<u16>,
     work: impl FnOnce(&AtomicBool) -> demc::Result<T> + Send + 'static,
 ) -> PyResult<T> {
     let stopped = Arc::new(AtomicBool::new(false));
     let (done, result) = channel();
     let asked = Arc::clone(&stopped);
-    thread::spawn(move || {
+    let run = move || {
         // Starting many threads takes long too, so that is done here.
         let guarded = AssertUnwindSafe(|| {
             let pool = match threads {
                 Some(count) => {
+                    let count = demc::cli::useful_threads(count).into();
                     ThreadPoolBuilder::new().num_threads(count).build().map(|pool| Some(Arc::new(pool)))
                 }
                 None => forked_pool(),
@@ -100,14 +101,17 @@ fn detached<T: Send + 'static>(
         let outcome = catch_unwind(guarded)
             .unwrap_or_else(|_| Err(Failure::Internal("its message is on standard error".into())));
         let _ = done.send(outcome);
-    });
+    };
+    let started = thread::Builder::new().spawn(run);
+    started.map_err(|error| Error::new_err(format!("no thread can be started: {error}")))?;
     let result = Mutex::new(result);
     let _call = Call::begin();
     loop {
         let received = py.detach(|| {
             let received = result.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(LOOK);
-            // Python's lock is nobody's any more. Whoever asks for it is ended in a way that Rust does not survive.
-            while ENDS.load(Ordering::SeqCst) {
+            // Python's lock is the ending thread's alone. Whoever else asks for it is ended in a way that Rust does not
+            // survive.
+            while ENDS_IN.get().is_some_and(|ending| *ending != thread::current().id()) {
                 thread::park();
             }
             received
@@ -124,8 +128,8 @@ fn detached<T: Send + 'static>(
     }
 }
 
-/// Whether Python ends, and how many calls are under way.
-static ENDS: AtomicBool = AtomicBool::new(false);
+/// The thread in which Python ends, once it does, and how many calls are under way.
+static ENDS_IN: OnceLock<ThreadId> = OnceLock::new();
 static CALLS: AtomicUsize = AtomicUsize::new(0);
 
 /// A call that is under way.
@@ -147,7 +151,7 @@ impl Drop for Call {
 /// Called when Python ends: calls in daemon threads, which nobody waits for, do not come back to it.
 #[pyfunction]
 fn leave(py: Python<'_>) {
-    ENDS.store(true, Ordering::SeqCst);
+    let _ = ENDS_IN.set(thread::current().id());
     if CALLS.load(Ordering::SeqCst) > 0 {
         // Those that have seen the result, or look for Ctrl-C just now, still need the lock.
         py.detach(|| thread::sleep(3 * LOOK));
@@ -170,11 +174,18 @@ fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
     Ok(model)
 }
 
-fn planes(image: &PyReadonlyArray3<'_, f32>) -> Planes {
-    let image = image.as_array();
-    let (height, width, _) = image.dim();
-    let channels = (0..3).flat_map(|c| image.index_axis_move(Axis(2), c).into_iter().copied());
-    Planes::from_vec(3, width, height, channels.collect())
+/// An array (H, W, C) whose values lie in that order, as planes.
+fn planes(py: Python<'_>, values: &[f32], (height, width, channels): (usize, usize, usize)) -> Planes {
+    py.detach(|| {
+        let plane = |c: usize| values.iter().skip(c).step_by(channels).copied();
+        Planes::from_vec(channels, width, height, (0..channels).flat_map(plane).collect())
+    })
+}
+
+/// Planes as an array (H, W, C), flat.
+fn interleaved(planes: &Planes) -> Vec<f32> {
+    let pixels = planes.pixels();
+    (0..pixels).flat_map(|pixel| (0..planes.channels).map(move |c| planes.data[c * pixels + pixel])).collect()
 }
 
 /// What an array is called, of the passes that arrays are taken for.
@@ -207,38 +218,57 @@ fn check_passes(model: &dyn Denoiser, set: &PassSet) -> demc::Result<()> {
     )))
 }
 
-/// Radiance (H, W, 3), flat, of float32 arrays (H, W, 3) of one size, which the caller has checked.
+/// Flat arrays of radiance (H, W, 3) and of alpha (H, W), which is there if it was given.
+type Picture<'py> = (Bound<'py, PyArray1<f32>>, Option<Bound<'py, PyArray1<f32>>>);
+
+/// Of float32 arrays (H, W, 3), alpha (H, W), of one size, whose values lie in that order: the caller has checked.
 #[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python's function, which names each of them")]
 fn denoise_arrays<'py>(
     py: Python<'py>,
     color: PyReadonlyArray3<'py, f32>,
     albedo: Option<PyReadonlyArray3<'py, f32>>,
     normal: Option<PyReadonlyArray3<'py, f32>>,
+    alpha: Option<PyReadonlyArray2<'py, f32>>,
     model: String,
     samples: Option<u32>,
-    threads: Option<usize>,
-) -> PyResult<Bound<'py, PyArray1<f32>>> {
-    let color = planes(&color);
-    let mut set = PassSet::new("arrays", "", color.width, color.height);
+    threads: Option<u16>,
+) -> PyResult<Picture<'py>> {
+    let (height, width) = (color.shape()[0], color.shape()[1]);
+    let mut set = PassSet::new("arrays", "", width, height);
     set.samples = samples;
-    set.insert(Pass::Combined, color);
-    for (pass, image) in [(Pass::DenoisingAlbedo, albedo), (Pass::DenoisingNormal, normal)] {
+    let images =
+        [(Pass::Combined, Some(color)), (Pass::DenoisingAlbedo, albedo), (Pass::DenoisingNormal, normal)];
+    for (pass, image) in images {
         if let Some(image) = image {
-            set.insert(pass, planes(&image));
+            set.insert(pass, planes(py, image.as_slice()?, (height, width, 3)));
         }
     }
-    let radiance = detached(py, threads, move |_| {
+    if let Some(alpha) = alpha {
+        set.insert(Pass::Alpha, planes(py, alpha.as_slice()?, (height, width, 1)));
+    }
+    let (radiance, alpha) = detached(py, threads, move |_| {
         let model = open(&model)?;
         check_passes(&*model, &set)?;
-        denoise::shot(&Shot::new(set), &*model, &Options::default())
+        let (radiance, alpha) = denoise::shot(Shot::new(set), &*model, &Options::default())?;
+        Ok((interleaved(&radiance), alpha.map(|alpha| interleaved(&alpha))))
     })?;
-    let pixels = radiance.pixels();
-    let values = (0..3 * pixels).map(|i| radiance.data[i % 3 * pixels + i / 3]);
-    Ok(PyArray1::from_iter(py, values))
+    Ok((PyArray1::from_vec(py, radiance), alpha.map(|alpha| PyArray1::from_vec(py, alpha))))
 }
 
-/// View layer, width, height, seconds, repaired values by pass, notes.
-type Told = (String, usize, usize, f64, HashMap<String, usize>, Vec<String>);
+/// What is told of a file that was denoised, see `Report` in `__init__.py`.
+#[derive(IntoPyObject)]
+struct Told {
+    view_layer: String,
+    width: usize,
+    height: usize,
+    samples: Option<u32>,
+    was_denoised: bool,
+    expected_error: Option<f64>,
+    seconds: f64,
+    repaired: HashMap<String, usize>,
+    notes: Vec<String>,
+}
 
 /// Denoises a file.
 #[pyfunction]
@@ -251,7 +281,8 @@ fn denoise_path(
     view_layer: Option<String>,
     guides: (Option<PathBuf>, Option<PathBuf>),
     names: Vec<String>,
-    threads: Option<usize>,
+    added: (Option<String>, bool, String, bool),
+    threads: Option<u16>,
 ) -> PyResult<Told> {
     let report = detached(py, threads, move |stopped| {
         let mut mapping = Mapping::default();
@@ -260,7 +291,14 @@ fn denoise_path(
         }
         let (albedo, normal) = guides;
         let sources = Sources { mapping, albedo, normal };
-        let (model, options) = (open(&model)?, Options { view_layer, sources, ..Options::default() });
+        let (layer, passes, alpha, confidence) = added;
+        let known = Alpha::ALL.into_iter().find(|(name, _)| *name == alpha);
+        let (_, alpha) = known.ok_or_else(|| {
+            let names = Alpha::ALL.map(|(name, _)| name).join(", ");
+            Failure::Usage(format!("alpha is '{alpha}'; give one of {names}"))
+        })?;
+        let options = Options { view_layer, sources, layer, passes, alpha, confidence, ..Options::default() };
+        let model = open(&model)?;
         let denoised = denoise::denoise(denoise::load(&source, &*model, &options)?, &*model, &options)?;
         // Whoever pressed Ctrl-C meanwhile expects no file.
         if stopped.load(Ordering::SeqCst) {
@@ -268,8 +306,15 @@ fn denoise_path(
         }
         denoise::store(denoised, &out, &options)
     })?;
-    let repaired = report.repaired.into_iter().collect();
-    Ok((report.view_layer, report.width, report.height, report.seconds, repaired, report.notes))
+    let denoise::Report { view_layer, width, height, samples, was_denoised, expected_error, .. } = report;
+    let (seconds, repaired, notes) = (report.seconds, report.repaired.into_iter().collect(), report.notes);
+    Ok(Told { view_layer, width, height, samples, was_denoised, expected_error, seconds, repaired, notes })
+}
+
+/// What `demc models --json` prints.
+#[pyfunction]
+fn models_json(py: Python<'_>) -> PyResult<String> {
+    detached(py, None, |_| demc::cli::models_json())
 }
 
 /// What `demc inspect --json` prints.
@@ -284,8 +329,9 @@ fn compare_files(
     py: Python<'_>,
     image: PathBuf,
     reference: PathBuf,
+    layers: [Option<String>; 3],
 ) -> PyResult<Vec<(&'static str, Option<f64>)>> {
-    let scores = detached(py, None, move |_| demc::cli::compare_files(&image, &reference))?;
+    let scores = detached(py, None, move |_| demc::cli::compare_files(&image, &reference, layers))?;
     Ok(scores.named().into())
 }
 
@@ -305,6 +351,7 @@ fn _demc(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(denoise_arrays, module)?)?;
     module.add_function(wrap_pyfunction!(denoise_path, module)?)?;
     module.add_function(wrap_pyfunction!(inspect_json, module)?)?;
+    module.add_function(wrap_pyfunction!(models_json, module)?)?;
     module.add_function(wrap_pyfunction!(compare_files, module)?)?;
     module.add_function(wrap_pyfunction!(command, module)?)
 }

@@ -21,9 +21,10 @@ mod wrap;
 
 use std::path::Path;
 
-pub use batch::{Batch, End, Outcome, Stopper};
+pub use batch::{Batch, End, Finished, Outcome, Stopper};
 pub use job::{
-    Denoised, Job, Options, Report, Views, check_layer_name, check_options, denoise, load, shot, store,
+    Denoised, Job, Options, Report, Views, WritePicture, check_layer_name, check_options, denoise, load,
+    shot, store,
 };
 pub use lights::Alpha;
 pub use plan::{Input, Plan, plan, plan_tree};
@@ -34,14 +35,18 @@ pub use window::{Candidate, Candidates};
 pub use wrap::Wrap;
 
 pub use crate::frame_number::frame_number;
-use crate::{Result, models::Denoiser};
+use crate::{Error, Result, models::Denoiser};
 
 /// Reads a frame, denoises it and writes all of it, with the result as a new layer. A file that exists at
 /// `output` is replaced.
 ///
 /// # Errors
-/// The input is unusable or lacks a pass that the model needs, or the output cannot be written.
+/// The input is unusable or lacks a pass that the model needs, it is the output, the output cannot be written, or
+/// [`Options::temporal`] asks for neighbours, which a [`Batch`] reads.
 pub fn file(input: &Path, output: &Path, model: &dyn Denoiser, options: &Options) -> Result<Report> {
+    if options.temporal.is_some() {
+        return Err(Error::Usage("a file has no neighbours by itself: a batch takes frames together".into()));
+    }
     let loaded = load(input, model, options)?;
     store(denoise(loaded, model, options)?, output, options)
 }
