@@ -69,8 +69,8 @@ pub const PAPER_FEATURES: usize = 12;
 ///
 /// # Errors
 /// The Combined pass is missing.
-pub fn paper_colour(passes: &PassSet, needed_by: &str) -> Result<Planes> {
-    let mut colour = passes.require(Pass::Combined, needed_by)?.clone();
+pub fn paper_colour(passes: &PassSet) -> Result<Planes> {
+    let mut colour = passes.require(Pass::Combined, "demc")?.clone();
     colour.data.iter_mut().for_each(|v| *v = compress(*v));
     Ok(colour)
 }
@@ -80,8 +80,8 @@ pub fn paper_colour(passes: &PassSet, needed_by: &str) -> Result<Planes> {
 ///
 /// # Errors
 /// A pass is missing.
-pub fn paper_features(passes: &PassSet, needed_by: &str) -> Result<Planes> {
-    let get = |pass| passes.require(pass, needed_by);
+pub fn paper_features(passes: &PassSet) -> Result<Planes> {
+    let get = |pass| passes.require(pass, "demc");
     let mut features = Planes::new(PAPER_FEATURES, passes.width, passes.height);
     let n = 3 * features.pixels();
     let (normal, rest) = features.data.split_at_mut(n);
@@ -89,7 +89,7 @@ pub fn paper_features(passes: &PassSet, needed_by: &str) -> Result<Planes> {
     let (first_hit, second_hit) = rest.split_at_mut(n);
     normal.copy_from_slice(&get(Pass::Normal)?.data);
     position.copy_from_slice(&get(Pass::Position)?.data);
-    first_hit.copy_from_slice(&first_texture(passes, needed_by)?.data);
+    first_hit.copy_from_slice(&first_texture(passes, "demc")?.data);
     second_hit.copy_from_slice(&get(Pass::DenoisingAlbedo)?.data);
     (0..PAPER_FEATURES).for_each(|c| z_score(features.channel_mut(c)));
     Ok(features)
@@ -137,6 +137,9 @@ const ALBEDO_FLOOR: f32 = 0.05;
 /// white as 1. No inverse is needed, because the predicted kernels act on radiance itself.
 const STEEPNESS: f32 = 16.0;
 
+/// What needs the passes of a built-in model, in error messages.
+pub const NEEDED_BY: &str = "this model";
+
 /// Log-average luminance of radiance after exposure: photography's middle grey.
 const MIDDLE_GREY: f64 = 0.18;
 
@@ -155,9 +158,8 @@ pub fn guide_rows(
     rows: Range<usize>,
     size: (usize, usize),
     exposure: f32,
-    needed_by: &str,
 ) -> Result<PassSet> {
-    let radiance = passes.require(Pass::Combined, needed_by)?;
+    let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
     let tamed = tame_fireflies(radiance, rows.clone(), size, MIDDLE_GREY as f32 / exposure);
     let mut part = passes.padded_rows(&PREFILTERED_PASSES, rows, size);
     part.insert(Pass::Combined, tamed);
@@ -224,15 +226,10 @@ impl<T> LightInputs<T> {
 ///
 /// # Errors
 /// A pass is missing.
-pub fn light_inputs(
-    passes: &PassSet,
-    refined: Refined,
-    exposure: f32,
-    needed_by: &str,
-) -> Result<LightInputs> {
-    let radiance = passes.require(Pass::Combined, needed_by)?;
-    let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let noisy_normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+pub fn light_inputs(passes: &PassSet, refined: Refined, exposure: f32) -> Result<LightInputs> {
+    let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
+    let noisy = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+    let noisy_normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
     let Refined { albedo: clean, normal, shading } = refined;
     let unwritten = |channels: usize| Planes::unwritten(channels, passes.width, passes.height);
     let mut guide = unwritten(7);
@@ -308,16 +305,6 @@ fn map(values: &[f32], output: &mut [f32], of: impl Fn(f32) -> f32 + Sync) {
     output.par_iter_mut().zip(values).for_each(|(output, value)| *output = of(*value));
 }
 
-/// The pixels (x, y) of the 5x5 around one, itself included, that lie within a frame of `w` columns and `h`
-/// rows.
-#[inline]
-fn neighbours((x, y): (usize, usize), (w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
-    const REACH: usize = 2;
-    let around = |at: usize, end: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(end);
-    let columns = around(x, w);
-    around(y, h).flat_map(move |y| columns.clone().map(move |x| (x, y)))
-}
-
 /// A component of a normal, clamped to -1..1.
 #[inline(always)]
 fn unit(axis: f32) -> f32 {
@@ -373,9 +360,9 @@ impl<T> GuideInputs<T> {
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guide_inputs(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<GuideInputs> {
-    let noisy = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let rendered = passes.require(Pass::DenoisingNormal, needed_by)?;
+pub fn guide_inputs(passes: &PassSet, exposure: f32) -> Result<GuideInputs> {
+    let noisy = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+    let rendered = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
     let unwritten = || Planes::unwritten(3, passes.width, passes.height);
     let [mut albedo, mut normal, mut encoded, mut guide] = [(); 4].map(|()| unwritten());
     map(&noisy.data, &mut albedo.data, |a| divisor(a) * exposure);
@@ -405,9 +392,9 @@ impl Vectorised for Encode<'_> {
 ///
 /// # Errors
 /// A pass is missing.
-pub fn guide_targets(passes: &PassSet, needed_by: &str) -> Result<Planes> {
-    let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
-    let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+pub fn guide_targets(passes: &PassSet) -> Result<Planes> {
+    let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
+    let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
     let mut targets = Planes::unwritten(6, passes.width, passes.height);
     let (light, direction) = targets.data.split_at_mut(albedo.data.len());
     map(&albedo.data, light, divisor);
@@ -481,8 +468,7 @@ impl<F: Fn(f32) -> f32> Vectorised for Luminance<'_, F> {
         let Self { planes, rows, of, columns } = self;
         for (c, weight) in LUMINANCE.into_iter().enumerate() {
             for y in rows.clone() {
-                let row = &planes.channel(c)[y * planes.width..][..planes.width];
-                for (sum, v) in columns.iter_mut().zip(row) {
+                for (sum, v) in columns.iter_mut().zip(planes.row(c, y)) {
                     *sum += weight * f64::from(of(*v));
                 }
             }

@@ -36,18 +36,22 @@ mod tests {
 
     #[test]
     fn frame_numbers_end_names() {
-        for (name, expected) in [
-            ("shot_0004spp.0017.exr", Some(17)),
-            ("shot0017.exr", Some(17)),
-            ("a-3/shot-0017.exr", Some(17)),
-            ("shot.-0003.exr", Some(-3)),
-            ("shot_-0003.exr", Some(-3)),
-            ("0001.exr", Some(1)),
-            ("shot_0004spp.exr", None),
-            ("shot.exr", None),
+        for (stem, expected) in [
+            ("shot_0004spp.0017", Some(("shot_0004spp.", 17))),
+            ("shot0017", Some(("shot", 17))),
+            ("shot_10017", Some(("shot_", 10017))),
+            ("shot-0017", Some(("shot-", 17))),
+            ("shot.-0003", Some(("shot.", -3))),
+            ("shot_-0003", Some(("shot_", -3))),
+            ("0001", Some(("", 1))),
+            ("-0003", Some(("", -3))),
+            ("shot_0004spp", None),
+            ("shot", None),
+            ("a99999999999999999999", None),
         ] {
-            assert_eq!(frame_number(Path::new(name)), expected, "{name}");
+            assert_eq!(split(stem), expected, "{stem}");
         }
+        assert_eq!(frame_number(Path::new("a-3/shot-0017.exr")), Some(17));
     }
 
     #[test]

@@ -20,7 +20,7 @@ pub trait Values: Sync {
 
 impl Values for Planes {
     fn extent(&self) -> (usize, usize, usize) {
-        (self.channels, self.width, self.height)
+        self.extent()
     }
 
     fn read(&self, channel: usize, first: usize, out: &mut [f32]) {
@@ -90,6 +90,11 @@ impl Planes {
         planes
     }
 
+    /// Channels, pixels in a row, and rows.
+    pub fn extent(&self) -> (usize, usize, usize) {
+        (self.channels, self.width, self.height)
+    }
+
     /// Pixels in one plane.
     pub fn pixels(&self) -> usize {
         self.width * self.height
@@ -98,13 +103,31 @@ impl Planes {
     /// Planes of as many `channels`, each a copy of the first channel of these planes.
     pub fn of_first(&self, channels: usize) -> Self {
         Self::from_rows(channels, (self.width, self.height), |_, y, row| {
-            row.copy_from_slice(&self.channel(0)[y * self.width..][..self.width]);
+            row.copy_from_slice(self.row(0, y));
         })
     }
 
     /// One plane, row-major.
     pub fn channel(&self, c: usize) -> &[f32] {
         &self.data[c * self.pixels()..][..self.pixels()]
+    }
+
+    /// A row of a channel.
+    pub fn row(&self, c: usize, y: usize) -> &[f32] {
+        &self.channel(c)[y * self.width..][..self.width]
+    }
+
+    /// A row of each of the first three channels.
+    pub fn rows(&self, y: usize) -> [&[f32]; 3] {
+        [0, 1, 2].map(|c| self.row(c, y))
+    }
+
+    /// The pixels (x, y) at most `reach` rows and columns away from one, itself included.
+    #[inline]
+    pub fn near(&self, x: usize, y: usize, reach: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
+        let around = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
+        let columns = around(x, self.width);
+        around(y, self.height).flat_map(move |y| columns.clone().map(move |x| (x, y)))
     }
 
     /// One plane, row-major, writable.
@@ -174,8 +197,7 @@ impl Planes {
     pub fn turned(&self) -> Self {
         let (w, h) = (self.width, self.height);
         Self::from_rows(self.channels, (w, h), |c, y, out| {
-            let from = &self.channel(c)[(h - 1 - y) * w..][..w];
-            out.iter_mut().zip(from.iter().rev()).for_each(|(out, from)| *out = *from);
+            out.iter_mut().zip(self.row(c, h - 1 - y).iter().rev()).for_each(|(out, from)| *out = *from);
         })
     }
 
@@ -200,7 +222,7 @@ impl Planes {
         assert!(self.width <= width && rows.len() <= height, "padding only adds");
         Self::from_rows(self.channels, (width, height), |c, y, out| {
             let y = rows.start + mirrored(y, rows.len());
-            out[..self.width].copy_from_slice(&self.channel(c)[y * self.width..][..self.width]);
+            out[..self.width].copy_from_slice(self.row(c, y));
             mirror_beyond(out, self.width);
         })
     }
@@ -213,7 +235,7 @@ impl Planes {
         assert_eq!((self.channels, self.width), (below.channels, below.width), "planes that fit");
         Self::from_rows(self.channels, (self.width, self.height + below.height), |c, y, out| {
             let (from, y) = if y < self.height { (self, y) } else { (below, y - self.height) };
-            out.copy_from_slice(&from.channel(c)[y * self.width..][..self.width]);
+            out.copy_from_slice(from.row(c, y));
         })
     }
 

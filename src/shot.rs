@@ -38,6 +38,8 @@ pub struct Shot {
     pub normals: Option<String>,
     /// How many values of each pass were not finite and are repaired; passes that were clean are not listed.
     pub repaired: BTreeMap<Pass, usize>,
+    /// The same of light groups, by the names of their layers.
+    pub repaired_groups: BTreeMap<String, usize>,
     /// The render as it was stored, if some of its values were not finite.
     unrepaired: Option<Planes>,
 }
@@ -100,7 +102,18 @@ impl Shot {
         let unrepaired = passes.get(Pass::Combined).filter(is_broken).cloned();
         let repaired = passes.sanitize();
         let (halves, neighbours, light_groups, wraps, normals) = Default::default();
-        Self { passes, halves, neighbours, light_groups, wraps, was_denoised, normals, repaired, unrepaired }
+        Self {
+            passes,
+            halves,
+            neighbours,
+            light_groups,
+            wraps,
+            was_denoised,
+            normals,
+            repaired,
+            repaired_groups: BTreeMap::new(),
+            unrepaired,
+        }
     }
 
     /// The render as it was stored, in which values that are not finite are not repaired.
@@ -116,7 +129,10 @@ impl Shot {
         for (name, planes) in passes::read_light_groups(frame, layer)? {
             let mut set = PassSet::new(&self.passes.path, &layer.name, planes.width, planes.height);
             set.insert(Pass::Combined, planes);
-            set.sanitize();
+            let repaired: usize = set.sanitize().values().sum();
+            if repaired > 0 {
+                self.repaired_groups.insert(layer.light_groups[&name].name.clone(), repaired);
+            }
             self.light_groups.extend(set.remove(Pass::Combined).map(|planes| (name, planes)));
         }
         Ok(())

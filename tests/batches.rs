@@ -116,12 +116,49 @@ fn a_report_and_inspect_search_folders_too() {
         .code(1)
         .stdout(contains("missing: renders/one/shot.0002.exr").and(contains("2 missing")));
     report("").code(1).stdout(contains("1 missing"));
+    // What cannot be looked at is told beside what can, and does not stay failed once its files are done.
+    fs::create_dir(folder.path().join("empty")).unwrap();
+    let report = |of: &[&str]| {
+        let mut command = demc();
+        command.current_dir(folder.path()).args(["report", "log.jsonl", "--of"]).args(of).assert()
+    };
+    report(&["renders/two/deep"]).success();
+    report(&["renders/two/deep", "empty"]).code(1).stdout(contains("missing: empty: no EXR files"));
+    let mut log = fs::read(folder.path().join("log.jsonl")).unwrap();
+    log.extend(br#"{"input":"renders/two/deep","status":"failed","error":"renders/two/deep: cannot read"}"#);
+    fs::write(folder.path().join("log.jsonl"), log).unwrap();
+    report(&["renders/two/deep"]).success();
     demc()
         .current_dir(folder.path())
         .args(["inspect", "renders", "--recursive"])
         .assert()
         .success()
         .stdout(contains("renders/two/deep/shot.0001.exr"));
+}
+
+#[test]
+fn no_more_threads_are_started_than_there_is_use_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = demc();
+    command.args(["denoise", "--model", "demc-s", "--threads", "4096", "--out"]).arg(folder.path());
+    command.arg(data("s0000_room_0004spp.exr")).timeout(Duration::from_secs(120)).assert().success();
+}
+
+#[test]
+#[cfg(unix)]
+fn a_folder_that_may_not_be_read_is_a_failure_and_no_wrong_usage() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = renders();
+    let closed = folder.path().join("renders/one");
+    fs::set_permissions(&closed, fs::Permissions::from_mode(0o000)).unwrap();
+    // Who may read everything, as in a container, has nothing to see here.
+    if fs::read_dir(&closed).is_err() {
+        denoise(folder.path(), "renders/one --out clean --json")
+            .code(1)
+            .stdout(contains(r#""status":"failed""#))
+            .stderr(contains("renders/one"));
+    }
+    fs::set_permissions(&closed, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
 #[test]
@@ -381,4 +418,12 @@ fn a_watch_takes_no_sequence_windows_and_picks_frames() {
     denoise(folder.path(), "renders --recursive --out clean --watch 1 --frames 2")
         .success()
         .stdout(contains("[1] clean/one/shot.0002.exr").and(contains("1 denoised")));
+    // Frames that have not come are told, as without a watch.
+    denoise(folder.path(), "renders --recursive --out clean --watch 1 --frames 2,77")
+        .success()
+        .stderr(contains("no input is of frame 77"));
+    denoise(folder.path(), "renders --recursive --out clean --watch 1 --frames 77")
+        .code(1)
+        .stderr(contains("no file of --frames has come"));
+    denoise(folder.path(), "--out clean --watch renders").code(2).stderr(contains("name inputs before it"));
 }

@@ -168,6 +168,26 @@ fn light_passes_do_not_outlive_the_result_that_they_add_up_to() {
 }
 
 #[test]
+fn replaced_light_passes_do_not_outlive_their_beauty_either() {
+    let out = tempfile::tempdir().unwrap();
+    let both = denoise("sky.exr", &out.path().join("both"), "--model demc-s --passes --replace");
+    let beauty = denoise("sky.exr", &out.path().join("beauty"), "--model demc-s --replace");
+    let again = |input: &Path, arguments: &str| {
+        let mut command = common::demc();
+        command.args(["denoise", "--overwrite"]).arg(input).arg("--out").arg(out.path().join("again"));
+        command.args(arguments.split_whitespace()).assert()
+    };
+    again(&both, "--model demc-s --replace")
+        .code(1)
+        .stderr(contains("belongs to the result that would be replaced"));
+    again(&both, "--model demc-s --replace --passes").success().stderr(contains("as rendered").not());
+    again(&beauty, "--model demc-s --replace").success().stderr(contains("as rendered").not());
+    for how in ["--model demc-s --passes", "--model demc-s --passes --replace"] {
+        again(&beauty, how).success().stderr(contains("its light passes are as rendered"));
+    }
+}
+
+#[test]
 fn light_passes_are_replaced_where_the_beauty_is() {
     let out = tempfile::tempdir().unwrap();
     let added = layer(&denoise("sky.exr", out.path(), "--model demc-s --passes"), "Glossy Direct.Denoised");

@@ -12,6 +12,7 @@ use common::{
     files::{data, read_exr, samples, values},
 };
 use demc::{
+    frame::Frame,
     metrics::error::relative_squared_error,
     passes::{self, Pass},
 };
@@ -152,14 +153,14 @@ fn the_frame_s_mean_is_told_by_json_inspect_and_the_layer_alike() {
     let inspected: Value = serde_json::from_slice(&inspected.stdout).unwrap();
     let report = inspected.as_array().map_or(&inspected, |files| &files[0]);
     let noted = &report["expected_errors"][0];
-    assert_eq!(noted["view_layer"], "ViewLayer");
+    assert_eq!(noted["layer"], "ViewLayer.Denoised");
     assert!((noted["relmse"].as_f64().unwrap() / told - 1.0).abs() < 1e-3);
     demc()
         .arg("inspect")
         .arg(&result)
         .assert()
         .success()
-        .stdout(contains("denoised 'ViewLayer': expected RelMSE"));
+        .stdout(contains("'ViewLayer.Denoised' has an expected RelMSE of"));
 }
 
 #[test]
@@ -197,7 +198,7 @@ fn frames_are_listed_by_what_is_expected_with_the_samples_they_want() {
         let after = text.split_once("the worst first:\n").unwrap_or_else(|| panic!("{text}")).1;
         after.lines().map(str::to_owned).collect::<Vec<_>>()
     };
-    let lines = listed(&run(&["--report", "1e-6"]).stdout);
+    let lines = listed(&run(&["--report", "1e-3"]).stdout);
     assert_eq!(lines.len(), 2);
     let error = |line: &str| line.split(' ').next().unwrap().parse::<f64>().unwrap();
     assert!(error(&lines[0]) >= error(&lines[1]), "{lines:?}");
@@ -215,8 +216,58 @@ fn frames_are_listed_by_what_is_expected_with_the_samples_they_want() {
     // And of the lines of many tasks.
     let log = dir.path().join("task.jsonl");
     std::fs::write(&log, run(&["--json", "--overwrite"]).stdout).unwrap();
-    let report = demc().arg("report").arg(&log).args(["--by-error", "1e-6"]).output().unwrap();
-    assert_eq!(listed(&report.stdout), lines);
+    let report = |log: &Path| {
+        listed(&demc().arg("report").arg(log).args(["--by-error", "1e-3"]).output().unwrap().stdout)
+    };
+    assert_eq!(report(&log), lines);
+    // Of tasks that found all done as well, and one by a method that tells nothing.
+    let late = dir.path().join("late.jsonl");
+    let mut told = run(&["--json"]).stdout;
+    let silent = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/s0000_room_0004spp.exr");
+    let by = ["denoise", "--model", "noisy", "--json", "--out"];
+    told.extend(demc().args(by).arg(&out).arg(silent).output().unwrap().stdout);
+    std::fs::write(&late, told).unwrap();
+    let mut found = report(&late);
+    assert!(found.pop().unwrap().starts_with("1 frame more, whose results do not tell"));
+    let noted = |lines: &[String]| lines.iter().map(|line| line[8..].to_owned()).collect::<Vec<_>>();
+    assert_eq!(noted(&found), noted(&lines));
+}
+
+#[test]
+fn each_result_in_a_file_has_an_error_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    // Blender 4 stores one part, Blender 5 one for each pass.
+    for file in ["blender4.exr", "blender5.exr"] {
+        let run = |input: &Path, more: &[&str]| {
+            let out = dir.path().join(more[1]);
+            let output = demc()
+                .args(["denoise", "--json"])
+                .arg(input)
+                .arg("--out")
+                .arg(&out)
+                .args(more)
+                .output()
+                .unwrap();
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+            (out.join(file), told["expected_error"].as_f64())
+        };
+        let (first, of_first) = run(&data(file), &["--model", "demc-s"]);
+        let (second, of_second) = run(&first, &["--model", "demc-l", "--layer", "Better"]);
+        let (third, of_third) = run(&second, &["--model", "nfor", "--layer", "Nfor"]);
+        assert!(of_first.is_some() && of_first != of_second && of_third.is_none(), "{file}");
+        let noted = Frame::read_headers(&third).unwrap();
+        for (layer, error) in [("Denoised", of_first), ("Better", of_second), ("Nfor", of_third)] {
+            let found = noted.expected_error(&format!("ViewLayer.{layer}"), None);
+            let is_alike = |(a, b): (f64, f64)| (a / b - 1.0).abs() < 1e-3;
+            assert_eq!(found.is_some(), error.is_some(), "{file}, {layer}");
+            assert!(found.zip(error).is_none_or(is_alike), "{file}, {layer}: {found:?}, {error:?}");
+        }
+        // Asked again, each tells its own.
+        let (_, again) = run(&first, &["--model", "demc-l", "--layer", "Better"]);
+        let is_alike = (again.unwrap() / of_second.unwrap() - 1.0).abs() < 1e-3;
+        assert!(is_alike, "{file}: {again:?}, {of_second:?}");
+    }
 }
 
 #[test]

@@ -265,3 +265,126 @@ fn a_result_that_was_cropped_since_is_not_filled() {
     command.args(["denoise", "--model", "noisy", "--out"]).arg(dir.path().join("out")).arg(&input);
     command.assert().code(1).stderr(contains("'V.Denoised', cropped since").and(contains("--layer NAME")));
 }
+
+/// A part of 48x40 pixels at a column, with a picture in three channels.
+fn picture(name: &str, channels: &str, column: i32) -> Layer<AnyChannels<FlatSamples>> {
+    let values: Vec<f32> =
+        (0..48 * 40).map(|i| 0.2 + (i * 2_654_435_761usize % 1000) as f32 / 1000.0).collect();
+    let list = ["R", "G", "B"]
+        .map(|c| AnyChannel::new(format!("{channels}.{c}").as_str(), FlatSamples::F32(values.clone())));
+    let attributes = LayerAttributes::named(name).with_position(Vec2(column, 0));
+    Layer::new((48, 40), attributes, Encoding::SMALL_LOSSLESS, AnyChannels::sort(list.into_iter().collect()))
+}
+
+fn write(path: &Path, parts: Vec<Layer<AnyChannels<FlatSamples>>>) {
+    let shared = ImageAttributes::new(IntegerBounds::from_dimensions((48, 40)));
+    Image::from_layers(shared, parts).write().to_file(path).unwrap();
+}
+
+#[test]
+fn a_light_pass_of_other_pixels_gets_its_result_where_the_beauty_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    let part = |pass: &str, column| picture(&format!("V.{pass}"), &format!("V.{pass}"), column);
+    write(&input, vec![part("Combined", 0), part("DiffCol", 0), part("DiffDir", 4)]);
+    let denoise = |out: &str, more: &[&str]| {
+        let mut command = demc();
+        command.args(["denoise", "--model", "demc-s", "--passes"]).args(more).arg(&input);
+        command.arg("--out").arg(dir.path().join(out)).assert()
+    };
+    denoise("added", &[]).success();
+    let result = MetaData::read_from_file(dir.path().join("added/in.exr"), false).unwrap();
+    let place = |name: &str| {
+        let part =
+            result.headers.iter().find(|part| part.own_attributes.layer_name.as_ref().unwrap().eq(name));
+        part.unwrap_or_else(|| panic!("{name}")).own_attributes.layer_position.x()
+    };
+    assert_eq!((place("V.DiffDir"), place("V.DiffDir.Denoised"), place("V.Denoised")), (4, 0, 0));
+    denoise("replaced", &["--replace"]).code(1).stderr(contains("'V.DiffDir' is stored for other pixels"));
+}
+
+#[test]
+fn what_is_repaired_in_light_groups_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    let part = |pass: &str| picture(&format!("V.{pass}"), &format!("V.{pass}"), 0);
+    let mut key = part("Combined_Key");
+    let FlatSamples::F32(values) = &mut key.channel_data.list[1].sample_data else { panic!("floats") };
+    values[300] = f32::NAN;
+    values[301] = f32::INFINITY;
+    write(&input, vec![part("Combined"), key, part("Combined_Fill")]);
+    let mut command = demc();
+    command.args(["denoise", "--model", "demc-s", "--passes", "--json", "--out"]).arg(dir.path().join("out"));
+    command.arg(&input).assert().success().stdout(
+        contains(r#""non_finite":{"Combined_Key":2}"#)
+            .and(contains("light passes and light groups 2 are NaN or infinite")),
+    );
+}
+
+#[test]
+fn a_file_of_one_view_has_no_view_in_its_channels_names() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    let mut part = picture("rgba", "V.Combined", 0);
+    part.attributes.layer_name = None;
+    part.attributes.view_name = Some("main".into());
+    Image::from_layer(part).write().to_file(&input).unwrap();
+    let first = denoise(&input, &dir.path().join("first"));
+    assert!(samples(&read_exr(&first), "V.Denoised.R").is_some());
+    let second = denoise(&first, &dir.path().join("second"));
+    assert_eq!(fs::read(first).unwrap(), fs::read(second).unwrap());
+}
+
+#[test]
+fn alpha_of_an_earlier_result_does_not_stay_in_a_layer() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    write_render(&input, 20, 10, |channel, i| if channel.ends_with('A') { (i % 2) as f32 } else { 0.5 });
+    let mut image = read_exr(&input);
+    let list = &mut image.layer_data[0].channel_data.list;
+    let extra: Vec<_> = list
+        .iter()
+        .map(|channel| (channel.name.to_string(), channel.sample_data.clone()))
+        .filter(|(name, _)| name.starts_with("ViewLayer.Combined.") && !name.ends_with('A'))
+        .map(|(name, samples)| AnyChannel::new(name.replace("Combined", "Extra").as_str(), samples))
+        .collect();
+    list.extend(extra);
+    image.layer_data[0].channel_data = AnyChannels::sort(std::mem::take(list));
+    image.write().to_file(&input).unwrap();
+    let first = denoise(&input, &dir.path().join("first"));
+    assert!(samples(&read_exr(&first), "ViewLayer.Denoised.A").is_some());
+    let out = dir.path().join("second");
+    let mut command = demc();
+    command.args(["denoise", "--model", "noisy", "--map", "beauty=Extra", "--out"]).arg(&out).arg(&first);
+    command.assert().success();
+    let second = read_exr(out.join("in.exr"));
+    assert!(samples(&second, "ViewLayer.Denoised.R").is_some());
+    assert!(samples(&second, "ViewLayer.Denoised.A").is_none());
+    assert!(samples(&second, "ViewLayer.Combined.A").is_some());
+}
+
+#[test]
+fn no_channel_gets_a_name_that_openexr_cannot_read() {
+    let dir = tempfile::tempdir().unwrap();
+    let input = dir.path().join("in.exr");
+    let name = "v".repeat(200);
+    write(&input, vec![picture(&name, &format!("{name}.Combined"), 0)]);
+    let run = |layer: &str| {
+        let mut command = demc();
+        command.args(["denoise", "--model", "noisy", "--layer", layer, "--out"]).arg(dir.path().join("out"));
+        command.arg(&input).assert()
+    };
+    run(&"l".repeat(53)).code(1).stderr(contains("longer than 255 bytes").and(contains("in.exr")));
+    run(&"l".repeat(52)).success();
+}
+
+#[test]
+fn alpha_is_refused_before_any_work_where_a_model_takes_none_along() {
+    let dir = tempfile::tempdir().unwrap();
+    for option in [&["--alpha", "denoise"][..], &["--passes"]] {
+        let mut command = demc();
+        command.args(["denoise", "--model", "nfor"]).args(option).arg("--out").arg(dir.path().join("out"));
+        let told = command.arg(data("blender5.exr")).assert().code(2);
+        told.stderr(contains(option.join(" ")).and(contains("nfor denoises the beauty alone")));
+    }
+}

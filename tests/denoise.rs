@@ -262,6 +262,7 @@ fn previews_are_made_up_for_and_kept() {
         run(&["--preview"]);
         fs::remove_file(out.join(files[0])).unwrap();
         run(&["--preview"]).stderr(contains("blender4.png: kept; --overwrite"));
+        run(&["--overwrite"]).stderr(contains("blender4.png: may show the earlier result; --preview"));
         assert_eq!(fs::read(out.join(pngs[0])).unwrap(), b"another program's");
     }
 

@@ -52,7 +52,7 @@ fn a_file_tells_its_number_of_samples() {
     let frame = Frame::read(example()).unwrap();
     assert_eq!(frame.text_attribute("cycles.ViewLayer.samples").as_deref(), Some("4"));
     assert_eq!(frame.text_attribute("cycles.Other.samples"), None);
-    assert_eq!(part(20, 10).rows(&[Pass::Combined], 2..5).samples, Some(4), "parts of a frame tell it too");
+    assert_eq!(part(20, 10).window((0, 2), (20, 3)).samples, Some(4), "parts of a frame tell it too");
 }
 
 #[test]

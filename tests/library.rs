@@ -11,7 +11,7 @@ use std::{
 use common::files::{data, read_exr, samples};
 use demc::{
     Error, Result,
-    denoise::{self, Batch, End, Job, Options, Outcome},
+    denoise::{self, Alpha, Batch, End, Job, Options, Outcome},
     models::{self, Denoiser},
     passes::{Pass, PassSet},
     planes::Planes,
@@ -204,17 +204,63 @@ fn what_has_no_pixels_and_tiles_of_none_are_errors() {
     };
     let model = models::open("demc-s").unwrap();
     for (w, h) in [(0, 0), (0, 5), (5, 0)] {
-        let error = denoise::shot(&shot(w, h), &*model, &Options::default()).unwrap_err();
+        let error = denoise::shot(shot(w, h), &*model, &Options::default()).unwrap_err();
         assert!(error.to_string().contains("has no pixels"), "{error}");
     }
     let options = Options { tile: Some(0), ..Options::default() };
-    assert!(matches!(denoise::shot(&shot(8, 8), &*model, &options), Err(Error::Usage(_))));
+    assert!(matches!(denoise::shot(shot(8, 8), &*model, &options), Err(Error::Usage(_))));
     for spec in ["nfor:int8", "noisy:f32", "noisy:bf16:unrestrained"] {
         assert!(
             matches!(models::open(spec), Err(Error::Usage(why)) if why.contains("is no network")),
             "{spec}"
         );
     }
+}
+
+#[test]
+fn a_shot_in_memory_is_denoised_as_a_file_is() {
+    let model = models::open("demc-s").unwrap();
+    let of = |passes: &PassSet, options: Options| denoise::shot(Shot::new(passes.clone()), &*model, &options);
+    // Most of it is not finite.
+    let mut passes = shot::prepare(data(FRAME), None).unwrap().passes;
+    let mut broken = passes.clone();
+    let (width, height) = (passes.width, passes.height);
+    broken.insert(Pass::Combined, Planes::from_vec(3, width, height, vec![f32::NAN; 3 * width * height]));
+    let error = of(&broken, Options::default()).unwrap_err().to_string();
+    assert!(error.contains("are NaN or infinite; render the frame again"), "{error}");
+    // What is for files is refused, and alpha goes along.
+    for options in [
+        Options { passes: true, ..Options::default() },
+        Options { confidence: true, ..Options::default() },
+        Options { temporal: Some(2), ..Options::default() },
+    ] {
+        assert!(matches!(of(&passes, options), Err(Error::Usage(_))));
+    }
+    let noisy = |row: &mut [f32], y: usize| {
+        row.iter_mut().enumerate().for_each(|(x, v)| *v = ((x * 31 + y * 17) % 5) as f32 / 4.0);
+    };
+    passes.insert(Pass::Alpha, Planes::from_rows(1, (width, height), |_, y, row| noisy(row, y)));
+    let (_, alpha) = of(&passes, Options::default()).unwrap();
+    assert!(alpha.is_some_and(|alpha| Some(&alpha) != passes.get(Pass::Alpha)));
+    let (_, kept) = of(&passes, Options { alpha: Alpha::Keep, ..Options::default() }).unwrap();
+    assert_eq!(kept.as_ref(), passes.get(Pass::Alpha));
+}
+
+#[test]
+fn a_file_is_neither_made_with_neighbours_nor_over_its_render() {
+    let folder = tempfile::tempdir().unwrap();
+    let (render, result) = (folder.path().join("a.exr"), folder.path().join("b.exr"));
+    fs::copy(data(FRAME), &render).unwrap();
+    let model = models::open("noisy").unwrap();
+    let options = Options { temporal: Some(2), ..Options::default() };
+    assert!(matches!(denoise::file(&render, &result, &*model, &options), Err(Error::Usage(_))));
+    assert!(!result.exists());
+    for layer in [None, Some("Denoised".into())] {
+        let options = Options { layer, ..Options::default() };
+        let error = denoise::file(&render, &render, &*model, &options).err().unwrap().to_string();
+        assert!(error.contains("is the render, which the result would overwrite"), "{error}");
+    }
+    assert!(fs::read(&render).unwrap() == fs::read(data(FRAME)).unwrap());
 }
 
 /// Turned about half, a panorama gives the same picture turned about half: its seam is nowhere.
@@ -235,7 +281,7 @@ fn a_panorama_has_no_seam() {
         let [one, other] = [&shot, &about].map(|shot| {
             let mut shot = shot.clone();
             shot.wraps = wraps;
-            denoise::shot(&shot, &*model, &Options::default()).unwrap()
+            denoise::shot(shot, &*model, &Options::default()).unwrap().0
         });
         let one = turned(&one);
         let pairs = one.data.iter().zip(&other.data);

@@ -281,3 +281,27 @@ fn a_report_over_many_tasks_lists_what_failed_in_the_end() {
     silent.code(1).stderr(contains("the logs hold no line of `demc denoise --json`"));
     demc().args(["report", "missing.jsonl"]).assert().code(1).stderr(contains("missing.jsonl: cannot read"));
 }
+
+#[test]
+fn every_failure_names_its_input() {
+    let folder = tempfile::tempdir().unwrap();
+    let input = data("s0000_room_0004spp.exr");
+    let run = |arguments: &[&str]| {
+        let mut command = demc();
+        command.current_dir(folder.path()).env("OIDN_DENOISE", "nowhere/oidnDenoise");
+        command.arg("denoise").arg(&input).args(["--out", "out"]).args(arguments).assert().code(1)
+    };
+    let named = || contains(format!("demc: {}", input.display()));
+    run(&["--albedo", "albedo.exr"]).stderr(named().and(contains("albedo.exr: cannot read")));
+    run(&["--model", "oidn-high"]).stderr(named().and(contains("by the environment variable OIDN_DENOISE")));
+}
+
+#[test]
+fn methods_that_a_variable_leaves_out_are_no_evaluation() {
+    let folder = workplace();
+    for command in ["eval", "stability"] {
+        let mut run = demc();
+        run.current_dir(folder.path()).args([command, "--test-set", "pairs", "--out", "out", "--models", ""]);
+        run.assert().code(2).stderr(contains("--models names no method"));
+    }
+}

@@ -224,8 +224,8 @@ fn a_prefilter_does_what_its_network_does_alone() {
     let [irradiance, albedo, _, _, ratio, shading, normal] = &planes[..] else {
         panic!("{} inputs", planes.len())
     };
-    let fit = Shading::of(&passes, scale.recip(), "the test").unwrap();
-    assert_eq!(*shading, fit.rows(&passes, 0..passes.height, "the test").unwrap());
+    let fit = Shading::of(&passes, scale.recip()).unwrap();
+    assert_eq!(*shading, fit.rows(&passes, 0..passes.height).unwrap());
     // The file holds halves of what the network alone holds.
     for (a, b) in albedo.data.iter().zip(&clean.data) {
         assert!((a - (b + 0.05)).abs() <= 2e-3, "{a} of {b}");

@@ -45,10 +45,18 @@ pub struct Args {
 }
 
 impl Args {
-    /// What is compared by default.
-    pub fn of(image: &Path, reference: &Path) -> Self {
-        let (image, reference, reference_layer) = (image.into(), reference.into(), COMBINED.into());
-        Self { image, reference, view_layer: None, layer: None, reference_layer, json: false }
+    /// Two files, and what is compared of them: view layer, layer and reference's layer.
+    pub fn of(image: &Path, reference: &Path, layers: [Option<String>; 3]) -> Self {
+        let [view_layer, layer, reference_layer] = layers;
+        let reference_layer = reference_layer.unwrap_or_else(|| COMBINED.into());
+        Self {
+            image: image.into(),
+            reference: reference.into(),
+            view_layer,
+            layer,
+            reference_layer,
+            json: false,
+        }
     }
 }
 

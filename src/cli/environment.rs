@@ -1,7 +1,7 @@
 //! Checks environment variables before anything is done, so that a typing error is reported and does not pass
 //! for a variable that is not set.
 
-use clap::builder::RangedI64ValueParser;
+use clap::builder::TypedValueParser;
 
 use crate::{
     Error, Result,
@@ -14,9 +14,18 @@ use crate::{
 /// The most threads that may be asked for; more than this cannot be started, and nobody means it.
 pub const MOST_THREADS: u16 = 4096;
 
+/// Threads for each core, at most: with hundreds, they wait for one another more than they compute.
+const MOST_FOR_A_CORE: usize = 8;
+
 /// Takes the value of `--threads`.
-pub fn threads() -> RangedI64ValueParser<u16> {
-    clap::value_parser!(u16).range(1..=MOST_THREADS.into())
+pub fn threads() -> impl TypedValueParser<Value = u16> {
+    clap::value_parser!(u16).range(1..=MOST_THREADS.into()).map(useful_threads)
+}
+
+/// As many threads as are asked for, but no more than there is use for.
+pub fn useful_threads(threads: u16) -> u16 {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    threads.min(u16::try_from(MOST_FOR_A_CORE * cores).unwrap_or(MOST_THREADS))
 }
 
 /// Computes with as many threads as asked for, or with all. Comes before anything runs in parallel.

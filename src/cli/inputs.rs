@@ -31,22 +31,16 @@ pub struct Search {
     pub except: Option<PathBuf>,
 }
 
-impl Inputs {
-    /// The paths of the files.
-    pub fn paths(self) -> Vec<PathBuf> {
-        self.files.into_iter().map(|input| input.file).collect()
-    }
-}
-
 /// Expands the inputs. A plain path that does not exist is kept: reading it reports it, and the others go on.
 ///
 /// # Errors
-/// A glob is malformed, or all inputs together name no file.
+/// A glob is malformed, or all inputs together name no file, though each could be looked at.
 pub fn expand(inputs: &[PathBuf], search: &Search) -> Result<Inputs> {
     let mut all = find(inputs, search)?;
     let empty = std::mem::take(&mut all.empty);
     all.unusable.extend(empty);
-    if all.files.is_empty() {
+    let is_empty = |(_, error): &(PathBuf, Error)| matches!(error, Error::Usage(_));
+    if all.files.is_empty() && all.unusable.iter().all(is_empty) {
         let why: Vec<String> = all.unusable.iter().map(|(_, error)| error.to_string()).collect();
         return Err(Error::Usage(why.join("\n")));
     }

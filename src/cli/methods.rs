@@ -62,6 +62,9 @@ impl Args {
         // Built-in methods change with the program.
         let program = super::program().map_or("unknown".into(), |path| report::file_stamp(&path));
         let asked = self.asked();
+        if self.models.iter().all(|model| model.trim().is_empty()) {
+            return Err(Error::Usage("--models names no method; `demc models` lists those there are".into()));
+        }
         let mut methods = Vec::new();
         for name in &asked {
             let (denoiser, file): (Box<dyn Denoiser>, Option<PathBuf>) =

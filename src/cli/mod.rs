@@ -32,7 +32,7 @@ use std::{
 
 use clap::{CommandFactory, Parser, Subcommand};
 
-pub use environment::MOST_THREADS;
+pub use environment::{MOST_THREADS, useful_threads};
 use lines::{ExitCode, SOME_FAILED, USAGE, warn_line};
 
 use crate::{
@@ -110,13 +110,22 @@ pub fn inspect_json(path: &Path) -> Result<String> {
     Ok(serde_json::to_string(&report).expect("strings and numbers serialise"))
 }
 
-/// The scores that `demc compare` prints for two files.
+/// What `demc models --json` prints.
 ///
 /// # Errors
-/// A file is unusable, or the images cannot be compared.
-pub fn compare_files(image: &Path, reference: &Path) -> Result<Scores> {
+/// A weights file is unusable.
+pub fn models_json() -> Result<String> {
+    models::json()
+}
+
+/// The scores that `demc compare` prints for two files: of the view layer, the layer of the image and that of the
+/// reference, each the command's choice where it is none.
+///
+/// # Errors
+/// A file is unusable, holds no such layer, or the images cannot be compared.
+pub fn compare_files(image: &Path, reference: &Path, layers: [Option<String>; 3]) -> Result<Scores> {
     attempt(image, || {
-        compare::scores(&compare::Args::of(image, reference), &|_| {}).map(|(scores, _)| scores)
+        compare::scores(&compare::Args::of(image, reference, layers), &|_| {}).map(|(scores, _)| scores)
     })
 }
 

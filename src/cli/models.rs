@@ -59,8 +59,12 @@ fn trained(method: &Method) -> Result<Listed> {
     Ok(row(method, model.network(), macs, Some(trained)))
 }
 
-/// Runs the subcommand.
-pub fn run(args: &Args) -> Result<ExitCode> {
+/// The list as a JSON array.
+pub fn json() -> Result<String> {
+    Ok(serde_json::to_string_pretty(&list()?).expect("rows serialise"))
+}
+
+fn list() -> Result<Vec<Listed>> {
     let with_weights = |method: &&Method| method.built_in().is_some() || method.weights_file().is_some();
     let untrained = METHODS.iter().filter(|method| !with_weights(method)).filter_map(|method| {
         let Kind::Learned { config, .. } = method.kind else { return None };
@@ -68,12 +72,16 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let macs = network.macs_per_pixel();
         Some(Ok(row(method, &mut *network, macs, None)))
     });
-    let rows = METHODS.iter().filter(with_weights).map(trained).chain(untrained);
-    let rows: Vec<Listed> = rows.collect::<Result<_>>()?;
+    METHODS.iter().filter(with_weights).map(trained).chain(untrained).collect()
+}
+
+/// Runs the subcommand.
+pub fn run(args: &Args) -> Result<ExitCode> {
     if args.json {
-        super::lines::print_line(&serde_json::to_string_pretty(&rows).expect("rows serialise"));
+        super::lines::print_line(&json()?);
         return Ok(ExitCode::SUCCESS);
     }
+    let rows = list()?;
     super::lines::print_line(&format!(
         "{:<14} {:<10} {:>12} {:>15} {:>16}  {}",
         "model", "weights", "parameters", "kMAC per pixel", "receptive field", "passes"

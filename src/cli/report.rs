@@ -14,7 +14,7 @@ use std::{
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 
-use super::inputs::{self, Search};
+use super::inputs::{self, Inputs, Search};
 use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
 use super::ranking::{Ranking, parse_wish};
 use crate::{Error, Result, frame::place_of};
@@ -73,7 +73,8 @@ struct Fate {
     status: Status,
     error: String,
     /// The result's expected RelMSE, and the samples of its render.
-    expected: Option<(f64, Option<u32>)>,
+    expected_error: Option<f64>,
+    samples: Option<u32>,
 }
 
 /// Prints the report.
@@ -102,6 +103,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             warn_line(&format!("demc: note: {log}: {unreadable} lines are none of `demc denoise --json`"));
         }
     }
+    forgive_folders(&mut frames);
     let missing = missing(&args.of, args.recursive, &frames)?;
     let count = |status| frames.values().filter(|frame| frame.status == status).count();
     for frame in frames.values().filter(|frame| frame.status == Status::Failed) {
@@ -114,8 +116,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             format!("failed: {}: {error}", input.display())
         });
     }
-    for input in &missing {
-        print_line(&format!("missing: {}: no task tells of it", input.display()));
+    for line in &missing {
+        print_line(&format!("missing: {line}"));
     }
     let failed = count(Status::Failed);
     let mut totals = format!("{} denoised in {seconds:.1} s of model time", count(Status::Done));
@@ -129,10 +131,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     print_line(&totals);
     if let Some(wish) = args.by_error {
         let mut ranking = Ranking::new(wish);
-        for frame in frames.values() {
-            if let Some((error, samples)) = frame.expected {
-                ranking.add(frame.input.display().to_string(), error, samples);
-            }
+        for frame in frames.values().filter(|frame| frame.status != Status::Failed) {
+            ranking.add(frame.input.display().to_string(), frame.expected_error, frame.samples);
         }
         ranking.print();
     }
@@ -154,18 +154,30 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     let place = place_of(&line.input);
     let known = frames.get(&place).map(|frame| rank(frame.status));
     if known.is_none_or(|known| known <= rank(line.status)) {
-        let error = line.error.unwrap_or_default();
-        let expected = line.expected_error.map(|error| (error, line.samples));
-        frames.insert(place, Fate { input: line.input, status: line.status, error, expected });
+        let Line { input, status, error, expected_error, samples, .. } = line;
+        let fate = Fate { input, status, error: error.unwrap_or_default(), expected_error, samples };
+        frames.insert(place, fate);
     }
 }
 
-fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) -> Result<Vec<PathBuf>> {
+/// Says of which inputs no task tells, and which of them cannot be looked at.
+fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) -> Result<Vec<String>> {
     if of.is_empty() {
         return Ok(Vec::new());
     }
     let search = Search { recursive, ..Search::default() };
-    let mut files = inputs::expand(of, &search)?.paths();
-    files.retain(|file| !frames.contains_key(&place_of(file)));
-    Ok(files)
+    let Inputs { files, unusable, .. } = inputs::expand(of, &search)?;
+    let unseen = unusable.into_iter().map(|(_, error)| error.to_string());
+    let files = files.into_iter().map(|input| input.file);
+    let untold = files.filter(|file| !frames.contains_key(&place_of(file)));
+    Ok(unseen.chain(untold.map(|file| format!("{}: no task tells of it", file.display()))).collect())
+}
+
+/// Leaves out folders that could not be read at first, and of which files were done later.
+fn forgive_folders(frames: &mut BTreeMap<PathBuf, Fate>) {
+    let good = frames.iter().filter(|(_, frame)| frame.status != Status::Failed);
+    let good: Vec<PathBuf> = good.map(|(place, _)| place.clone()).collect();
+    frames.retain(|place, frame| {
+        frame.status != Status::Failed || !place.is_dir() || !good.iter().any(|file| file.starts_with(place))
+    });
 }

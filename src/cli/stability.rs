@@ -43,9 +43,9 @@ fn trials() -> String {
     let lines = Trial::ALL.map(|trial| format!("  {:<16}{}\n", trial.name(), trial.meaning()));
     format!(
         "Trials:\n{}\nratio: RelMSE over that of the frame as rendered. deviation: RelMSE between the two results.\n\
-         stability_scenes.csv tells of frames as rendered, renders of one scene and sample count taken together: a method\n\
-         fails where its RelMSE is above the input's (1e-4, if the input is exact), or its light off by 2% more than\n\
-         the input's.\n\
+         stability_scenes.csv tells of frames as rendered, renders of one scene and sample count taken together: \
+         a method fails where its RelMSE is above the input's (1e-4, if the input is exact), or its light off by 2% more \
+         than the input's.\n\
          Half buffers beside a frame are not used: nfor works on the frame alone.\n\n\
          Examples:\n  demc stability --test-set pairs --models demc-s --out stability\n  \
          demc stability --test-set pairs --models demc-m --trials as-rendered --out scenes",

@@ -433,7 +433,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         Err(Error::Interrupted) => {
             let out = args.out.display();
             warn_line(&match config.exists() {
-                true => format!("stopped; go on with: demc train --out {out} --resume"),
+                true => format!("stopped; go on with: demc train --out '{out}' --resume"),
                 false => "stopped before the first step".into(),
             });
             Ok(ExitCode::from(super::stop::INTERRUPTED))

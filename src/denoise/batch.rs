@@ -27,10 +27,21 @@ use crate::{Error, Result, error::attempt, frame::Frame, frame_number::frame_num
 pub enum Outcome {
     /// Written.
     Done(Report),
-    /// The result was there already; why it may not be what is wanted, if there are reasons.
-    Skipped(Vec<String>),
+    /// The result was there already.
+    Skipped(Finished),
     /// Nothing was written.
     Failed(Error),
+}
+
+/// A result that was there already.
+#[derive(Clone, Debug, Default)]
+pub struct Finished {
+    /// Why it may not be what is wanted, if there are reasons.
+    pub notes: Vec<String>,
+    /// Its expected RelMSE, as the mean over its views, where that is noted.
+    pub expected_error: Option<f64>,
+    /// Samples of a pixel of its render, where the file tells.
+    pub samples: Option<u32>,
 }
 
 /// How the batch ended.
@@ -348,13 +359,12 @@ impl Shared {
             let take_up = || {
                 let existing = existing?;
                 existing.write_missing_previews(&job.output, &self.options)?;
-                Ok(existing.made_otherwise)
-            };
-            let skipped = |made: Option<String>| {
                 let outdated = job::outdated(job, beside).map(Into::into);
-                Outcome::Skipped(outdated.into_iter().chain(made).collect())
+                let Existing { made_otherwise, expected_error, samples, .. } = existing;
+                let notes = outdated.into_iter().chain(made_otherwise).collect();
+                Ok(Outcome::Skipped(Finished { notes, expected_error, samples }))
             };
-            attempt(&job.output, take_up).map_or_else(Outcome::Failed, skipped)
+            attempt(&job.output, take_up).unwrap_or_else(Outcome::Failed)
         };
         let _ = self.write(job.clone(), take_up, ended);
         true

@@ -97,16 +97,10 @@ impl Options {
             Some(format!("{}/{}{variant}", name(place.parent()?), name(&place)))
         });
         let mut said = vec![format!("--model {}", weights.as_deref().unwrap_or(model.name()))];
-        match self.alpha {
-            Alpha::Auto => {}
-            Alpha::Denoise => said.push("--alpha denoise".into()),
-            Alpha::Keep => said.push("--alpha keep".into()),
-        }
-        match self.wrap {
-            Wrap::Auto => {}
-            Wrap::X => said.push("--wrap x".into()),
-            Wrap::None => said.push("--wrap none".into()),
-        }
+        let alpha = Alpha::ALL.into_iter().find(|(_, how)| *how == self.alpha && *how != Alpha::Auto);
+        said.extend(alpha.map(|(name, _)| format!("--alpha {name}")));
+        let wrap = Wrap::ALL.into_iter().find(|(_, how)| *how == self.wrap && *how != Wrap::Auto);
+        said.extend(wrap.map(|(name, _)| format!("--wrap {name}")));
         said.extend(self.temporal.map(|reach| format!("--temporal {reach}")));
         let Sources { mapping, albedo, normal } = &self.sources;
         said.extend(mapping.iter().map(|(pass, name)| format!("--map '{pass}={name}'")));
@@ -241,14 +235,14 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
             report
                 .notes
                 .push("Combined was already denoised by demc (--replace), and is denoised once more".into());
+            let is_own = |at: &PassChannels| frame.is_own_layer(&layer_name(&layer.name, &at.name));
+            let lights = denoised_lights(layer);
+            if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
+                let why = "its light passes are as rendered: they do not add up to it, and their results do not either";
+                report.notes.push(why.into());
+            }
         }
-        let values = 3 * shot.passes.width * shot.passes.height;
-        if let Some(count) = shot.repaired.get(&Pass::Combined).filter(|count| **count > values / 2) {
-            let why = format!(
-                "{count} of the {values} values of Combined are NaN or infinite; render the frame again"
-            );
-            return Err(Error::invalid(input, why));
-        }
+        refuse_broken(&shot)?;
         // Before any work: a missing pass is the user's commonest mistake.
         model.check(&shot.passes)?;
         let is_given = options.sources.normal.is_some();
@@ -261,8 +255,10 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
         if options.passes {
             shot.read_light_groups(&frame, layer)?;
         }
-        for (pass, count) in &shot.repaired {
-            *report.repaired.entry(pass.to_string()).or_default() += count;
+        let of_passes = shot.repaired.iter().map(|(pass, count)| (pass.to_string(), count));
+        let of_groups = shot.repaired_groups.iter().map(|(group, count)| (group.clone(), count));
+        for (name, count) in of_passes.chain(of_groups) {
+            *report.repaired.entry(name).or_default() += count;
         }
         (report.width, report.height) = (shot.passes.width, shot.passes.height);
         views.push((layer.clone(), shot));
@@ -271,12 +267,31 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     Ok(Views { frame, views, report })
 }
 
+/// Refuses a render of which most was filled in, and is no picture.
+fn refuse_broken(shot: &Shot) -> Result<()> {
+    let values = 3 * shot.passes.width * shot.passes.height;
+    match shot.repaired.get(&Pass::Combined) {
+        Some(count) if *count > values / 2 => {
+            let why = format!(
+                "{count} of the {values} values of Combined are NaN or infinite; render the frame again"
+            );
+            Err(Error::invalid(&shot.passes.path, why))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Refuses to replace a result whose light passes would stay, as they add up to that result alone.
 fn refuse_stale(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
-    let Some(added) = options.layer.as_ref().filter(|_| !options.passes) else { return Ok(()) };
-    let is_own = |at: &&PassChannels| frame.is_own_layer(&added_name(layer, &at.name, added));
-    let Some(light) = denoised_lights(layer).into_iter().find(is_own) else { return Ok(()) };
-    let name = added_name(layer, &light.name, added);
+    if options.passes {
+        return Ok(());
+    }
+    let name = |at: &PassChannels| match &options.layer {
+        Some(added) => added_name(layer, &at.name, added),
+        None => layer_name(&layer.name, &at.name),
+    };
+    let mut names = denoised_lights(layer).into_iter().map(name);
+    let Some(name) = names.find(|name| frame.is_own_layer(name)) else { return Ok(()) };
     let why = format!(
         "holds '{name}', which belongs to the result that would be replaced; say --passes, or --layer NAME for one beside it"
     );
@@ -291,6 +306,16 @@ fn check_added(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
         names.push(added_name(layer, COMBINED, added));
         let along = if options.passes { passes_along(layer) } else { Vec::new() };
         names.extend(along.into_iter().map(|at| added_name(layer, &at.name, added)));
+    }
+    if options.passes && options.layer.is_none() {
+        let mut along = passes_along(layer).into_iter();
+        if let Some(other) = along.find(|at| !has_window_of_beauty(frame, layer, at)) {
+            let why = format!(
+                "'{}' is stored for other pixels than the beauty, so that nothing can take its place; leave out --replace",
+                layer_name(&layer.name, &other.name)
+            );
+            return Err(Error::invalid(frame.path(), why));
+        }
     }
     names.extend(options.confidence.then(|| layer_name(&layer.name, &error_layer(options))));
     for name in names {
@@ -325,9 +350,10 @@ pub fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
     if options.temporal.is_some_and(|reach| reach > u8::MAX.into()) {
         return wrong("frames on each side: at most 255".into());
     }
-    if options.passes && !model.takes_companions() {
+    let along = [("--passes", options.passes), ("--alpha denoise", options.alpha == Alpha::Denoise)];
+    if let Some((option, _)) = along.iter().find(|(_, is_on)| *is_on && !model.takes_companions()) {
         let name = model.name();
-        return wrong(format!("{name} denoises the beauty alone; --passes takes demc-s, demc-m or demc-l"));
+        return wrong(format!("{name} denoises the beauty alone; {option} takes demc-s, demc-m or demc-l"));
     }
     if options.confidence {
         check_expects(model, "--confidence")?;
@@ -389,7 +415,7 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let (radiance, error) = run(&shot, &mut along.companions, true, (model, options), report)?;
+        let (radiance, error) = run(&shot, &mut along.companions, true, (model, options.tile), report)?;
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
         // What was read is not needed any more, so its memory is freed.
         drop(shot);
@@ -399,20 +425,29 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
     })
 }
 
-/// Denoises passes that are in memory, by the same steps as a file's. Returns finite radiance, (3, H, W).
+/// Denoises passes that are in memory, by the same steps as a file's. Returns finite radiance, (3, H, W), and alpha, (1,
+/// H, W), where the shot has that. Of the options, `tile` and `alpha` count; whether edges meet is the shot's to say.
 ///
 /// # Errors
-/// A pass is missing, or the model cannot denoise the frame.
-pub fn shot(shot: &Shot, model: &dyn Denoiser, options: &Options) -> Result<Planes> {
+/// A pass is missing, most of the beauty is not finite, the model cannot denoise the frame, or options ask for more than
+/// a beauty.
+pub fn shot(mut shot: Shot, model: &dyn Denoiser, options: &Options) -> Result<(Planes, Option<Planes>)> {
     model.check(&shot.passes)?;
     check_options(model, options)?;
+    if options.passes || options.confidence || options.temporal.is_some() {
+        let why = "of a shot in memory the beauty is denoised and its alpha: passes, confidence and temporal are for files";
+        return Err(Error::Usage(why.into()));
+    }
     if shot.passes.width * shot.passes.height == 0 {
         return Err(Error::invalid(&shot.passes.path, "has no pixels"));
     }
+    refuse_broken(&shot)?;
     let mut report = Report::default();
     rayon::scope(|_| {
-        let (radiance, _) = run(shot, &mut [], false, (model, options), &mut report)?;
-        finite(radiance, model.name(), &shot.passes.path, &mut report)
+        let mut along = Along::take(&mut shot, model, options, &mut report.notes);
+        let (radiance, _) = run(&shot, &mut along.companions, false, (model, options.tile), &mut report)?;
+        let radiance = finite(radiance, model.name(), &shot.passes.path, &mut report)?;
+        Ok((radiance, along.alpha().or(shot.passes.remove(Pass::Alpha))))
     })
 }
 
@@ -450,12 +485,11 @@ pub(super) fn run(
     shot: &Shot,
     companions: &mut [Companion],
     expects: bool,
-    (model, options): (&dyn Denoiser, &Options),
+    (model, tile): (&dyn Denoiser, Option<usize>),
     report: &mut Report,
 ) -> Result<(Planes, Option<ExpectedError>)> {
-    let denoise = |shot: &Shot, companions: &mut [Companion]| {
-        model.denoise_along(shot, companions, options.tile, expects)
-    };
+    let denoise =
+        |shot: &Shot, companions: &mut [Companion]| model.denoise_along(shot, companions, tile, expects);
     report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
     let start = Instant::now();
     let (radiance, error) =
@@ -542,8 +576,13 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         let why = "is a guide of this frame, which the result would overwrite; choose another --out";
         return Err(Error::invalid(guide, why));
     }
-    let errors: Vec<f64> = views.iter().filter_map(|(_, view)| Some(view.error.as_ref()?.mean())).collect();
-    report.expected_error = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
+    if are_same(frame.path(), output) {
+        return Err(Error::invalid(
+            output,
+            "is the render, which the result would overwrite; choose another place",
+        ));
+    }
+    report.expected_error = mean(views.iter().map(|(_, view)| view.error.as_ref().map(ExpectedError::mean)));
     for (layer, Denoised { radiance, alpha, lights, error }) in &views {
         let beauty = (&layer.passes[&Pass::Combined], COMBINED, radiance, alpha.as_ref());
         let lights = lights.iter().map(|(source, light)| {
@@ -558,7 +597,7 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
             }
         }
         let result = layer_name(&layer.name, options.layer.as_deref().unwrap_or(&beauty.0.name));
-        frame.set_expected_error(&result, &view_name(layer), error.as_ref().map(ExpectedError::mean));
+        frame.set_expected_error(&result, layer.view.as_deref(), error.as_ref().map(ExpectedError::mean));
         frame.set_lacked(&result, &report.lacked);
         frame.set_reach(&result, options.temporal.unwrap_or(0));
         frame.set_method(&result, &report.method);
@@ -575,14 +614,17 @@ pub(super) fn insert(denoised: Views<Denoised>, output: &Path, options: &Options
         }
     }
     report.notes.dedup();
-    if let Some(write) = options.preview {
-        for (layer, Denoised { radiance, .. }) in &views {
-            let path = preview_path(output, layer, views.len());
+    for (layer, Denoised { radiance, .. }) in &views {
+        let path = preview_path(output, layer, views.len());
+        if let Some(write) = options.preview {
             if options.overwrite || !path.exists() {
                 write(&path, radiance)?;
             } else {
                 report.notes.push(format!("{}: kept; --overwrite writes it anew", path.display()));
             }
+        } else if path.exists() && output.exists() {
+            let why = format!("{}: may show the earlier result; --preview writes it anew", path.display());
+            report.notes.push(why);
         }
     }
     Ok((frame, report))
@@ -598,6 +640,7 @@ fn put(
 ) -> Result<Option<Recoded>> {
     if let Some(added) = &options.layer {
         let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
+        let beside = if has_window_of_beauty(frame, layer, at) { at } else { &layer.passes[&Pass::Combined] };
         let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
             .iter()
             .enumerate()
@@ -606,7 +649,8 @@ fn put(
         if let Some(alpha) = alpha {
             channels.push(NewChannel { component: "A", kind, values: alpha.channel(0) });
         }
-        return frame.set_layer(at.part, &added_name(layer, pass, added), layer.view.as_deref(), &channels);
+        let name = added_name(layer, pass, added);
+        return frame.set_layer(beside.part, &name, layer.view.as_deref(), &channels);
     }
     let mut channels: Vec<(usize, &[f32])> =
         at.channels.iter().enumerate().map(|(c, &i)| (i, planes.channel(c))).collect();
@@ -618,6 +662,12 @@ fn put(
     frame.replace(at.part, &layer_name(&layer.name, &at.name), &channels)
 }
 
+/// Whether a pass is stored for the pixels that the beauty is stored for, which are those that are denoised.
+fn has_window_of_beauty(frame: &Frame, layer: &Layer, at: &PassChannels) -> bool {
+    let [own, beauty] = [at, &layer.passes[&Pass::Combined]].map(|at| frame.parts()[at.part].data_window);
+    own == beauty
+}
+
 /// The full name of what is added for a pass: `ViewLayer.Denoised` for Combined, else `ViewLayer.Diffuse
 /// Direct.Denoised`.
 fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
@@ -627,17 +677,15 @@ fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
     }
 }
 
+/// The mean over stereo views of what each has, if all have it.
+fn mean(of_views: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    let values: Vec<f64> = of_views.collect::<Option<_>>()?;
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
 /// The name of the layer that tells how far off a result is expected to be.
 fn error_layer(options: &Options) -> String {
     format!("{} Error", options.layer.as_deref().unwrap_or(COMBINED))
-}
-
-/// The name of a view layer, and of its stereo view.
-fn view_name(layer: &Layer) -> String {
-    match &layer.view {
-        None => layer.name.clone(),
-        Some(view) => layer_name(&layer.name, view),
-    }
 }
 
 /// The path of a layer's preview: the result's, with the view where there are `views`, as `.png`.
@@ -690,6 +738,10 @@ pub(super) struct Existing {
     pub made_otherwise: Option<String>,
     /// The frames by number that it was made without.
     pub lacked: BTreeSet<i64>,
+    /// Its expected RelMSE, as the mean over its views, where that is noted.
+    pub expected_error: Option<f64>,
+    /// Samples of a pixel of its render, where the file tells.
+    pub samples: Option<u32>,
 }
 
 impl Existing {
@@ -740,7 +792,14 @@ impl Existing {
         let made = headers.method(&full_name).filter(|made| *made != method);
         let made_otherwise = made
             .map(|made| format!("was made with {made}, and was kept; --overwrite makes it with {method}"));
-        Ok(Self { views, made_otherwise, lacked: headers.lacked(&full_name) })
+        let expected = views.iter().map(|layer| headers.expected_error(&full_name, layer.view.as_deref()));
+        Ok(Self {
+            expected_error: mean(expected),
+            samples: passes::told_samples(headers, chosen),
+            lacked: headers.lacked(&full_name),
+            made_otherwise,
+            views,
+        })
     }
 
     /// Writes the previews that are wanted and missing.

@@ -59,7 +59,9 @@ impl Lane {
     pub fn start(shared: &Arc<Shared>, (lane, lanes): (usize, usize), ended: &Sender<Message>) {
         let threads = rayon::current_num_threads();
         let own = threads / lanes + usize::from(lane < threads % lanes);
-        let pool = (lanes > 1).then(|| ThreadPoolBuilder::new().num_threads(own).build());
+        // Of several lanes each has a share, and one keeps to the pool that the batch was begun in.
+        let pool = (lanes > 1 || rayon::current_thread_index().is_some())
+            .then(|| ThreadPoolBuilder::new().num_threads(own).build());
         let pool = pool.map(|pool| Arc::new(pool.expect("the system has room for the threads of a lane")));
         let lane = Self { shared: Arc::clone(shared), lanes, pool, ended: ended.clone() };
         // Rendezvous channels: a stage holds its frame until the next one is free to take it.
@@ -163,8 +165,9 @@ impl Lane {
 
     fn denoise_all(&self, frames: &Receiver<Loaded>, next: &SyncSender<(Job, Views<Denoised>)>) {
         let Shared { model, options, .. } = &*self.shared;
-        let (model, reach) = (&**model, self.reach());
-        let mut window = Window::new(reach);
+        let model = &**model;
+        let new_window = || Window::new(self.reach(), model, options.tile);
+        let mut window = new_window();
         for loaded in frames {
             if self.shared.is_stopped() {
                 return;
@@ -178,17 +181,17 @@ impl Lane {
                     (job, denoised)
                 }
                 Loaded::Begin => {
-                    window = Window::new(reach);
+                    window = new_window();
                     continue;
                 }
                 Loaded::Neighbour { number, file, read, is_written } => {
                     let loaded = self.take_apart(&file, read);
                     let entered = attempt(&file, || {
-                        self.on_own_threads(|| window.enter(number, loaded, is_written, model));
+                        self.on_own_threads(|| window.enter(number, loaded, is_written));
                         Ok(())
                     });
                     if let Err(error) = entered {
-                        window.enter(number, Err(error), is_written, model);
+                        window.enter(number, Err(error), is_written);
                     }
                     continue;
                 }
@@ -196,7 +199,7 @@ impl Lane {
                     let window = &mut window;
                     let denoised = attempt(&job.input, || {
                         self.on_own_threads(|| {
-                            let denoised = window.denoise(number, model, options);
+                            let denoised = window.denoise(number);
                             window.leave(number);
                             denoised
                         })

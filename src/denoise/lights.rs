@@ -33,6 +33,12 @@ pub enum Alpha {
     Keep,
 }
 
+impl Alpha {
+    /// All, by their names on the command line.
+    pub const ALL: [(&str, Self); 3] =
+        [("auto", Self::Auto), ("denoise", Self::Denoise), ("keep", Self::Keep)];
+}
+
 /// Light passes that are stored divided by a colour, and that colour.
 const LIT: [([Pass; 2], Pass); 3] = [
     ([Pass::DiffuseDirect, Pass::DiffuseIndirect], Pass::DiffuseColor),
@@ -137,13 +143,17 @@ impl Along {
                 "Combined is below zero in {count} of the pixels: there it and its light are denoised as black"
             ));
         }
-        let is_summand = |pass: &Pass| *pass == Pass::Combined || light_passes().contains(pass);
-        let broken: usize =
-            shot.repaired.iter().filter(|(pass, _)| is_summand(pass)).map(|(_, count)| count).sum();
+        let adds_up = |pass: &Pass| match pass {
+            Pass::Combined => true,
+            Pass::ShadowCatcher => false,
+            pass => light_passes().contains(pass),
+        };
+        let of_passes = shot.repaired.iter().filter(|(pass, _)| adds_up(pass)).map(|(_, count)| count);
+        let broken: usize = of_passes.chain(shot.repaired_groups.values()).sum();
         if broken > 0 {
             notes.push(format!(
-                "of the values of Combined and of light passes {broken} are NaN or infinite: around them the denoised light \
-                 passes do not add up to the result"
+                "of the values of Combined, light passes and light groups {broken} are NaN or infinite: around them the \
+                 denoised ones do not add up to the result"
             ));
         }
         for (lights, colour) in LIT {
@@ -182,28 +192,43 @@ impl Along {
             below.iter().for_each(|at| companion.planes.data[*at] = 0.0);
         }
         if !self.sources.iter().any(|source| *source != Source::Pass(Pass::Alpha)) {
-            notes.push(
-                "holds no light passes to denoise; turn on View Layer Properties > Passes > Light, or light groups".into(),
-            );
+            let remedy = match shot.passes.renderer.is_blender() {
+                true => "turn on View Layer Properties > Passes > Light, or light groups",
+                false => "--map 'PASS=NAME' tells where they are, if there are any",
+            };
+            notes.push(format!("holds no light passes to denoise; {remedy}"));
         }
+    }
+
+    /// Each source with its companion's planes.
+    fn done(self) -> Vec<(Source, Planes)> {
+        let denoised = self.companions.into_iter().map(|companion| companion.planes);
+        self.sources.into_iter().zip(denoised).collect()
+    }
+
+    /// Alpha, (1, H, W), once the model has denoised it, if it goes along.
+    pub fn alpha(self) -> Option<Planes> {
+        take_alpha(&mut self.done())
     }
 
     /// The layers as they are to be stored, once the model has denoised them: alpha, (1, H, W), and all
     /// others, (3, H, W).
     pub fn finish(self, frame: &Frame, layer: &Layer) -> (Option<Planes>, Vec<(Source, Planes)>) {
-        let denoised = self.companions.into_iter().map(|companion| companion.planes);
-        let mut done: Vec<(Source, Planes)> = self.sources.into_iter().zip(denoised).collect();
-        let alpha = done.iter().position(|(source, _)| *source == Source::Pass(Pass::Alpha));
-        let alpha = alpha.map(|at| {
-            let (_, mut alpha) = done.remove(at);
-            alpha.data.iter_mut().for_each(|share| *share = share.clamp(0.0, 1.0));
-            alpha
-        });
+        let mut done = self.done();
+        let alpha = take_alpha(&mut done);
         for (lights, colour) in LIT {
             divide(&mut done, lights, colour, frame, layer);
         }
         (alpha, done)
     }
+}
+
+/// Takes denoised alpha out of what was denoised.
+fn take_alpha(done: &mut Vec<(Source, Planes)>) -> Option<Planes> {
+    let at = done.iter().position(|(source, _)| *source == Source::Pass(Pass::Alpha))?;
+    let (_, mut alpha) = done.remove(at);
+    alpha.data.iter_mut().for_each(|share| *share = share.clamp(0.0, 1.0));
+    Some(alpha)
 }
 
 /// Divides denoised light by its denoised colour, which is first rounded to what the file can store.

@@ -101,13 +101,7 @@ impl Stretch {
 
 /// The sequences that jobs belong to, in the order of their first jobs.
 pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
-    /// A sequence that is still growing.
-    struct Sequence {
-        files: BTreeMap<i64, PathBuf>,
-        jobs: Vec<(Job, i64)>,
-        is_numbered: bool,
-    }
-    let mut sequences: Vec<Sequence> = Vec::new();
+    let mut sequences: Vec<Stretch> = Vec::new();
     let mut known: BTreeMap<Key, usize> = BTreeMap::new();
     for job in jobs {
         let place = Place::of(&job.input);
@@ -118,8 +112,8 @@ pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
         let is_new = |at: &usize| sequences[*at].jobs.iter().all(|(_, other)| *other != number);
         let at = place.as_ref().and_then(|place| known.get(&place.key)).copied();
         let at = at.filter(|at| is_sibling(at) && is_new(at)).unwrap_or_else(|| {
-            let files = place.as_ref().map(Place::siblings).unwrap_or_default();
-            sequences.push(Sequence { files, jobs: Vec::new(), is_numbered: place.is_some() });
+            let files = Arc::new(place.as_ref().map(Place::siblings).unwrap_or_default());
+            sequences.push(Stretch { files, jobs: Vec::new(), is_numbered: place.is_some() });
             let at = sequences.len() - 1;
             let is_sibling = sequences[at].files.get(&number).is_none_or(|file| *file == job.input);
             if let Some(place) = place.filter(|_| is_sibling) {
@@ -127,41 +121,16 @@ pub fn group(jobs: Vec<Job>) -> Vec<Stretch> {
             }
             at
         });
-        sequences[at].files.insert(number, job.input.clone());
+        Arc::make_mut(&mut sequences[at].files).insert(number, job.input.clone());
         sequences[at].jobs.push((job, number));
     }
-    let whole = |Sequence { files, mut jobs, is_numbered }| {
-        jobs.sort_by_key(|(_, number)| *number);
-        Stretch { files: Arc::new(files), jobs, is_numbered }
-    };
-    sequences.into_iter().map(whole).collect()
+    sequences.iter_mut().for_each(|sequence| sequence.jobs.sort_by_key(|(_, number)| *number));
+    sequences
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn place(file: &str) -> Option<(String, i64)> {
-        Place::of(Path::new(file)).map(|place| (String::from_utf8(place.key.before).unwrap(), place.number))
-    }
-
-    #[test]
-    fn numbers_of_any_width_end_names() {
-        for (file, expected) in [
-            ("a/shot_0004spp.0017.exr", Some(("shot_0004spp.", 17))),
-            ("shot17.exr", Some(("shot", 17))),
-            ("shot_10017.exr", Some(("shot_", 10017))),
-            ("0001.exr", Some(("", 1))),
-            ("-0003.exr", Some(("", -3))),
-            ("shot.-0003.exr", Some(("shot.", -3))),
-            ("shot-0003.exr", Some(("shot-", 3))),
-            ("bathroom_0004spp.exr", None),
-            ("bathroom.exr", None),
-            ("a99999999999999999999.exr", None),
-        ] {
-            assert_eq!(place(file), expected.map(|(head, number)| (head.into(), number)), "{file}");
-        }
-    }
 
     #[test]
     fn jobs_are_sequences_with_all_that_lies_beside_them() {

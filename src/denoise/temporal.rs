@@ -3,10 +3,7 @@
 //! In: a [`Shot`] with its neighbours. Out: what [`super::Batch`] makes of the frame with
 //! [`super::Options::temporal`].
 
-use super::{
-    Options, Report,
-    window::{Candidates, PASSES, Window},
-};
+use super::window::{Candidates, PASSES, Window};
 use crate::{Result, models::Denoiser, passes::Pass, planes::Planes, shot::Shot};
 
 /// What its name ends in.
@@ -32,15 +29,15 @@ impl Temporal {
 
 impl Temporal {
     /// A window around a frame with the neighbours that the shot has.
-    fn window(&self, shot: &Shot) -> Window {
-        let mut window = Window::new(self.reach);
+    fn window(&self, shot: &Shot) -> Window<'_> {
+        let mut window = Window::new(self.reach, &*self.model, None);
         let reach = i32::try_from(self.reach).unwrap_or(i32::MAX);
         for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
-            window.enter_shot(offset.into(), Shot::new(passes.clone()), &*self.model);
+            window.enter_shot(offset.into(), Shot::new(passes.clone()));
         }
         let mut own = Shot::new(shot.passes.clone());
         (own.halves, own.wraps) = (shot.halves.clone(), shot.wraps);
-        window.enter_shot(0, own, &*self.model);
+        window.enter_shot(0, own);
         window
     }
 
@@ -49,7 +46,7 @@ impl Temporal {
     /// # Errors
     /// The model cannot denoise a frame.
     pub fn candidates(&self, shot: &Shot) -> Result<Candidates> {
-        self.window(shot).candidates(0, &*self.model)
+        self.window(shot).candidates(0)
     }
 }
 
@@ -79,7 +76,7 @@ impl Denoiser for Temporal {
     }
 
     fn denoise(&self, shot: &Shot) -> Result<Planes> {
-        self.window(shot).denoise_shot(0, &*self.model, &Options::default(), &mut Report::default())
+        self.window(shot).denoise_shot(0)
     }
 
     fn is_warm(&self) -> bool {

@@ -15,7 +15,7 @@ use std::{
 };
 
 use super::{
-    Denoised, Options, Report, Views,
+    Denoised, Report, Views,
     half_floats::HalfFloats,
     job::{finish, run},
 };
@@ -145,7 +145,10 @@ struct Held {
 }
 
 /// Frames of one sequence, by number, in memory.
-pub struct Window {
+pub struct Window<'a> {
+    model: &'a dyn Denoiser,
+    /// See [`Options::tile`](super::Options::tile).
+    tile: Option<usize>,
     /// How many frames away the renders are that are averaged, and the results.
     reaches: [i32; 2],
     held: BTreeMap<i64, Held>,
@@ -153,11 +156,13 @@ pub struct Window {
     is_stream: bool,
 }
 
-impl Window {
+impl<'a> Window<'a> {
     /// An empty window of so many frames before and after one.
-    pub fn new(reach: usize) -> Self {
+    pub fn new(reach: usize, model: &'a dyn Denoiser, tile: Option<usize>) -> Self {
         let renders = reach.min(RENDERS);
         Self {
+            model,
+            tile,
             reaches: [renders, reach - renders].map(|n| i32::try_from(n).unwrap_or(i32::MAX)),
             held: BTreeMap::new(),
             is_stream: false,
@@ -165,18 +170,12 @@ impl Window {
     }
 
     /// Takes in what was read of a frame, or why it cannot be; `is_written` if it is to be denoised too.
-    pub fn enter(
-        &mut self,
-        number: i64,
-        loaded: Result<Views<Shot>>,
-        is_written: bool,
-        model: &dyn Denoiser,
-    ) {
+    pub fn enter(&mut self, number: i64, loaded: Result<Views<Shot>>, is_written: bool) {
         self.is_stream = true;
         let mut moments = BTreeMap::new();
         let rest = loaded.and_then(|loaded| {
             loaded.each(|_, layer, shot, _| {
-                moments.insert(key(layer), Moment::new(shot, model));
+                moments.insert(key(layer), Moment::new(shot, self.model));
                 Ok(())
             })
         });
@@ -189,8 +188,8 @@ impl Window {
     }
 
     /// Takes in a frame that has a single view and comes from no file.
-    pub fn enter_shot(&mut self, number: i64, shot: Shot, model: &dyn Denoiser) {
-        let moments = BTreeMap::from([(ViewKey::default(), Moment::new(shot, model))]);
+    pub fn enter_shot(&mut self, number: i64, shot: Shot) {
+        let moments = BTreeMap::from([(ViewKey::default(), Moment::new(shot, self.model))]);
         self.held.insert(number, Held { rest: None, moments, error: None, trouble: None });
     }
 
@@ -198,14 +197,8 @@ impl Window {
     ///
     /// # Errors
     /// The model cannot denoise it.
-    pub fn denoise_shot(
-        &mut self,
-        number: i64,
-        model: &dyn Denoiser,
-        options: &Options,
-        report: &mut Report,
-    ) -> Result<Planes> {
-        self.view(number, &ViewKey::default(), model, options, report)
+    pub fn denoise_shot(&mut self, number: i64) -> Result<Planes> {
+        self.view(number, &ViewKey::default(), &mut Report::default())
     }
 
     /// Lets go of what no frame after one needs that has been denoised, if frames come in order.
@@ -231,7 +224,7 @@ impl Window {
     /// Lets go of what a frame of a stream no longer needs, when the render of frame `averaged` has just been
     /// averaged with its neighbours': of what tells frames apart where it is known how they belong together,
     /// and of all passes but those of the result where its neighbours' renders have been averaged too.
-    fn trim(&mut self, number: i64, view: &ViewKey, averaged: i64, model: &dyn Denoiser) {
+    fn trim(&mut self, number: i64, view: &ViewKey, averaged: i64) {
         let next = |offset: i32| number + i64::from(offset);
         let is_known = |number: i64, offset: i32| {
             let knows = |moment: &Moment| moment.links.contains_key(&offset) || moment.is_result_alone();
@@ -247,7 +240,7 @@ impl Window {
         });
         let mut kept = vec![Pass::Combined, Pass::Alpha, Pass::Vector];
         if !is_averaged {
-            kept.extend(model.passes().iter().chain(model.optional_passes()));
+            kept.extend(self.model.passes().iter().chain(self.model.optional_passes()));
         }
         if let Some(moment) = self.moment_mut(number, view) {
             moment.keep(&kept);
@@ -258,12 +251,7 @@ impl Window {
     ///
     /// # Errors
     /// It could not be read, or the model cannot denoise it.
-    pub fn denoise(
-        &mut self,
-        number: i64,
-        model: &dyn Denoiser,
-        options: &Options,
-    ) -> Result<Views<Denoised>> {
+    pub fn denoise(&mut self, number: i64) -> Result<Views<Denoised>> {
         let held = self.held.get_mut(&number).expect("a frame enters before it is denoised");
         if let Some(error) = held.error.take() {
             return Err(error);
@@ -271,11 +259,11 @@ impl Window {
         let rest = held.rest.take().expect("it is denoised once");
         rest.each(|_, layer, (), report| {
             let start = Instant::now();
-            let radiance = self.view(number, &key(layer), model, options, report)?;
+            let radiance = self.view(number, &key(layer), report)?;
             report.seconds = start.elapsed().as_secs_f64();
             let passes = &self.moment(number, &key(layer)).expect("its views have entered").shot.passes;
             let alpha = passes.get(Pass::Alpha).cloned();
-            finish(&passes.path, radiance, (alpha, Vec::new()), model, report)
+            finish(&passes.path, radiance, (alpha, Vec::new()), self.model, report)
         })
     }
 
@@ -283,9 +271,9 @@ impl Window {
     ///
     /// # Errors
     /// The model cannot denoise a frame.
-    pub fn candidates(&mut self, number: i64, model: &dyn Denoiser) -> Result<Candidates> {
+    pub fn candidates(&mut self, number: i64) -> Result<Candidates> {
         let view = ViewKey::default();
-        self.gather(number, &view, model, &Options::default(), &mut Report::default())?;
+        self.gather(number, &view, &mut Report::default())?;
         let own = self.moment(number, &view).expect("it has entered");
         let (result, render) = (own.result(), own.render());
         let likeness = likeness::Own::of(result, &render, own.exposure);
@@ -305,15 +293,8 @@ impl Window {
         })
     }
 
-    fn view(
-        &mut self,
-        number: i64,
-        view: &ViewKey,
-        model: &dyn Denoiser,
-        options: &Options,
-        report: &mut Report,
-    ) -> Result<Planes> {
-        self.gather(number, view, model, options, report)?;
+    fn view(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<Planes> {
+        self.gather(number, view, report)?;
         let own = self.moment(number, view).expect("its views have entered");
         let radiance = own.render();
         let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
@@ -327,25 +308,18 @@ impl Window {
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
-    fn gather(
-        &mut self,
-        number: i64,
-        view: &ViewKey,
-        model: &dyn Denoiser,
-        options: &Options,
-        report: &mut Report,
-    ) -> Result<()> {
+    fn gather(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<()> {
         let [renders, results] = self.reaches;
         for offset in offsets(renders.max(results)) {
             self.connect(number, view, offset);
         }
         self.explain(number, view, report);
-        self.infer(number, view, model, options, report)?;
+        self.infer(number, view, report)?;
         report.lacked.extend(self.lost(number, view, renders.max(results)));
         for offset in offsets(results) {
             if self.is_linked(number, view, offset) {
                 let other = number + i64::from(offset);
-                self.infer(other, view, model, options, report)?;
+                self.infer(other, view, report)?;
                 report.lacked.extend(&self.moment(other, view).expect("it was inferred").lacked);
             }
         }
@@ -387,15 +361,8 @@ impl Window {
     }
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
-    fn infer(
-        &mut self,
-        number: i64,
-        view: &ViewKey,
-        model: &dyn Denoiser,
-        options: &Options,
-        report: &mut Report,
-    ) -> Result<()> {
-        let [renders, _] = self.reaches;
+    fn infer(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<()> {
+        let Self { model, tile, reaches: [renders, _], .. } = *self;
         if self.moment(number, view).is_some_and(|own| own.result.is_some()) {
             return Ok(());
         }
@@ -418,8 +385,8 @@ impl Window {
         } else {
             own.shot()
         };
-        offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number, model));
-        let (image, _) = run(&shot, &mut [], false, (model, options), report)?;
+        offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number));
+        let (image, _) = run(&shot, &mut [], false, (model, tile), report)?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
         (moment.result, moment.lacked) = (Some(image), lacked);
@@ -491,8 +458,7 @@ impl Window {
         }
         let (mut sum, mut inside) = (0.0, 0usize);
         for y in 0..weights.height {
-            let row = &weights.data[y * weights.width..][..weights.width];
-            sum += row.iter().map(|w| f64::from(*w)).sum::<f64>();
+            sum += weights.row(0, y).iter().map(|w| f64::from(*w)).sum::<f64>();
             inside += flow.row(y).0.iter().filter(|x| !x.is_nan()).count();
         }
         let share = (sum / inside.max(1) as f64) as f32;

@@ -20,6 +20,9 @@ pub enum Wrap {
 }
 
 impl Wrap {
+    /// All, by their names on the command line.
+    pub const ALL: [(&str, Self); 3] = [("auto", Self::Auto), ("x", Self::X), ("none", Self::None)];
+
     /// Whether the edges of this part of a frame meet.
     pub(super) fn of(self, frame: &Frame, part: usize) -> bool {
         // A region of the whole, or one with more around it, ends where it ends.
@@ -71,7 +74,7 @@ pub(super) fn joined(
 fn widen(planes: &Planes) -> Planes {
     let (width, before) = (planes.width, planes.width - MARGIN % planes.width);
     Planes::from_rows(planes.channels, (width + 2 * MARGIN, planes.height), |c, y, row| {
-        let from = &planes.channel(c)[y * width..][..width];
+        let from = planes.row(c, y);
         row.iter_mut().enumerate().for_each(|(x, value)| *value = from[(x + before) % width]);
     })
 }

@@ -2,7 +2,6 @@
 
 use rayon::prelude::*;
 
-use super::neighbours;
 use crate::planes::Planes;
 
 /// Sets a colour channel of a pixel of `image` to zero where both `radiance` and `albedo` are zero in that
@@ -12,7 +11,7 @@ use crate::planes::Planes;
 /// black places, which a display's gamma makes visible. Radiance alone does not tell: a dim wall may be black
 /// in all samples.
 pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
-    let (w, h, n) = (image.width, image.height, image.pixels());
+    let (w, n) = (image.width, image.pixels());
     image.data.par_chunks_mut(n).enumerate().for_each(|(c, plane)| {
         let (radiance_of, albedo_of) = (radiance.channel(c), albedo.channel(c));
         let nothing = |radiance: f32, albedo: f32| (radiance <= 0.0) & (albedo <= 0.0);
@@ -24,7 +23,7 @@ pub fn keep_black(image: &mut Planes, radiance: &Planes, albedo: &Planes) {
                 return;
             }
             for (x, value) in row.iter_mut().enumerate() {
-                if is_black(x, y) && neighbours((x, y), (w, h)).all(|(x, y)| is_black(x, y)) {
+                if is_black(x, y) && radiance.near(x, y, 2).all(|(x, y)| is_black(x, y)) {
                     *value = 0.0;
                 }
             }

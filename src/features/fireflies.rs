@@ -5,9 +5,11 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::neighbours;
 pub use crate::filters::FIREFLY;
-use crate::planes::{Planes, mirror_beyond, mirrored};
+use crate::{
+    kernels::thirds,
+    planes::{Planes, mirror_beyond, mirrored},
+};
 
 /// Pixels of a row that are tested together.
 const RUN: usize = 32;
@@ -27,15 +29,12 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
     }
     let brightest = |x: usize, y: usize| (0..3).map(|c| radiance.channel(c)[y * w + x]).fold(0.0, f32::max);
     let mut tamed = Planes::unwritten(3, size.0, size.1);
-    let n = tamed.pixels();
-    let (red, rest) = tamed.data.split_at_mut(n);
-    let (green, blue) = rest.split_at_mut(n);
-    let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(size.0));
+    let [red, green, blue] = thirds(&mut tamed.data).map(|plane| plane.par_chunks_mut(size.0));
     red.zip(green).zip(blue).enumerate().for_each_init(Vec::new, |row, (y, ((red, green), blue))| {
         let y = rows.start + mirrored(y, rows.len());
         let mut colours = [red, green, blue];
         for (c, colour) in colours.iter_mut().enumerate() {
-            colour[..w].copy_from_slice(&radiance.channel(c)[y * w..][..w]);
+            colour[..w].copy_from_slice(radiance.row(c, y));
         }
         row.clear();
         row.extend((0..w).map(|x| brightest(x, y)));
@@ -52,7 +51,7 @@ pub fn tame_fireflies(radiance: &Planes, rows: Range<usize>, size: (usize, usize
             for x in run {
                 let own = row[x];
                 let others = || {
-                    let near = neighbours((x, y), (w, radiance.height));
+                    let near = radiance.near(x, y, 2);
                     near.filter(|&other| other != (x, y)).map(|(x, y)| brightest(x, y))
                 };
                 if own <= floor || others().any(|other| own <= FIREFLY * other) {

@@ -52,13 +52,13 @@ pub const DIFFUSE_FLOOR: f32 = 0.00316;
 ///
 /// # Errors
 /// A pass is missing.
-pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
-    let radiance = passes.require(Pass::Combined, needed_by)?;
-    let guides = SharedInputs::new(passes, needed_by)?;
+pub fn kpcn_combined(passes: &PassSet) -> Result<Inputs> {
+    let radiance = passes.require(Pass::Combined, "kpcn")?;
+    let guides = SharedInputs::new(passes)?;
     let exposure = exposure(radiance);
     let mut albedo = guides.albedo.clone();
     if KPCN_COMBINED_OPTIONAL.iter().all(|pass| passes.get(*pass).is_some()) {
-        let (texture, n) = (first_texture(passes, needed_by)?, albedo.pixels());
+        let (texture, n) = (first_texture(passes, "kpcn")?, albedo.pixels());
         for i in (0..n).filter(|i| (0..3).any(|c| texture.data[c * n + i] > 0.0)) {
             (0..3).for_each(|c| albedo.data[c * n + i] = texture.data[c * n + i].clamp(0.0, 1.0));
         }
@@ -78,10 +78,10 @@ pub fn kpcn_combined(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
 ///
 /// # Errors
 /// A pass is missing.
-pub fn kpcn_streams(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
-    let get = |pass| passes.require(pass, needed_by);
+pub fn kpcn_streams(passes: &PassSet) -> Result<Inputs> {
+    let get = |pass| passes.require(pass, "kpcn");
     let radiance = get(Pass::Combined)?;
-    let guides = SharedInputs::new(passes, needed_by)?;
+    let guides = SharedInputs::new(passes)?;
     let exposure = exposure(radiance);
     let mut colour = get(Pass::DiffuseColor)?.clone();
     colour.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
@@ -128,17 +128,17 @@ struct SharedInputs {
 }
 
 impl SharedInputs {
-    fn new(passes: &PassSet, needed_by: &str) -> Result<Self> {
+    fn new(passes: &PassSet) -> Result<Self> {
         let [normal, albedo, depth] = GUIDES;
         let clamped = |pass, least| -> Result<Planes> {
-            let mut planes = passes.require(pass, needed_by)?.clone();
+            let mut planes = passes.require(pass, "kpcn")?.clone();
             planes.data.iter_mut().for_each(|v| *v = v.clamp(least, 1.0));
             Ok(planes)
         };
         let normal = clamped(normal, -1.0)?;
         // Emitters write their radiance into albedo.
         let albedo = clamped(albedo, 0.0)?;
-        let depth = relative_depth(passes.require(depth, needed_by)?);
+        let depth = relative_depth(passes.require(depth, "kpcn")?);
         let mut channels = Vec::new();
         for guide in [&normal, &albedo, &depth] {
             describe(guide, &mut channels);
@@ -195,7 +195,7 @@ mod tests {
             if !unfiltered {
                 KPCN_UNFILTERED.into_iter().for_each(|pass| drop(set.remove(pass)));
             }
-            let Inputs { planes, scale } = kpcn_streams(&set, "kpcn").unwrap();
+            let Inputs { planes, scale } = kpcn_streams(&set).unwrap();
             let [diffuse, colour, specular, rest, ..] = &planes[..] else { panic!("six planes") };
             let combined = &set.get(Pass::Combined).unwrap().data;
             for (i, want) in combined.iter().enumerate() {
@@ -209,7 +209,7 @@ mod tests {
     #[test]
     fn the_single_stream_divides_by_the_first_texture_where_there_is_one() {
         let mut set = ramps();
-        let albedo = |set: &PassSet| kpcn_combined(set, "kpcn").unwrap().planes[1].data.clone();
+        let albedo = |set: &PassSet| kpcn_combined(set).unwrap().planes[1].data.clone();
         let denoising: Vec<f32> =
             set.get(Pass::DenoisingAlbedo).unwrap().data.iter().map(|a| a + 0.05).collect();
         // One of the three is there by itself, which is not enough.
@@ -227,7 +227,7 @@ mod tests {
     #[test]
     fn the_single_stream_times_albedo_is_combined() {
         let set = ramps();
-        let Inputs { planes, scale } = kpcn_combined(&set, "kpcn").unwrap();
+        let Inputs { planes, scale } = kpcn_combined(&set).unwrap();
         for (i, want) in set.get(Pass::Combined).unwrap().data.iter().enumerate() {
             let got = planes[0].data[i] * planes[1].data[i] * scale;
             assert!((got - want).abs() < 1e-5 * want);

@@ -49,15 +49,15 @@ const MAX_DEVIATIONS: f32 = 3.0;
 ///
 /// # Errors
 /// A pass is missing.
-pub fn lbf(passes: &PassSet, needed_by: &str) -> Result<Inputs> {
-    let get = |pass| passes.require(pass, needed_by);
+pub fn lbf(passes: &PassSet) -> Result<Inputs> {
+    let get = |pass| passes.require(pass, "lbf");
     let radiance = get(Pass::Combined)?;
     let exposure = exposure(radiance);
     let mut colour = radiance.clone();
     colour.data.iter_mut().for_each(|v| *v = v.max(0.0) * exposure);
     let mut normal = get(Pass::Normal)?.clone();
     normal.data.iter_mut().for_each(|v| *v = 0.5 * v.clamp(-1.0, 1.0));
-    let mut first_hit = first_texture(passes, needed_by)?;
+    let mut first_hit = first_texture(passes, "lbf")?;
     let mut second_hit = get(Pass::DenoisingAlbedo)?.clone();
     for texture in [&mut first_hit, &mut second_hit] {
         texture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn a_flat_frame_has_means_and_nothing_else() {
-        let inputs = lbf(&flat(0.25), "lbf").unwrap();
+        let inputs = lbf(&flat(0.25)).unwrap();
         let channels: Vec<usize> = inputs.planes.iter().map(|p| p.channels).collect();
         assert_eq!(channels, [3, 1, 12, 6, LBF_CHANNELS]);
         let secondary = &inputs.planes[4];

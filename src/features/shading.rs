@@ -10,7 +10,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{STEEPNESS, divisor, unit};
+use super::{NEEDED_BY, STEEPNESS, divisor, unit};
 use crate::{
     Result,
     filters::{
@@ -72,18 +72,17 @@ impl Shading {
     ///
     /// # Errors
     /// A pass is missing.
-    pub fn of(passes: &PassSet, exposure: f32, needed_by: &str) -> Result<Self> {
-        let radiance = passes.require(Pass::Combined, needed_by)?;
-        let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
-        let albedo = passes.require(Pass::DenoisingAlbedo, needed_by)?;
+    pub fn of(passes: &PassSet, exposure: f32) -> Result<Self> {
+        let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
+        let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
+        let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
         let (width, squares) = (passes.width, passes.width.div_ceil(SQUARE));
         let mut moments = vec![0.0; passes.height.div_ceil(SQUARE) * MOMENTS * squares];
         moments.par_chunks_mut(MOMENTS * squares).enumerate().for_each(|(row, moments)| {
             let mut of_columns = vec![0.0; MOMENTS * width];
             let mut lines = vec![1.0; LINES * width];
             for y in SQUARE * row..(SQUARE * (row + 1)).min(passes.height) {
-                let [radiance, albedo, normal] = [radiance, albedo, normal]
-                    .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+                let [radiance, albedo, normal] = [radiance, albedo, normal].map(|planes| planes.rows(y));
                 let (lines, sums) = (&mut *lines, &mut *of_columns);
                 vectorised::run(Gather { radiance, albedo, normal, exposure, lines, sums });
             }
@@ -122,8 +121,8 @@ impl Shading {
     ///
     /// # Errors
     /// A pass is missing.
-    pub fn rows(&self, passes: &PassSet, rows: Range<usize>, needed_by: &str) -> Result<Planes> {
-        let normal = passes.require(Pass::DenoisingNormal, needed_by)?;
+    pub fn rows(&self, passes: &PassSet, rows: Range<usize>) -> Result<Planes> {
+        let normal = passes.require(Pass::DenoisingNormal, NEEDED_BY)?;
         let (width, squares) = (passes.width, self.squares);
         let height = self.lines.len() / (KEPT * squares);
         let mut shading = Planes::unwritten(1, width, rows.len());
@@ -133,8 +132,7 @@ impl Shading {
             let near = line(above).iter().zip(line(above + 1));
             let line: Vec<f32> = near.map(|(a, b)| a + (b - a) * share).collect();
             let slopes = std::array::from_fn(|k| &line[k * squares..][..squares]);
-            let normal = [0, 1, 2].map(|c| &normal.channel(c)[y * width..][..width]);
-            vectorised::run(Shade { slopes, normal, output });
+            vectorised::run(Shade { slopes, normal: normal.rows(y), output });
         });
         Ok(shading)
     }
@@ -280,7 +278,7 @@ mod tests {
     }
 
     fn shading(passes: &PassSet, exposure: f32) -> Planes {
-        Shading::of(passes, exposure, "test").unwrap().rows(passes, 0..SIZE.1, "test").unwrap()
+        Shading::of(passes, exposure).unwrap().rows(passes, 0..SIZE.1).unwrap()
     }
 
     /// The slope of shading over the normal's X.
@@ -336,9 +334,9 @@ mod tests {
     fn parts_of_a_frame_are_those_of_the_whole() {
         let passes = frame(0.7, 1.0, 0.5);
         let whole = shading(&passes, 1.0);
-        let parts = Shading::of(&passes, 1.0, "test").unwrap();
+        let parts = Shading::of(&passes, 1.0).unwrap();
         for rows in [0..1, 3..17, 17..53] {
-            let part = parts.rows(&passes, rows.clone(), "test").unwrap();
+            let part = parts.rows(&passes, rows.clone()).unwrap();
             assert_eq!(part.data, whole.data[rows.start * SIZE.0..rows.end * SIZE.0]);
         }
     }
@@ -351,8 +349,8 @@ mod tests {
         passes = frame(0.7, 1.0, 0.5);
         passes.insert(Pass::DenoisingNormal, flat);
         assert!(shading(&passes, 1.0).data.iter().all(|v| v.abs() < 1e-3));
-        let one = passes.rows(&[Pass::Combined, Pass::DenoisingNormal, Pass::DenoisingAlbedo], 0..1);
-        let narrow = Shading::of(&one, 1.0, "test").unwrap().rows(&one, 0..1, "test").unwrap();
+        let one = passes.window((0, 0), (SIZE.0, 1));
+        let narrow = Shading::of(&one, 1.0).unwrap().rows(&one, 0..1).unwrap();
         assert!(narrow.data.iter().all(|v| v.is_finite()));
     }
 }

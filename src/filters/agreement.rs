@@ -154,7 +154,7 @@ impl Look {
             let pixels = row * SQUARE..((row + 1) * SQUARE).min(height);
             for y in pixels.clone() {
                 for c in 0..3 {
-                    let light = row_of(radiance, c, y);
+                    let light = radiance.row(c, y);
                     let albedo = guides.albedo.map(|albedo| {
                         albedo.read(c, y * width, &mut guide);
                         &*guide
@@ -296,8 +296,8 @@ impl Look {
         assert!(self.size == (weights.width, weights.height), "weights of the frame's size");
         let (mut sum, mut counted) = (0.0, 0.0);
         for row in 0..self.squares.height {
-            let line = |line: usize| row_of(&self.squares, line, row);
-            let weights = row_of(weights, 0, row * SQUARE);
+            let line = |line: usize| self.squares.row(line, row);
+            let weights = weights.row(0, row * SQUARE);
             for column in 0..self.squares.width {
                 let squared: f32 = (ALBEDO..ALBEDO + 3).map(|c| line(c)[column].powi(2)).sum();
                 let of_albedo = line(SPREAD_OF_ALBEDO)[column] / (squared + DARK);
@@ -360,7 +360,7 @@ impl Look {
                 };
                 out.iter_mut().zip(&places).for_each(|(out, place)| *out = factor * place.of(plane));
             }
-            let here = std::array::from_fn(|line| row_of(&self.squares, line, row));
+            let here = std::array::from_fn(|line| self.squares.row(line, row));
             vectorised::run(CompareSquares { here, there: &there, columns: &columns, out });
         })
     }
@@ -433,11 +433,6 @@ fn median(values: &mut [f32]) -> Option<(f32, f32)> {
     // Of a normal distribution the deviation is 1.48 times the median distance, and the error of the median 1.25 times
     // that of the mean.
     Some((median, 1.48 * 1.25 * distance / (values.len() as f32).sqrt()))
-}
-
-/// A row of a channel.
-fn row_of(planes: &Planes, c: usize, y: usize) -> &[f32] {
-    &planes.channel(c)[y * planes.width..][..planes.width]
 }
 
 /// Lines of a row of pixels: how different albedo, normal and depth of each are from those of the nearest

@@ -52,11 +52,7 @@ impl Flow {
     /// If the vectors are of another size.
     pub fn step(&mut self, vectors: &Planes, direction: Direction) {
         let (width, height) = (self.width, self.height);
-        assert_eq!(
-            (vectors.channels, vectors.width, vectors.height),
-            (4, width, height),
-            "a pass of the frame"
-        );
+        assert_eq!(vectors.extent(), (4, width, height), "a pass of the frame");
         let (right, up, sign) = match direction {
             Direction::Back => (0, 1, 1.0),
             Direction::Forth => (2, 3, -1.0),
@@ -116,8 +112,8 @@ impl Flow {
         Planes::from_rows(planes.channels, self.size(), |c, y, out| {
             let (columns, rows) = self.row(y);
             let plane = planes.channel(c);
-            for (out, at) in out.iter_mut().zip(columns.iter().zip(rows)) {
-                *out = bilinear(plane, self.size(), (*at.0, *at.1));
+            for (out, (x, y)) in out.iter_mut().zip(columns.iter().zip(rows)) {
+                *out = Between::new((*x, *y), self.size()).of(plane);
             }
         })
     }
@@ -207,12 +203,6 @@ impl Vectorised for Aside<'_> {
     }
 }
 
-/// The value of a plane at a place between its pixels. Beyond the outermost pixels their values are repeated.
-/// A place of NaN gives NaN.
-pub fn bilinear(plane: &[f32], (width, height): (usize, usize), (x, y): (f32, f32)) -> f32 {
-    Between::new((x, y), (width, height)).of(plane)
-}
-
 /// The four pixels around a place, and how far it lies between them.
 pub struct Between {
     corners: [[usize; 2]; 2],
@@ -245,7 +235,7 @@ fn between(v: f32, n: usize) -> (usize, usize, f32) {
     (first, (first + 1).min(n - 1), v - first as f32)
 }
 
-/// As [`bilinear`], but of three planes and without blurring them. Values follow the cubic spline of Catmull
+/// As [`Between::of`], but of three planes and without blurring them. Values follow the cubic spline of Catmull
 /// and Rom, kept between the least and the greatest of the four pixels around so that edges don't ring.
 pub fn sharp(planes: &Planes, (x, y): (f32, f32)) -> [f32; 3] {
     let (width, height) = (planes.width, planes.height);
@@ -405,6 +395,6 @@ mod tests {
     fn frames_of_one_pixel_are_sampled() {
         let one = Planes::from_vec(3, 1, 1, vec![1.0, 2.0, 3.0]);
         assert_eq!(sharp(&one, (0.3, -0.2)), [1.0, 2.0, 3.0]);
-        assert_eq!(bilinear(one.channel(1), (1, 1), (0.3, 0.4)), 2.0);
+        assert_eq!(Between::new((0.3, 0.4), (1, 1)).of(one.channel(1)), 2.0);
     }
 }

@@ -56,11 +56,7 @@ pub struct Scratch {
 impl Weights {
     /// Weights from patches of `guide`, whose noise has `variance` (of the same shape).
     pub fn new(guide: &Planes, variance: &Planes, comparison: Comparison) -> Self {
-        assert_eq!(
-            (guide.channels, guide.width, guide.height),
-            (variance.channels, variance.width, variance.height),
-            "every value of the guide has a variance"
-        );
+        assert_eq!(guide.extent(), variance.extent(), "every value of the guide has a variance");
         let margin = comparison.window + comparison.patch;
         Self {
             width: guide.width,

@@ -27,6 +27,7 @@ use crate::{
     kernels::{
         exponential::exp,
         logarithm::ln,
+        thirds,
         vectorised::{self, Vectorised},
     },
     planes::Planes,
@@ -248,11 +249,9 @@ impl Refit {
         rows: Range<usize>,
         change: impl Fn(&mut f32, f32) + Sync,
     ) {
-        let (width, plane) = (guides.size.0, image.len() / 3);
-        let (red, rest) = image.split_at_mut(plane);
-        let (green, blue) = rest.split_at_mut(plane);
+        let width = guides.size.0;
         let held = (rows.start - guides.first) * width..(rows.end - guides.first) * width;
-        let [red, green, blue] = [red, green, blue].map(|plane| plane[held.clone()].par_chunks_mut(width));
+        let [red, green, blue] = thirds(image).map(|plane| plane[held.clone()].par_chunks_mut(width));
         let memory = || Memory {
             pixels: Pixels::new(self.squares),
             fit: vec![0.0; KEPT * (self.squares + 2)],

@@ -9,20 +9,23 @@ use super::{
 };
 use crate::planes::Planes;
 
+/// Radius of the squares over which estimates are averaged.
+const RADIUS: usize = 3;
+
 /// The variance of the mean of two independent images of equal quality, `(a - b)^2 / 4` averaged over
-/// the square of `radius` around each pixel: one pixel's difference alone has a single degree of freedom.
-pub fn dual_buffer(a: &Planes, b: &Planes, radius: usize) -> Planes {
-    assert_eq!((a.channels, a.width, a.height), (b.channels, b.width, b.height));
+/// 7x7 pixels: one pixel's difference alone has a single degree of freedom.
+pub fn dual_buffer(a: &Planes, b: &Planes) -> Planes {
+    assert_eq!(a.extent(), b.extent());
     let squares = a.data.par_iter().zip(&b.data).map(|(a, b)| (a - b) * (a - b) * 0.25).collect();
     let squares = Planes::from_vec(a.channels, a.width, a.height, squares);
-    nl_means::filter(&squares, &Weights::uniform(a.width, a.height, radius))
+    nl_means::filter(&squares, &Weights::uniform(a.width, a.height, RADIUS))
 }
 
 /// The variance of one image about what a first-order fit on position and `features` explains within
-/// squares of `radius`, averaged over such squares. What the features leave unexplained, such as the
+/// 7x7 pixels, averaged over as many. What the features leave unexplained, such as the
 /// edges of shadows, counts as noise.
-pub fn residual(image: &Planes, features: &Planes, radius: usize) -> Planes {
-    let weights = Weights::uniform(image.width, image.height, radius);
+pub fn residual(image: &Planes, features: &Planes) -> Planes {
+    let weights = Weights::uniform(image.width, image.height, RADIUS);
     let fit = regression::first_order(image, features, &weights, true);
     let influence = fit.influence.expect("it was asked for");
     let mut squares = fit.image;
@@ -106,9 +109,9 @@ pub(crate) mod tests {
         };
         let (a, b) = (with(3), with(4));
         // The mean of two images with variance 1/4.
-        let dual = mean(&dual_buffer(&a, &b, 3));
+        let dual = mean(&dual_buffer(&a, &b));
         assert!((dual - 0.125).abs() < 0.01, "{dual}");
-        let residual = mean(&residual(&a, &features, 3));
+        let residual = mean(&residual(&a, &features));
         assert!((residual - 0.25).abs() < 0.02, "{residual}");
         // The least of four noisy directions is below the truth, but of its order.
         let noisy = Planes::from_vec(

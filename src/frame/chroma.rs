@@ -11,6 +11,7 @@ use exr::{
 };
 
 use super::decode::read_values;
+use crate::kernels::thirds;
 
 /// The distance of chroma's samples in columns and rows.
 pub const DISTANCE: usize = 2;
@@ -122,8 +123,7 @@ fn middle(i: usize, count: usize, sample: impl Fn(usize) -> f32) -> f32 {
 /// Turns luminance and chroma, (3, N), into red, green and blue. Chroma is `(R - Y) / Y` and `(B - Y) / Y`,
 /// and luminance `Y` the sum of the colours weighted by `weights`.
 pub fn to_rgb(planes: &mut [f32], weights: [f32; 3]) {
-    let (luminance, chroma) = planes.split_at_mut(planes.len() / 3);
-    let (red, blue) = chroma.split_at_mut(luminance.len());
+    let [luminance, red, blue] = thirds(planes);
     for ((y, ry), by) in luminance.iter_mut().zip(red).zip(blue) {
         let (r, b) = ((*ry + 1.0) * *y, (*by + 1.0) * *y);
         let g = (*y - r * weights[0] - b * weights[2]) / weights[1];

@@ -25,6 +25,7 @@ use super::{
     chroma,
     decode::row_bytes,
     header::{Attributes, write_tiles},
+    read::LONGEST_NAME,
     zip,
 };
 use crate::{Error, Result};
@@ -38,8 +39,8 @@ pub const HALF_MAX: f32 = f16::MAX.to_f32_const();
 /// Attribute that names the layers of its part that demc made, one a line. A layer that it does not name is
 /// never replaced by one of the same name.
 const MARK: &str = "demc";
-/// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its
-/// view layer.
+/// Attribute that tells how far off results are expected to be: a line for each, its expected RelMSE and its layer's
+/// name (with its stereo view, where it has one).
 const EXPECTED_ERROR: &str = "demcExpectedError";
 // What is noted of each layer that demc made, in pairs of lines: the layer's name, and below it what is noted.
 /// Attribute with the frames by number that layers were made without.
@@ -88,6 +89,11 @@ impl fmt::Display for Recoded {
 
 /// Channels by full name, as it is stored, bound for one part.
 type Named<'a> = Vec<(Vec<u8>, NewChannel<'a>)>;
+
+/// A layer's name with the stereo view, where there is one.
+fn with_view(name: &str, view: Option<&str>) -> String {
+    view.map_or_else(|| name.into(), |view| format!("{name}.{view}"))
+}
 
 /// What [`Frame::set_expected_error`] noted in a part.
 fn expected_errors(attributes: &Attributes) -> Vec<(String, f64)> {
@@ -144,10 +150,21 @@ impl Frame {
                 let prefix = if is_of_part { name.to_owned() } else { format!("{name}.{view}") };
                 (format!("{name}-{view}"), prefix)
             }
+            // Channels of a file that is one view have no view in their names.
+            Some(view) if self.parts[beside].view.as_deref() == Some(view) => {
+                (name.to_owned(), name.to_owned())
+            }
             Some(view) => (name.to_owned(), format!("{name}.{view}")),
         };
         let named = channels.iter().map(|c| (format!("{prefix}.{}", c.component).into_bytes(), *c));
         let named: Named<'_> = named.collect();
+        if let Some((long, _)) = named.iter().find(|(name, _)| name.len() > LONGEST_NAME) {
+            let why = format!(
+                "no channel can be called '{}', which is longer than {LONGEST_NAME} bytes; choose a shorter --layer",
+                String::from_utf8_lossy(long)
+            );
+            return Err(Error::invalid(&self.path, why));
+        }
         let beside_view = &self.parts[beside].view;
         let holder = self.parts.iter().position(|p| {
             p.view == *beside_view && p.channels.iter().any(|c| c.name.as_bytes() == named[0].0)
@@ -161,38 +178,47 @@ impl Frame {
             );
             return Err(Error::invalid(&self.path, why));
         }
+        // Of a layer that demc made before, nothing is left that the new one has not.
+        let outdated = self.is_own_layer(name).then(|| format!("{prefix}."));
         let (part, recoded) = match holder {
-            Some(part) => (part, self.set_channels(part, &named)?),
+            Some(part) => (part, self.set_channels(part, &named, outdated.as_deref())?),
             None if own_part => {
                 self.add_part(beside, &part_name, &named)?;
                 (self.parts.len() - 1, None)
             }
-            None => (beside, self.set_channels(beside, &named)?),
+            None => (beside, self.set_channels(beside, &named, None)?),
         };
         self.mark(part, name);
         Ok(recoded)
     }
 
-    /// Notes the expected RelMSE of the result for a view layer (with its stereo view, where it has one), beside
-    /// the layer `name` that demc made of it; or forgets that of an earlier result, where none is known.
+    /// Notes the expected RelMSE of the layer `name`, which demc made, in a stereo view where it has several; or forgets
+    /// that of an earlier result, where none is known.
     ///
     /// # Panics
     /// If demc made no such layer.
-    pub fn set_expected_error(&mut self, name: &str, view_layer: &str, error: Option<f64>) {
+    pub fn set_expected_error(&mut self, name: &str, view: Option<&str>, error: Option<f64>) {
         let attributes = self.attributes_beside(name);
         let mut errors = expected_errors(attributes);
         if errors.is_empty() && error.is_none() {
             return;
         }
-        errors.retain(|(name, _)| name != view_layer);
-        errors.extend(error.map(|error| (view_layer.into(), error)));
+        let result = with_view(name, view);
+        errors.retain(|(other, _)| *other != result);
+        errors.extend(error.map(|error| (result, error)));
         let lines: Vec<String> = errors.iter().map(|(name, error)| format!("{error:.3e} {name}")).collect();
         attributes.set_text(EXPECTED_ERROR, &lines.join("\n"));
     }
 
-    /// The view layers whose results note an expected RelMSE, each with that error.
+    /// The results that note an expected RelMSE, by layer and stereo view, each with that error.
     pub fn expected_errors(&self) -> Vec<(String, f64)> {
         self.stored.iter().flat_map(|stored| expected_errors(&stored.attributes)).collect()
+    }
+
+    /// The expected RelMSE of the layer `name`, in a stereo view where it has several; none where it is not noted.
+    pub fn expected_error(&self, name: &str, view: Option<&str>) -> Option<f64> {
+        let result = with_view(name, view);
+        self.expected_errors().into_iter().find(|(other, _)| *other == result).map(|(_, error)| error)
     }
 
     /// Notes how the layer `name` was made, which demc made: a text of one line.
@@ -340,7 +366,7 @@ impl Frame {
                 (name, NewChannel { component: "", kind: self.parts[part].channels[index].kind, values })
             })
             .collect();
-        let recoded = self.set_channels(part, &named)?;
+        let recoded = self.set_channels(part, &named, None)?;
         self.mark(part, name);
         Ok(recoded)
     }
@@ -414,8 +440,14 @@ impl Frame {
         Ok(())
     }
 
-    /// Adds channels to a part, or replaces those of the same name.
-    fn set_channels(&mut self, part: usize, new: &Named<'_>) -> Result<Option<Recoded>> {
+    /// Adds channels to a part, or replaces those of the same name, and of the same layer, where it is said how its
+    /// channels' names begin.
+    fn set_channels(
+        &mut self,
+        part: usize,
+        new: &Named<'_>,
+        outdated: Option<&str>,
+    ) -> Result<Option<Recoded>> {
         self.refuse_undecodable(part)?;
         let is_chroma = new.iter().any(|(name, _)| chroma::is_chroma(name));
         if is_chroma || chroma::is_subsampled(&self.stored[part].layout) {
@@ -424,7 +456,11 @@ impl Frame {
         }
         let Stored { attributes: old_attributes, layout: old } = &self.stored[part];
         let is_new = |name: &Text| new.iter().any(|(n, _)| name.as_slice() == n.as_slice());
-        let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name));
+        let is_outdated = |name: &Text| {
+            let component = outdated.and_then(|layer| name.as_slice().strip_prefix(layer.as_bytes()));
+            component.is_some_and(|component| !component.contains(&b'.'))
+        };
+        let kept = || old.channels.list.iter().filter(|c| !is_new(&c.name) && !is_outdated(&c.name));
         let loses = kept().any(|c| !survives(old.compression, c.sample_type));
         let compression = if loses { Compression::ZIP16 } else { old.compression };
 

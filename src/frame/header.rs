@@ -75,21 +75,18 @@ impl Attributes {
 
     /// The numbers of an attribute; none where it does not have `N` of them.
     fn floats<const N: usize>(&self, name: &str, kind: &str) -> Option<[f32; N]> {
-        let numbers = self.value(name, kind)?.as_chunks::<4>().0;
-        let numbers: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-        numbers.try_into().ok()
+        self.numbers(name, kind).map(|numbers| numbers.map(f32::from_le_bytes))
     }
 
-    /// A rectangle of pixels by its first and last column and row.
-    fn corners(&self, name: &str) -> Option<[i32; 4]> {
-        let numbers = self.value(name, "box2i")?.as_chunks::<4>().0;
-        let numbers: Vec<i32> = numbers.iter().map(|bytes| i32::from_le_bytes(*bytes)).collect();
-        numbers.try_into().ok()
+    /// The bytes of each of an attribute's numbers; none where it does not have `N` of them.
+    fn numbers<const N: usize>(&self, name: &str, kind: &str) -> Option<[[u8; 4]; N]> {
+        self.value(name, kind)?.as_chunks::<4>().0.try_into().ok()
     }
 
     /// A rectangle of pixels; where it is empty or turned inside out, its size is zero.
     pub fn window(&self, name: &str) -> Option<Window> {
-        let [x0, y0, x1, y1] = self.corners(name)?;
+        // By its first and last column and row.
+        let [x0, y0, x1, y1] = self.numbers(name, "box2i")?.map(i32::from_le_bytes);
         let span = |from: i32, to: i32| usize::try_from(i64::from(to) - i64::from(from) + 1).unwrap_or(0);
         Some(Window { x: x0, y: y0, width: span(x0, x1), height: span(y0, y1) })
     }
@@ -217,7 +214,12 @@ impl Attributes {
     }
 }
 
-fn compression_id(compression: Compression) -> u8 {
+/// What OpenEXR calls each kind of compression, by its number in headers.
+pub const COMPRESSIONS: [&str; 12] =
+    ["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"];
+
+/// The number of a kind of compression in headers.
+pub fn compression_id(compression: Compression) -> u8 {
     use Compression as C;
     match compression {
         C::Uncompressed => 0,

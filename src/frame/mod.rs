@@ -335,19 +335,5 @@ impl fmt::Display for SampleKind {
 }
 
 fn compression_name(compression: Compression) -> &'static str {
-    use Compression as C;
-    match compression {
-        C::Uncompressed => "none",
-        C::RLE => "rle",
-        C::ZIP1 => "zips",
-        C::ZIP16 => "zip",
-        C::PIZ => "piz",
-        C::PXR24 => "pxr24",
-        C::B44 => "b44",
-        C::B44A => "b44a",
-        C::DWAA(_) => "dwaa",
-        C::DWAB(_) => "dwab",
-        C::HTJ2K32 => "htj2k32",
-        C::HTJ2K256 => "htj2k256",
-    }
+    header::COMPRESSIONS[usize::from(header::compression_id(compression))]
 }

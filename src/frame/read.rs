@@ -25,7 +25,7 @@ use crate::{Error, Result};
 /// Bytes of a chunk's entry in the offset table.
 const OFFSET_BYTES: u64 = 8;
 /// Longest name of an attribute, a type or a channel.
-const LONGEST_NAME: usize = 255;
+pub const LONGEST_NAME: usize = 255;
 /// The only version of the format since 2.0.
 const VERSION: u32 = 2;
 

@@ -14,6 +14,7 @@ use super::{
     exponential::{exp, limited, logistic},
     filter::Size,
     simd::{Kernel, Simd, Tier},
+    thirds,
 };
 
 /// Coarse pixels around a fine one.
@@ -78,10 +79,8 @@ pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: 
     assert_eq!((fine.len(), output.len(), coarse.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
     assert_eq!((masks.alpha.len(), masks.corners.len()), (n, CORNERS * n));
     assert!(size.w.is_multiple_of(2), "only even rows have halves");
-    let (red, rest) = output.split_at_mut(n);
-    let (green, blue) = rest.split_at_mut(n);
-    let rows = red.par_chunks_mut(size.w).zip(green.par_chunks_mut(size.w)).zip(blue.par_chunks_mut(size.w));
-    rows.enumerate().for_each(|(y, ((red, green), blue))| {
+    let [red, green, blue] = thirds(output).map(|plane| plane.par_chunks_mut(size.w));
+    red.zip(green).zip(blue).enumerate().for_each(|(y, ((red, green), blue))| {
         Tier::detect().run(BlendRow { size, place, y, fine, coarse, masks, output: [red, green, blue] });
     });
 }

@@ -13,6 +13,7 @@ use super::{
     LANES,
     exponential::{exp, limited},
     simd::{Kernel, Simd, Tier},
+    thirds,
     vectorised::{self, Vectorised},
 };
 
@@ -74,12 +75,7 @@ pub(super) fn each_row<const N: usize>(
     total: &mut [f32],
     work: impl Fn(usize, [[&mut [f32]; 3]; N], &mut [f32]) + Sync,
 ) {
-    let n = total.len();
-    let mut planes = outputs.map(|output| {
-        let (red, rest) = output.split_at_mut(n);
-        let (green, blue) = rest.split_at_mut(n);
-        [red, green, blue].map(|plane| plane.chunks_mut(w))
-    });
+    let mut planes = outputs.map(|output| thirds(output).map(|plane| plane.chunks_mut(w)));
     let mut next_row = || {
         planes
             .each_mut()

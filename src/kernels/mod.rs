@@ -179,6 +179,13 @@ impl<'a> ViewMut<'a> {
     }
 }
 
+/// The thirds of values, as the channels of an image, (3, H, W).
+pub fn thirds<T>(values: &mut [T]) -> [&mut [T]; 3] {
+    let (first, rest) = values.split_at_mut(values.len() / 3);
+    let (second, third) = rest.split_at_mut(rest.len() / 2);
+    [first, second, third]
+}
+
 /// A pointer that tasks share to write disjoint parts of one buffer.
 #[derive(Clone, Copy)]
 struct Shared(*mut Block);

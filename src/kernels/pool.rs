@@ -138,8 +138,8 @@ pub fn channel_moments(input: View) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// `output = max(0, scale[c] * input + shift[c])`, the maximum only with `relu`.
-pub fn scale_shift(input: View, scale: &[f32], shift: &[f32], relu: bool, output: ViewMut) {
+/// `output = max(0, scale[c] * input + shift[c])`.
+pub fn scale_shift(input: View, scale: &[f32], shift: &[f32], output: ViewMut) {
     let s = input.shape;
     assert_eq!(output.shape, s);
     assert_eq!((scale.len(), shift.len()), (s.c, s.c));
@@ -148,12 +148,11 @@ pub fn scale_shift(input: View, scale: &[f32], shift: &[f32], relu: bool, output
         let lanes = s.lanes(plane);
         a[..lanes].copy_from_slice(&scale[plane * LANES..][..lanes]);
         b[..lanes].copy_from_slice(&shift[plane * LANES..][..lanes]);
-        let floor = if relu { 0.0 } else { f32::NEG_INFINITY };
         for y in 0..s.h {
             let row = &input.data[s.row(n, plane, y)..][..s.w];
             for (out, v) in out[row_in_plane(s, y)..][..s.w].iter_mut().zip(row) {
                 for l in 0..LANES {
-                    out.0[l] = (a[l] * v.0[l] + b[l]).max(floor);
+                    out.0[l] = (a[l] * v.0[l] + b[l]).max(0.0);
                 }
             }
         }

@@ -61,8 +61,7 @@ pub fn flicker(pair: &Pair) -> Option<f64> {
 }
 
 fn subtract(image: &Planes, reference: &Planes) -> Planes {
-    let size = |planes: &Planes| (planes.channels, planes.width, planes.height);
-    assert_eq!(size(image), size(reference), "an image and its reference");
+    assert_eq!(image.extent(), reference.extent(), "an image and its reference");
     Planes::from_rows(3, (image.width, image.height), |c, y, out| {
         let at = c * image.pixels() + y * image.width;
         let both = image.data[at..].iter().zip(&reference.data[at..]);
@@ -75,7 +74,7 @@ fn mean_3x3(planes: &Planes) -> Planes {
     let (width, height) = (planes.width, planes.height);
     Planes::from_rows(planes.channels, (width, height), |c, y, out| {
         let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
-        let lines = rows.map(|y| &planes.channel(c)[y * width..][..width]);
+        let lines = rows.map(|y| planes.row(c, y));
         for (x, out) in out.iter_mut().enumerate() {
             let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
             *out = lines.iter().flat_map(|line| columns.map(|x| line[x])).sum::<f32>() / 9.0;

@@ -8,7 +8,7 @@
 
 use rayon::prelude::*;
 
-use crate::planes::Planes;
+use crate::{kernels::thirds, planes::Planes};
 
 /// Pixels per degree of visual angle: a 0.7 m wide monitor of 3840 pixels seen from 0.7 m.
 const PIXELS_PER_DEGREE: f32 = 67.020_64;
@@ -56,10 +56,7 @@ pub fn hdr_flip(image: &Planes, reference: &Planes) -> Option<f64> {
 /// # Panics
 /// If the images are not (3, H, W) of one size.
 pub fn hdr_flip_map(image: &Planes, reference: &Planes) -> Option<Vec<f32>> {
-    assert!(
-        (image.channels, image.width, image.height) == (3, reference.width, reference.height),
-        "FLIP compares RGB images of one size"
-    );
+    assert!(image.extent() == (3, reference.width, reference.height), "FLIP compares RGB images of one size");
     let filters = Filters::new();
     let mut worst = vec![0.0f32; reference.pixels()];
     for exposure in exposures(reference)? {
@@ -268,8 +265,7 @@ fn hyab(a: [f32; 3], b: [f32; 3]) -> f32 {
 fn map_pixels(image: &Planes, f: impl Fn([f32; 3]) -> [f32; 3] + Sync) -> Planes {
     let mut out = Planes::new(3, image.width, image.height);
     let n = image.pixels();
-    let (first, rest) = out.data.split_at_mut(n);
-    let (second, third) = rest.split_at_mut(n);
+    let [first, second, third] = thirds(&mut out.data);
     let planes = first.par_iter_mut().zip(second).zip(third).enumerate();
     planes.for_each(|(i, ((a, b), c))| {
         [*a, *b, *c] = f([image.data[i], image.data[n + i], image.data[2 * n + i]]);

@@ -99,9 +99,8 @@ impl std::error::Error for Incomparable {}
 /// # Errors
 /// The sizes differ or a value is not finite.
 pub fn check(image: &Planes, reference: &Planes) -> Result<(), Incomparable> {
-    let size = |p: &Planes| (p.channels, p.width, p.height);
-    if size(image) != size(reference) {
-        return Err(Incomparable::Size { image: size(image), reference: size(reference) });
+    if image.extent() != reference.extent() {
+        return Err(Incomparable::Size { image: image.extent(), reference: reference.extent() });
     }
     match (image.non_finite(), reference.non_finite()) {
         (0, 0) => Ok(()),
@@ -135,8 +134,7 @@ pub fn score(image: &Planes, reference: &Planes) -> Result<Scores, Incomparable>
 /// # Panics
 /// If sizes or channels differ, or there is no pixel.
 fn assert_alike(image: &Planes, reference: &Planes) {
-    let size = |p: &Planes| (p.channels, p.width, p.height);
-    assert_eq!(size(image), size(reference), "images of one size");
+    assert_eq!(image.extent(), reference.extent(), "images of one size");
     assert!(!image.data.is_empty(), "images with pixels");
 }
 

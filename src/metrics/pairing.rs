@@ -64,8 +64,7 @@ impl Difference {
 /// # Panics
 /// If the sizes differ, or the images have not three channels.
 fn mismatch(image: &Planes, reference: &Planes) -> Option<f64> {
-    let size = |p: &Planes| (p.channels, p.width, p.height);
-    assert!(image.channels == 3 && size(image) == size(reference), "both are RGB of one size");
+    assert!(image.channels == 3 && image.extent() == reference.extent(), "both are RGB of one size");
     let (columns, rows) = (image.width / SQUARE, image.height / SQUARE);
     let luminances = [image, reference].map(luminance);
     let (mut brighter, mut darker) = (0usize, 0usize);

@@ -26,11 +26,7 @@ const C2: f64 = 9e-4;
 /// # Panics
 /// If the sizes differ.
 pub fn ssim(image: &Planes, reference: &Planes) -> Option<f64> {
-    assert_eq!(
-        (image.channels, image.width, image.height),
-        (reference.channels, reference.width, reference.height),
-        "SSIM compares images of one size"
-    );
+    assert_eq!(image.extent(), reference.extent(), "SSIM compares images of one size");
     if image.width < WINDOW || image.height < WINDOW {
         return None;
     }

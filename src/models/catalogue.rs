@@ -155,10 +155,18 @@ impl Method {
             return Learned::parse(name, &bytes, &path);
         }
         Err(Error::Usage(match self.kind {
-            Kind::Learned { weights: Weights::File, .. } => format!(
-                "{name}: its weights are no part of the program; they are in {IN_REPOSITORY} of demc's \
-                 repository. Name the file in place of the method, or that folder by {WEIGHTS_FOLDER}=FOLDER"
-            ),
+            Kind::Learned { weights: Weights::File, .. } => {
+                let looked = match std::env::var_os(WEIGHTS_FOLDER) {
+                    Some(folder) => {
+                        format!("{WEIGHTS_FOLDER} names {}, where they are not", folder.display())
+                    }
+                    None => format!("{IN_REPOSITORY} is not below the current folder"),
+                };
+                format!(
+                    "{name}: its weights are no part of the program, and {looked}; they are in {IN_REPOSITORY} of demc's \
+                     repository. Name the file in place of the method, or that folder by {WEIGHTS_FOLDER}=FOLDER"
+                )
+            }
             Kind::Learned { .. } => format!(
                 "{name} comes without weights: `demc train --model {name} --data DIR --out RUN` makes them, and \
                  RUN/best.safetensors then names the method"

@@ -326,8 +326,7 @@ impl Network for Demc {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
-        let name = "demc";
-        Ok(Inputs { planes: vec![paper_colour(passes, name)?, paper_features(passes, name)?], scale: 1.0 })
+        Ok(Inputs { planes: vec![paper_colour(passes)?, paper_features(passes)?], scale: 1.0 })
     }
 
     fn convolutions(&mut self) -> Vec<&mut Conv> {

@@ -63,8 +63,7 @@ impl ExpectedError {
         let part = Planes::from_rows(1, (*width, *height), |_, y, row| {
             let (above, down) = between(y, squares.height);
             let below = (above + 1).min(squares.height - 1);
-            let [above, below] =
-                [above, below].map(|at| &squares.data[at * squares.width..][..squares.width]);
+            let [above, below] = [above, below].map(|at| squares.row(0, at));
             for (x, value) in row.iter_mut().enumerate() {
                 let (left, across) = between(x, squares.width);
                 let right = (left + 1).min(squares.width - 1);

@@ -187,8 +187,8 @@ impl Network for Kpcn {
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
         match self.config.architecture {
-            Architecture::Kpcn => kpcn_streams(passes, "kpcn"),
-            _ => kpcn_combined(passes, "kpcn"),
+            Architecture::Kpcn => kpcn_streams(passes),
+            _ => kpcn_combined(passes),
         }
     }
 

@@ -119,7 +119,7 @@ impl Network for Lbf {
     }
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
-        lbf(passes, "lbf")
+        lbf(passes)
     }
 
     fn params(&mut self) -> Vec<&mut Param> {

@@ -109,7 +109,7 @@ impl Learned {
         let size = (passes.width, passes.height);
         let odd = (size.0 | 1, size.1 | 1);
         let radiance = passes.require(Pass::Combined, TURNED)?;
-        let grown = guide_rows(passes, 0..size.1, odd, exposure(radiance), TURNED)?;
+        let grown = guide_rows(passes, 0..size.1, odd, exposure(radiance))?;
         if !companions.is_empty() {
             let (noisy, tamed) =
                 (radiance.padded_rows(0..size.1, odd), grown.require(Pass::Combined, TURNED)?);

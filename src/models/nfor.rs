@@ -40,8 +40,6 @@ const LAST_FEATURES: Comparison = Comparison { window: 2, patch: 3, k: 0.5, vari
 const BANDWIDTHS: [f32; 2] = [0.5, 1.0];
 /// The variance of a half buffer, in units of the variance of the whole.
 const HALF: f32 = 2.0;
-/// Radius over which estimates of variance are averaged.
-const VARIANCE_RADIUS: usize = 3;
 
 /// The method.
 pub struct Nfor;
@@ -119,11 +117,11 @@ fn from_halves([mut a, mut b]: [Buffer; 2]) -> Planes {
     let half = Comparison { variance_scale: HALF, ..FEATURES };
     let (mut features_a, mut features_b) = (Vec::new(), Vec::new());
     for (a, b) in a.features.iter().zip(&b.features) {
-        let noise = variance::dual_buffer(a, b, VARIANCE_RADIUS);
+        let noise = variance::dual_buffer(a, b);
         features_a.push(filter(a, &Weights::new(b, &noise, half)));
         features_b.push(filter(b, &Weights::new(a, &noise, half)));
     }
-    let noise = variance::dual_buffer(&a.colour, &b.colour, VARIANCE_RADIUS);
+    let noise = variance::dual_buffer(&a.colour, &b.colour);
     let (mean_features, feature_noise): (Vec<_>, Vec<_>) =
         features_a.iter().zip(&features_b).map(|(a, b)| (mean(a, b), half_difference(a, b))).unzip();
     let (features_a, features_b) = (join(&features_a), join(&features_b));
@@ -172,7 +170,7 @@ fn from_one(mut buffer: Buffer) -> Planes {
         .map(|feature| filter(feature, &Weights::new(feature, &variance::directional(feature), FEATURES)))
         .collect();
     let features = join(&features);
-    let noise = variance::residual(colour, &features, VARIANCE_RADIUS);
+    let noise = variance::residual(colour, &features);
     let candidates = BANDWIDTHS.map(|k| {
         let weights = Weights::new(colour, &noise, Comparison { k, ..COLOUR });
         let Fit { image, influence } = first_order(colour, &features, &weights, true);

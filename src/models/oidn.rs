@@ -87,7 +87,8 @@ impl Oidn {
             .output();
         let run = result.map_err(|e| {
             Error::Usage(format!(
-                "{}: cannot run {}: {e}; install Open Image Denoise and name its program {PROGRAM} with --oidn or {VARIABLE}",
+                "{}: cannot run {}: {e}; install Open Image Denoise and name its program {PROGRAM} by the environment variable {VARIABLE}, or by --oidn \
+                 of eval and stability",
                 self.name,
                 self.program.display()
             ))

@@ -38,8 +38,8 @@ use crate::{
     Result,
     companion::Companion,
     features::{
-        GUIDE_PASSES, Inputs, LightInputs, Refined, Shading, albedo_of_target, exposure, guide_rows,
-        light_inputs, normal_of_target,
+        GUIDE_PASSES, Inputs, LightInputs, NEEDED_BY, Refined, Shading, albedo_of_target, exposure,
+        guide_rows, light_inputs, normal_of_target,
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::memory::PlaneBuffer,
@@ -79,9 +79,6 @@ const FULL_KERNEL: usize = 3;
 
 /// What the names of a prefilter's layers begin with.
 pub const PREFILTER: &str = "prefilter.";
-
-/// What needs the passes, in error messages.
-const NEEDED_BY: &str = "this model";
 
 /// The trunk of the network, whose guides are albedo, normal, and how noisy the albedo was.
 const TRUNK: Variant = Variant { prefix: "", guides: 7, full_kernel: FULL_KERNEL, refines: true };
@@ -180,9 +177,9 @@ impl Network for Pyramid {
         let (albedo, normal) = (albedo_of_target(albedo), normal_of_target(normal));
         let exposure = exposure(passes.require(Pass::Combined, NEEDED_BY)?);
         let (rows, size) = (0..passes.height, (passes.width, passes.height));
-        let shading = Shading::of(passes, exposure, NEEDED_BY)?.rows(passes, rows.clone(), NEEDED_BY)?;
-        let passes = guide_rows(passes, rows, size, exposure, NEEDED_BY)?;
-        let inputs = light_inputs(&passes, Refined { albedo, normal, shading }, exposure, NEEDED_BY)?;
+        let shading = Shading::of(passes, exposure)?.rows(passes, rows.clone())?;
+        let passes = guide_rows(passes, rows, size, exposure)?;
+        let inputs = light_inputs(&passes, Refined { albedo, normal, shading }, exposure)?;
         Ok(Inputs { planes: inputs.into_list().into(), scale: exposure.recip() })
     }
 

@@ -507,7 +507,7 @@ impl BatchNorm {
         };
         let (scale, shift) = self.scale_and_shift(&moments);
         let mut output = Buffer::new(shape);
-        scale_shift(input.saved.data.view(), &scale, &shift, true, output.view_mut());
+        scale_shift(input.saved.data.view(), &scale, &shift, output.view_mut());
 
         let batch = matches!(stats, Stats::Batch(_));
         let (mut activation, out) = Activation::output(Data::F32(output), input.tape, true);

@@ -378,8 +378,12 @@ pub fn choose_like<'a>(
 
 /// The view layers of a file, as a sentence part.
 fn listed(layers: &[Layer]) -> String {
-    let mut names: Vec<String> = layers.iter().map(|l| format!("'{}'", l.name)).collect();
-    names.dedup();
+    let mut names: Vec<String> = Vec::new();
+    for name in layers.iter().map(|l| format!("'{}'", l.name)) {
+        if !names.contains(&name) {
+            names.push(name); // stereo views repeat them
+        }
+    }
     match &names[..] {
         [name] if name == "''" => "it has no view layers: save as OpenEXR MultiLayer".into(),
         _ => format!("its view layers: {}", names.join(", ")),

@@ -67,11 +67,6 @@ impl Mapping {
         self.0.iter().map(|(pass, name)| (*pass, name.as_str()))
     }
 
-    /// Whether this pass is named.
-    pub fn names(&self, pass: Pass) -> bool {
-        self.0.contains_key(&pass)
-    }
-
     /// Whether a layer holds all that is named.
     ///
     /// # Errors

@@ -247,15 +247,6 @@ impl PassSet {
         self.window((columns.start, 0), (columns.len(), self.height))
     }
 
-    /// Some rows of those of `passes` that it holds.
-    ///
-    /// # Panics
-    /// If there are no such rows.
-    pub fn rows(&self, passes: &[Pass], rows: Range<usize>) -> Self {
-        let size = (self.width, rows.len());
-        self.padded_rows(passes, rows, size)
-    }
-
     /// Some rows of those of `passes` that it holds, grown to a width and height as [`Planes::padded_to`]
     /// does.
     ///
@@ -284,10 +275,7 @@ impl PassSet {
     /// # Panics
     /// If the size or the channel count differs from what the set and the pass demand.
     pub fn insert(&mut self, pass: Pass, planes: Planes) {
-        assert_eq!(
-            (planes.channels, planes.width, planes.height),
-            (pass.channels(), self.width, self.height)
-        );
+        assert_eq!(planes.extent(), (pass.channels(), self.width, self.height));
         self.planes.insert(pass, planes);
     }
 

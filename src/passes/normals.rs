@@ -8,7 +8,7 @@
 
 use std::fmt;
 
-use crate::planes::Planes;
+use crate::{kernels::thirds, planes::Planes};
 
 /// A vector.
 type Vec3 = [f32; 3];
@@ -109,9 +109,7 @@ pub fn to_camera_space(normals: &mut Planes, world_to_camera: Option<[f32; 16]>)
 
 /// Changes every normal.
 fn each(normals: &mut Planes, change: impl Fn(Vec3) -> Vec3) {
-    let area = normals.width * normals.height;
-    let (x, rest) = normals.data.split_at_mut(area);
-    let (y, z) = rest.split_at_mut(area);
+    let [x, y, z] = thirds(&mut normals.data);
     for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
         [*x, *y, *z] = change([*x, *y, *z]);
     }

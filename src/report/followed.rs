@@ -110,10 +110,9 @@ impl<'a> Before<'a> {
         if !self.images.contains_key(&method.name) {
             self.make(method).map_err(|why| said(&why))?;
         }
-        let size = |planes: &Planes| (planes.channels, planes.width, planes.height);
         let before = &self.images[&method.name];
         let reference = self.reference.as_ref().expect("it comes with the images");
-        if size(before) != size(image) {
+        if before.extent() != image.extent() {
             return Err(said("the frame before is of another size"));
         }
         let (images, references) = ([image, before], [&next.reference, reference]);

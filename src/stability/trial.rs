@@ -102,55 +102,38 @@ impl Trial {
 
     /// Its name in tables.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::AsRendered => "as-rendered",
-            Self::Darker => "darker",
-            Self::Brighter => "brighter",
-            Self::MuchDarker => "much-darker",
-            Self::MuchBrighter => "much-brighter",
-            Self::Mirrored => "mirrored",
-            Self::Cropped => "cropped",
-            Self::Fireflies => "fireflies",
-            Self::NonFinite => "non-finite",
-            Self::ShiftedGuides => "shifted-guides",
-            Self::BlankGuides => "blank-guides",
-            Self::BlankAlbedo => "blank-albedo",
-            Self::BlankNormals => "blank-normals",
-            Self::WithoutGuides => "without-guides",
-            Self::WithoutAlbedo => "without-albedo",
-            Self::WithoutNormals => "without-normals",
-            Self::RandomAlbedo => "random-albedo",
-            Self::BrightAlbedo => "bright-albedo",
-            Self::SrgbAlbedo => "srgb-albedo",
-            Self::UnitNormals => "unit-normals",
-            Self::WorldNormals => "world-normals",
-        }
+        self.said().0
     }
 
     /// What it does, for a reader of its name.
     pub fn meaning(self) -> &'static str {
+        self.said().1
+    }
+
+    /// Name and meaning.
+    fn said(self) -> (&'static str, &'static str) {
         match self {
-            Self::AsRendered => "nothing changes: what the others are measured by",
-            Self::Darker => "radiance is a 256th",
-            Self::Brighter => "radiance is 256 times as high",
-            Self::MuchDarker => "radiance is a 4096th",
-            Self::MuchBrighter => "radiance is 4096 times as high",
-            Self::Mirrored => "left and right change places",
-            Self::Cropped => "the frame begins 5 pixels further right and 3 further down",
-            Self::Fireflies => "one pixel in 1024 has 1000 times the mean radiance",
-            Self::NonFinite => "one pixel in 1024 of every pass is NaN or infinite",
-            Self::ShiftedGuides => "guides are 2 pixels further right than radiance",
-            Self::BlankGuides => "guides hold nothing",
-            Self::BlankAlbedo => "albedo holds nothing",
-            Self::BlankNormals => "normals hold nothing",
-            Self::WithoutGuides => "there are no guides",
-            Self::WithoutAlbedo => "there is no albedo",
-            Self::WithoutNormals => "there are no normals",
-            Self::RandomAlbedo => "albedo is any value in 0..1 in each pixel",
-            Self::BrightAlbedo => "albedo is twice as high",
-            Self::SrgbAlbedo => "albedo is encoded by the curve of sRGB",
-            Self::UnitNormals => "normals are stored in 0..1",
-            Self::WorldNormals => "normals are of world space, the camera unknown",
+            Self::AsRendered => ("as-rendered", "nothing changes: what the others are measured by"),
+            Self::Darker => ("darker", "radiance is a 256th"),
+            Self::Brighter => ("brighter", "radiance is 256 times as high"),
+            Self::MuchDarker => ("much-darker", "radiance is a 4096th"),
+            Self::MuchBrighter => ("much-brighter", "radiance is 4096 times as high"),
+            Self::Mirrored => ("mirrored", "left and right change places"),
+            Self::Cropped => ("cropped", "the frame begins 5 pixels further right and 3 further down"),
+            Self::Fireflies => ("fireflies", "one pixel in 1024 has 1000 times the mean radiance"),
+            Self::NonFinite => ("non-finite", "one pixel in 1024 of every pass is NaN or infinite"),
+            Self::ShiftedGuides => ("shifted-guides", "guides are 2 pixels further right than radiance"),
+            Self::BlankGuides => ("blank-guides", "guides hold nothing"),
+            Self::BlankAlbedo => ("blank-albedo", "albedo holds nothing"),
+            Self::BlankNormals => ("blank-normals", "normals hold nothing"),
+            Self::WithoutGuides => ("without-guides", "there are no guides"),
+            Self::WithoutAlbedo => ("without-albedo", "there is no albedo"),
+            Self::WithoutNormals => ("without-normals", "there are no normals"),
+            Self::RandomAlbedo => ("random-albedo", "albedo is any value in 0..1 in each pixel"),
+            Self::BrightAlbedo => ("bright-albedo", "albedo is twice as high"),
+            Self::SrgbAlbedo => ("srgb-albedo", "albedo is encoded by the curve of sRGB"),
+            Self::UnitNormals => ("unit-normals", "normals are stored in 0..1"),
+            Self::WorldNormals => ("world-normals", "normals are of world space, the camera unknown"),
         }
     }
 

@@ -12,7 +12,10 @@ use std::{
     time::Duration,
 };
 
-use clap::{Args as ClapArgs, ValueEnum};
+use clap::{
+    Args as ClapArgs,
+    builder::{PossibleValuesParser, TypedValueParser},
+};
 use frames::Frames;
 use progress::{Progress, Style};
 
@@ -27,8 +30,8 @@ use super::{
 use crate::{
     Error, Result,
     denoise::{self, Alpha, Batch, End, Job, Look, Options, Outcome, Plan, Watch, Wrap, preview},
-    frame::{Frame, prepare_folder},
-    models, passes,
+    frame::prepare_folder,
+    models,
 };
 
 /// Arguments of `demc denoise`.
@@ -95,7 +98,7 @@ pub struct Args {
     /// Go on with renders that are still coming in, each when its file is whole, until Ctrl-C, or until
     /// nothing new has come for SECONDS; with --overwrite, a frame that is rendered again is denoised again
     #[arg(long, value_name = "SECONDS", num_args = 0..=1, conflicts_with = "temporal",
-          value_parser = clap::value_parser!(u32).range(1..))]
+          value_parser = parse_idle)]
     #[allow(clippy::option_option, reason = "not at all, for ever, for some time")]
     watch: Option<Option<u32>>,
 
@@ -111,13 +114,13 @@ pub struct Args {
     preview: bool,
 
     /// What becomes of alpha: denoised with the beauty's kernels, or kept; auto denoises it where it varies
-    #[arg(long, value_enum, value_name = "HOW", default_value_t = AlphaChoice::Auto)]
-    alpha: AlphaChoice,
+    #[arg(long, value_name = "HOW", default_value = "auto", value_parser = one_of(Alpha::ALL))]
+    alpha: Alpha,
 
     /// Whether the left and the right edge meet, as those of an all-round panorama: auto believes the file's
     /// attribute envmap
-    #[arg(long, value_enum, value_name = "HOW", default_value_t = WrapChoice::Auto)]
-    wrap: WrapChoice,
+    #[arg(long, value_name = "HOW", default_value = "auto", value_parser = one_of(Wrap::ALL))]
+    wrap: Wrap,
 
     /// Denoise the light passes and light groups as well: they add up to the denoised beauty
     #[arg(long)]
@@ -149,20 +152,21 @@ pub struct Args {
     quiet: bool,
 }
 
-/// The values of `--alpha`.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum AlphaChoice {
-    Auto,
-    Denoise,
-    Keep,
+/// After how many seconds without a new file a watch ends.
+///
+/// # Errors
+/// It is no whole number of them.
+fn parse_idle(text: &str) -> Result<u32> {
+    let seconds = text.parse().ok().filter(|seconds| *seconds > 0);
+    seconds.ok_or_else(|| {
+        Error::Usage("wants whole seconds; name inputs before it, or after that number".into())
+    })
 }
 
-/// The values of `--wrap`.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum WrapChoice {
-    Auto,
-    X,
-    None,
+/// Reads one of these by its name.
+fn one_of<T: Copy + Send + Sync + 'static>(all: [(&'static str, T); 3]) -> impl TypedValueParser<Value = T> {
+    let of = move |said: String| all.into_iter().find(|(name, _)| *name == said).expect("one of them").1;
+    PossibleValuesParser::new(all.map(|(name, _)| name)).map(of)
 }
 
 /// Runs the batch.
@@ -204,19 +208,11 @@ pub fn run(args: Args) -> Result<ExitCode> {
         preview: args.preview.then_some(preview::write),
         overwrite: args.overwrite,
         temporal: args.temporal.map(usize::from),
-        alpha: match args.alpha {
-            AlphaChoice::Auto => Alpha::Auto,
-            AlphaChoice::Denoise => Alpha::Denoise,
-            AlphaChoice::Keep => Alpha::Keep,
-        },
+        alpha: args.alpha,
         sources,
         passes: args.passes,
         confidence: args.confidence,
-        wrap: match args.wrap {
-            WrapChoice::Auto => Wrap::Auto,
-            WrapChoice::X => Wrap::X,
-            WrapChoice::None => Wrap::None,
-        },
+        wrap: args.wrap,
     };
     denoise::check_options(&*model, &options)?;
     let style = match (args.json, args.quiet) {
@@ -248,15 +244,26 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let batch = batch.at_once(args.jobs.into());
     let stopper = batch.stopper();
     stop::on_request(move || stopper.stop())?;
+    let mut came = Vec::new();
     let end = batch.run(|job, outcome| {
         progress.report(job, outcome);
+        came.push(denoise::Input { file: job.input.clone(), below: PathBuf::new() });
         if let Some(ranking) = &mut ranking {
-            rank(ranking, job, outcome, args.view_layer.as_deref());
+            rank(ranking, job, outcome);
         }
     });
     let failed = progress.finish(end == End::Stopped);
     if let Some(ranking) = ranking {
         ranking.print();
+    }
+    if let (Some(frames), true, End::Complete) = (&args.frames, args.watch.is_some(), end) {
+        if let Some(note) = frames.lacking(&came).filter(|_| !args.quiet) {
+            warn_line(&format!("demc: note: {note}"));
+        }
+        if came.is_empty() {
+            warn_line("demc: no file of --frames has come, whose name ends in a number as shot.0017.exr");
+            return Ok(ExitCode::from(SOME_FAILED));
+        }
     }
     Ok(match end {
         End::Stopped => ExitCode::from(stop::INTERRUPTED),
@@ -266,32 +273,13 @@ pub fn run(args: Args) -> Result<ExitCode> {
 }
 
 /// Adds a frame to the list of expected errors. A result that existed already has noted its own.
-fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome, view_layer: Option<&str>) {
-    let (errors, samples): (Vec<f64>, _) = match outcome {
-        Outcome::Done(report) => (report.expected_error.into_iter().collect(), report.samples),
-        Outcome::Skipped(_) => match noted(&job.output, view_layer) {
-            Ok(noted) => noted,
-            Err(_) => return,
-        },
+fn rank(ranking: &mut Ranking, job: &Job, outcome: &Outcome) {
+    let (error, samples) = match outcome {
+        Outcome::Done(report) => (report.expected_error, report.samples),
+        Outcome::Skipped(there) => (there.expected_error, there.samples),
         Outcome::Failed(_) => return,
     };
-    if !errors.is_empty() {
-        let mean = errors.iter().sum::<f64>() / errors.len() as f64;
-        ranking.add(job.input.display().to_string(), mean, samples);
-    }
-}
-
-/// The expected errors that a result notes for a view layer, of each stereo view, and the samples of its render.
-fn noted(result: &Path, view_layer: Option<&str>) -> Result<(Vec<f64>, Option<u32>)> {
-    let result = Frame::read_headers(result)?;
-    let layers = passes::layers(&result);
-    let name = &passes::choose(&result, &layers, view_layer)?.name;
-    let is_of_layer = |noted: &str| {
-        let rest = noted.strip_prefix(name.as_str());
-        name.is_empty() || rest.is_some_and(|view| view.is_empty() || view.starts_with('.'))
-    };
-    let errors = result.expected_errors().into_iter().filter(|(noted, _)| is_of_layer(noted));
-    Ok((errors.map(|(_, error)| error).collect(), passes::told_samples(&result, name)))
+    ranking.add(job.input.display().to_string(), error, samples);
 }
 
 /// The work of a batch.

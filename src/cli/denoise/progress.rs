@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::{
     cli::lines::{print_line, warn_line},
-    denoise::{Job, Outcome},
+    denoise::{Finished, Job, Outcome, Report},
 };
 
 /// What is printed of files that did not fail.
@@ -45,10 +45,21 @@ struct Line<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    quality: Option<Quality>,
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
     report: Option<Details<'a>>,
     /// None of what failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     notes: Option<Vec<String>>,
+}
+
+/// What is known of how good a result is, made now or before.
+#[derive(Serialize)]
+struct Quality {
+    /// Samples of a pixel; null where the file does not tell.
+    samples: Option<u32>,
+    /// The result's expected RelMSE; null where the model does not tell.
+    expected_error: Option<f64>,
 }
 
 #[derive(Serialize)]
@@ -59,12 +70,8 @@ struct Details<'a> {
     /// What the file holds of that view layer.
     passes: &'a [String],
     light_groups: &'a [String],
-    /// Samples of a pixel; null where the file does not tell.
-    samples: Option<u32>,
     /// Whether Blender had denoised Combined, so that its pass Noisy Image was denoised instead.
     was_denoised: bool,
-    /// The result's expected RelMSE; null where the model does not tell.
-    expected_error: Option<f64>,
     seconds: f64,
     non_finite: &'a std::collections::BTreeMap<String, usize>,
 }
@@ -127,7 +134,10 @@ impl Progress {
             Style::Quiet => {}
         });
         if let Outcome::Failed(error) = outcome {
-            self.bar.suspend(|| warn_line(&format!("demc: {error}")));
+            // Most errors name their file; those of a guide or of a program name that.
+            let (error, input) = (error.to_string(), job.input.display().to_string());
+            let of = if error.contains(&input) { String::new() } else { format!("{input}: ") };
+            self.bar.suspend(|| warn_line(&format!("demc: {of}{error}")));
         }
     }
 
@@ -196,9 +206,9 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
                 warn_line(&format!("demc: note: {}: {note}", job.input.display()));
             }
         }
-        Outcome::Skipped(notes) => {
+        Outcome::Skipped(there) => {
             print_line(&format!("{place}{}  is there already", job.output.display()));
-            for note in notes {
+            for note in &there.notes {
                 warn_line(&format!("demc: note: {}: {note}", job.output.display()));
             }
         }
@@ -207,10 +217,17 @@ fn print_plain(job: &Job, outcome: &Outcome, place: &str, pace: &str) {
 }
 
 fn json_line(job: &Job, outcome: &Outcome) -> String {
-    let (status, error, report, notes) = match outcome {
-        Outcome::Done(report) => ("done", None, Some(report), Some(report.notes.clone())),
-        Outcome::Skipped(notes) => ("skipped", None, None, Some(notes.clone())),
-        Outcome::Failed(error) => ("failed", Some(error.to_string()), None, None),
+    let (status, error, report) = match outcome {
+        Outcome::Done(report) => ("done", None, Some(report)),
+        Outcome::Skipped(_) => ("skipped", None, None),
+        Outcome::Failed(error) => ("failed", Some(error.to_string()), None),
+    };
+    let (notes, quality) = match outcome {
+        Outcome::Done(Report { notes, samples, expected_error, .. })
+        | Outcome::Skipped(Finished { notes, samples, expected_error }) => {
+            (Some(notes.clone()), Some(Quality { samples: *samples, expected_error: *expected_error }))
+        }
+        Outcome::Failed(_) => (None, None),
     };
     let line = Line {
         input: job.input.display().to_string(),
@@ -218,15 +235,14 @@ fn json_line(job: &Job, outcome: &Outcome) -> String {
         status,
         error,
         notes,
+        quality,
         report: report.map(|r| Details {
             view_layer: &r.view_layer,
             width: r.width,
             height: r.height,
             passes: &r.passes,
             light_groups: &r.light_groups,
-            samples: r.samples,
             was_denoised: r.was_denoised,
-            expected_error: r.expected_error,
             seconds: r.seconds,
             non_finite: &r.repaired,
         }),

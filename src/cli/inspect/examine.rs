@@ -24,7 +24,7 @@ pub struct FileReport {
     pub layout: &'static str,
     pub parts: Vec<PartReport>,
     pub layers: Vec<LayerReport>,
-    /// The expected RelMSE of the results that it holds, where demc noted it, by view layer.
+    /// The expected RelMSE of the results that it holds, where demc noted it, by layer (and stereo view).
     pub expected_errors: Vec<ExpectedError>,
     /// The layers that demc made, each with how it did so.
     pub results: Vec<Made>,
@@ -44,7 +44,7 @@ pub struct Made {
 
 #[derive(Serialize)]
 pub struct ExpectedError {
-    pub view_layer: String,
+    pub layer: String,
     pub relmse: f64,
 }
 
@@ -152,7 +152,7 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
         expected_errors: frame
             .expected_errors()
             .into_iter()
-            .map(|(view_layer, relmse)| ExpectedError { view_layer, relmse })
+            .map(|(layer, relmse)| ExpectedError { layer, relmse })
             .collect(),
         results: frame.methods().into_iter().map(|(layer, method)| Made { layer, method }).collect(),
         findings: windows(&frame),
@@ -174,9 +174,12 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
 
 fn windows(frame: &Frame) -> Vec<Finding> {
     let display = frame.display_window();
-    let mut differing: Vec<Window> =
-        frame.parts().iter().map(|p| p.data_window).filter(|w| *w != display).collect();
-    differing.dedup();
+    let mut differing: Vec<Window> = Vec::new();
+    for window in frame.parts().iter().map(|p| p.data_window).filter(|w| *w != display) {
+        if !differing.contains(&window) {
+            differing.push(window);
+        }
+    }
     let at = |w: Window| format!("{}x{} at {},{}", w.width, w.height, w.x, w.y);
     let warn = |w: Window| {
         let message = format!(

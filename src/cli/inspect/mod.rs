@@ -48,7 +48,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     // The frame before, while files are frames of one sequence in order.
     let mut before: Option<(PathBuf, Trace)> = None;
     let is_compared = inputs.files.len() > 1;
-    for path in inputs.paths() {
+    for path in inputs.files.into_iter().map(|input| input.file) {
         let mut examined = attempt(&path, || examine::examine(&path, &methods, &mapping, is_compared));
         let of_before = before.take().filter(|(earlier, _)| denoise::follows(&path, earlier));
         if let Ok(report) = &mut examined {

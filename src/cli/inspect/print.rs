@@ -40,8 +40,8 @@ fn write_file(out: &mut String, report: &FileReport) -> std::fmt::Result {
     for Made { layer, method } in &report.results {
         writeln!(out, "  '{layer}' was made with {method}")?;
     }
-    for ExpectedError { view_layer, relmse } in &report.expected_errors {
-        writeln!(out, "  denoised '{view_layer}': expected RelMSE {relmse:.2e}")?;
+    for ExpectedError { layer, relmse } in &report.expected_errors {
+        writeln!(out, "  '{layer}' has an expected RelMSE of {relmse:.2e}")?;
     }
     write_findings(out, "  ", &report.findings)?;
     report.layers.iter().try_for_each(|layer| write_layer(out, layer))

@@ -27,7 +27,7 @@ impl Empty {
     /// If sizes differ.
     pub fn of(radiance: &Planes, alpha: &Planes) -> Option<Self> {
         let (width, height) = (radiance.width, radiance.height);
-        assert_eq!((alpha.channels, alpha.width, alpha.height), (1, width, height), "planes of one frame");
+        assert_eq!(alpha.extent(), (1, width, height), "planes of one frame");
         let (mut has_clear, mut has_covered) = (false, false);
         for alpha in &alpha.data {
             has_clear |= *alpha == 0.0;

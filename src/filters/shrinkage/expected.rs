@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::{
     FLOOR, Render,
-    features::{FEATURES, TINY, WINDOWS, each_row},
+    features::{FEATURES, SAMPLES, TINY, WINDOWS, each_row},
 };
 use crate::{
     filters::{
@@ -26,6 +26,10 @@ use crate::{
 /// Besides the features, the perceptron reads the logarithm of the mean squared change that is left, in the
 /// square itself and around it.
 const INPUTS: usize = FEATURES + 2;
+
+/// The samples of the cleanest frames that were learned from. A file that tells more counts as one that tells nothing:
+/// beyond, the perceptron would guess, and with adaptive sampling such a number is what a pixel may have had at most.
+const MOST_SAMPLES: u32 = 256;
 
 /// Relative squared changes are cut at this.
 const LARGEST_CHANGE: f32 = 100.0;
@@ -53,6 +57,9 @@ pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
         squares::around(near_rows, squares, window, &mut of_rows, &mut around);
         let mut inputs = vec![0.0; INPUTS * squares];
         inputs[..FEATURES * squares].copy_from_slice(features);
+        if render.samples.is_some_and(|samples| samples > MOST_SAMPLES) {
+            inputs[SAMPLES * squares..FEATURES * squares].fill(0.0);
+        }
         let (own, near) = inputs[FEATURES * squares..].split_at_mut(squares);
         own.iter_mut().zip(rows[row]).for_each(|(log, change)| *log = ln(change + TINY));
         let (changes, weights) = around.split_at(squares);
@@ -79,10 +86,13 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
         let (changes, rest) = lines.split_at_mut(squares);
         let (ones, units) = rest.split_at_mut(squares);
         ones.fill(1.0);
+        let mut is_near = vec![true; width];
         let rows = row * SQUARE..((row + 1) * SQUARE).min(height);
         for y in rows.clone() {
-            let [noisy, clean] = [render.radiance, result]
-                .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+            if let Some(empty) = &render.empty {
+                empty.row(y, &mut is_near);
+            }
+            let [noisy, clean] = [render.radiance, result].map(|planes| planes.rows(y));
             for x in 0..width {
                 let change: f32 =
                     (0..3).map(|c| (noisy[c][x].max(0.0) - clean[c][x]) / (clean[c][x] + floor)).sum::<f32>()
@@ -92,7 +102,8 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
                     .map(|square| (square + least) / (square + RELMSE_EPSILON as f32))
                     .sum();
                 changes[x / SQUARE] += (change * change).min(LARGEST_CHANGE);
-                units[x / SQUARE] += unit / 3.0;
+                // What stays as rendered because nothing was met has no error.
+                units[x / SQUARE] += if is_near[x] { unit / 3.0 } else { 0.0 };
             }
         }
         for (square, (change, unit)) in changes.iter_mut().zip(units).enumerate() {

@@ -23,6 +23,8 @@ pub const WINDOWS: [&[f32]; 3] =
 /// place, the logarithm to base 2 of the number of samples, and whether that number is known.
 const OF_WINDOW: usize = 11;
 pub const FEATURES: usize = WINDOWS.len() * OF_WINDOW + 3;
+/// The first of those that tell of samples.
+pub const SAMPLES: usize = FEATURES - 2;
 
 /// Added to values before their logarithm is taken, and to divisors.
 pub const TINY: f32 = 1e-8;

@@ -35,7 +35,7 @@ use self::{
 };
 use super::squares::{SQUARE, between};
 use crate::{
-    kernels::{exponential::exp, logarithm::ln},
+    kernels::{exponential::exp, logarithm::ln, thirds},
     planes::Planes,
 };
 
@@ -186,10 +186,8 @@ pub fn features(image: &Planes, render: &Render) -> Planes {
 }
 
 fn check(image: &Planes, render: &Render) {
-    let size = (image.width, image.height);
     for planes in [render.radiance, render.albedo, image] {
-        let own = (planes.channels, planes.width, planes.height);
-        assert_eq!(own, (3, size.0, size.1), "planes of one frame");
+        assert_eq!(planes.extent(), (3, image.width, image.height), "planes of one frame");
     }
 }
 
@@ -247,9 +245,7 @@ fn mix(
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
-    let (red, rest) = image.data.split_at_mut(width * height);
-    let (green, blue) = rest.split_at_mut(width * height);
-    let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(width));
+    let [red, green, blue] = thirds(&mut image.data).map(|plane| plane.par_chunks_mut(width));
     let shares: Vec<Option<&mut [f32]>> = match shares {
         Some(shares) => shares.data.chunks_mut(width).map(Some).collect(),
         None => (0..height).map(|_| None).collect(),
@@ -267,7 +263,7 @@ fn mix(
             for (line, (a, b)) in line.iter_mut().zip(of(above).iter().zip(of(above + 1))) {
                 *line = a + (b - a) * share;
             }
-            let radiance = [0, 1, 2].map(|c| &render.radiance.channel(c)[y * width..][..width]);
+            let radiance = render.radiance.rows(y);
             for x in 0..width {
                 let (left, share) = between(x, squares);
                 let right = (left + 1).min(squares - 1);
@@ -570,7 +566,11 @@ mod tests {
             empty: Empty::of(&radiance, &alpha),
         };
         let mut shares = Planes::new(1, SIZE.0, SIZE.1);
-        shrink(&mut image, &render, Some(&mut shares));
+        let errors = Shrinkage::of(&render).shrink_expecting(&mut image, Some(&mut shares));
+        for (at, error) in errors.data.iter().enumerate() {
+            let first = at % errors.width * SQUARE;
+            assert_eq!(*error > 0.0, first < 43, "{first}: {error}");
+        }
         for (at, share) in shares.data.iter().enumerate() {
             let values = |planes: &Planes| [0, 1, 2].map(|c| planes.channel(c)[at]);
             match at % w {
@@ -583,6 +583,18 @@ mod tests {
                 _ => assert!(values(&image) == [0.0; 3] && *share == 1.0, "{}", at % w),
             }
         }
+    }
+
+    #[test]
+    fn of_more_samples_than_were_learned_from_as_much_is_expected_as_of_unknown_ones() {
+        let (radiance, albedo, image) = (noisy(0.3), planes(|_, _, _| 0.5), planes(picture));
+        let errors = |samples| {
+            let render = Render { radiance: &radiance, albedo: &albedo, exposure: 0.6, samples, empty: None };
+            expected::errors(&image, &render, &sums::gather(&image, &render, &Seen::of(&render))).data
+        };
+        assert_eq!(errors(Some(257)), errors(None));
+        assert_eq!(errors(Some(4096)), errors(None));
+        assert_ne!(errors(Some(256)), errors(None));
     }
 
     #[test]

@@ -78,14 +78,6 @@ fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
     (0..3).all(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute))
 }
 
-/// Pixels (x, y) of the square of `2 reach + 1` rows and columns around one that lie in the frame, itself
-/// included.
-fn near(planes: &Planes, x: usize, y: usize, reach: usize) -> impl Iterator<Item = (usize, usize)> {
-    let around = |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
-    let columns = around(x, planes.width);
-    around(y, planes.height).flat_map(move |y| columns.clone().map(move |x| (x, y)))
-}
-
 /// Tells light that comes straight to the camera.
 pub struct Seen<'a> {
     pub radiance: &'a Planes,
@@ -123,8 +115,8 @@ impl Seen<'_> {
         // A black pixel is no light itself. As a neighbour it counts, because lamps and stars end in black.
         let is_lit = (0..3).any(|c| self.albedo.channel(c)[y * width + x] > 0.0);
         is_lit && equals_albedo(x, y) && {
-            let beyond = 9 - near(self.radiance, x, y, 1).count();
-            let seen = near(self.radiance, x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
+            let beyond = 9 - self.radiance.near(x, y, 1).count();
+            let seen = self.radiance.near(x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
             seen + beyond >= SEEN_TOGETHER
         }
     }
@@ -144,7 +136,7 @@ impl Seen<'_> {
         if light <= 0.0 {
             return 0.0;
         }
-        let others = near(radiance, x, y, 1).filter(|&other| other != (x, y));
+        let others = radiance.near(x, y, 1).filter(|&other| other != (x, y));
         let (_, second) = others.map(|(x, y)| beyond(x, y).0).fold((0.0, 0.0), |(first, second), other| {
             (f32::max(first, other), f32::max(second, first.min(other)))
         });
@@ -159,6 +151,6 @@ pub fn is_firefly(render: &Render, x: usize, y: usize) -> bool {
     let brightest = |(x, y): (usize, usize)| {
         (0..3).map(|c| radiance.channel(c)[y * radiance.width + x]).fold(0.0, f32::max)
     };
-    let others = near(radiance, x, y, 2).filter(|&other| other != (x, y)).map(brightest);
+    let others = radiance.near(x, y, 2).filter(|&other| other != (x, y)).map(brightest);
     brightest((x, y)) > FIREFLY * others.fold(0.0, f32::max)
 }

@@ -106,8 +106,7 @@ impl PixelRow {
         let line = || vec![0.0; width + 2];
         let [light, ratio, denoised, albedo, residual, cut] = [(); 6].map(|()| line());
         let mut row = Self { light, ratio, denoised, albedo, scales: [line(), line()], residual, cut };
-        let [image, radiance, albedo] = [image, render.radiance, render.albedo]
-            .map(|planes| [0, 1, 2].map(|c| &planes.channel(c)[y * width..][..width]));
+        let [image, radiance, albedo] = [image, render.radiance, render.albedo].map(|planes| planes.rows(y));
         let floor = FLOOR / render.exposure;
         vectorised::run(Read { image, radiance, albedo, film, floor, row: &mut row });
         let Self { light, ratio, denoised, albedo, residual, .. } = &mut row;

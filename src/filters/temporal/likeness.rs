@@ -71,7 +71,7 @@ impl<'a> Own<'a> {
     pub fn of(image: &'a Planes, radiance: &Planes, exposure: f32) -> Self {
         let (size, floor) = ((image.width, image.height), FLOOR / exposure);
         let noise = Planes::from_rows(1, size, |_, y, squared| {
-            let both = [image, radiance].map(|planes| rows(planes, y));
+            let both = [image, radiance].map(|planes| planes.rows(y));
             let signed = &mut vec![0.0; size.0];
             vectorised::run(Difference { both, floor, largest: LARGEST, signed, squared });
         });
@@ -81,7 +81,7 @@ impl<'a> Own<'a> {
                 box_mean::row(image.channel(c), size, y, 1, &mut mean);
                 mean
             });
-            let both = [rows(image, y), means.each_ref().map(Vec::as_slice)];
+            let both = [image.rows(y), means.each_ref().map(Vec::as_slice)];
             let signed = &mut vec![0.0; size.0];
             vectorised::run(Difference { both, floor, largest: f32::INFINITY, signed, squared });
         });
@@ -123,7 +123,7 @@ impl<'a> Own<'a> {
         let there = fetch(self.image, other, link);
         let size = (self.image.width, self.image.height);
         let differences = Planes::from_rows_of_all(2, size, |y, out| {
-            let both = [self.image, &there].map(|planes| rows(planes, y));
+            let both = [self.image, &there].map(|planes| planes.rows(y));
             let [signed, squared] = out else { unreachable!("there are two planes") };
             let (floor, largest) = (self.floor, f32::INFINITY);
             vectorised::run(Difference { both, floor, largest, signed, squared });
@@ -183,11 +183,6 @@ impl Vectorised for Logarithm<'_> {
             Of::Least(least) => values.for_each(|v| *v = ln(v.max(least))),
         }
     }
-}
-
-/// A row of the three channels of an image.
-fn rows(image: &Planes, y: usize) -> [&[f32]; 3] {
-    [0, 1, 2].map(|c| &image.channel(c)[y * image.width..][..image.width])
 }
 
 /// The means, over three channels of a row of two images, of their differences relative to the first, and of

@@ -60,10 +60,9 @@ pub fn merge(own: &dyn Values, is_light: bool, neighbours: &[(&dyn Values, &Link
         assert_eq!(values.extent(), own.extent(), "planes of one pass");
         assert!(link.flow.size() == size, "frames of one size");
     }
-    let of_row = |y: usize| y * size.0..(y + 1) * size.0;
     Planes::from_rows_of_all(channels, size, |y, rows| {
         let stretches: Vec<_> = neighbours.iter().map(|(_, link)| link.flow.nearest_of_row(y)).collect();
-        let weights: Vec<_> = neighbours.iter().map(|(_, link)| &link.weights.data[of_row(y)]).collect();
+        let weights: Vec<_> = neighbours.iter().map(|(_, link)| link.weights.row(0, y)).collect();
         let mut sums = vec![1.0; size.0];
         for weights in &weights {
             sums.iter_mut().zip(*weights).for_each(|(sum, weight)| *sum += weight);
@@ -105,16 +104,15 @@ pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&P
             own.weigh(other, link)
         })
         .collect();
-    let of_row = |y: usize| y * size.0..(y + 1) * size.0;
     Planes::from_rows_of_all(3, size, |y, rows| {
         let mut sums = vec![1.0; size.0];
         for (_, weights) in &others {
-            sums.iter_mut().zip(&weights.data[of_row(y)]).for_each(|(sum, weight)| *sum += weight);
+            sums.iter_mut().zip(weights.row(0, y)).for_each(|(sum, weight)| *sum += weight);
         }
         for (c, out) in rows.iter_mut().enumerate() {
-            out.copy_from_slice(&image.channel(c)[of_row(y)]);
+            out.copy_from_slice(image.row(c, y));
             for (there, weights) in &others {
-                let both = there.channel(c)[of_row(y)].iter().zip(&weights.data[of_row(y)]);
+                let both = there.row(c, y).iter().zip(weights.row(0, y));
                 out.iter_mut().zip(both).for_each(|(out, (there, weight))| *out += weight * there);
             }
             out.iter_mut().zip(&sums).for_each(|(out, sum)| *out /= sum);

@@ -71,7 +71,7 @@ impl Network for Prefilter {
     }
 
     fn target(&self, reference: &PassSet) -> Result<Planes> {
-        guide_targets(reference, NEEDED_BY)
+        guide_targets(reference)
     }
 
     fn multiple(&self) -> usize {
@@ -80,7 +80,7 @@ impl Network for Prefilter {
 
     fn inputs(&self, passes: &PassSet) -> Result<Inputs> {
         let exposure = albedo_exposure(passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?);
-        let inputs = guide_inputs(passes, exposure, NEEDED_BY)?;
+        let inputs = guide_inputs(passes, exposure)?;
         Ok(Inputs { planes: inputs.into_list().into(), scale: exposure.recip() })
     }
 
@@ -118,7 +118,7 @@ impl Network for Prefilter {
     ) -> Result<Planes> {
         let guides = strips::infer_guides(self, passes, tile)?;
         let rows = |c: usize, y: usize, row: &mut [f32]| {
-            row.copy_from_slice(&guides[c / 3].channel(c % 3)[y * passes.width..][..passes.width]);
+            row.copy_from_slice(guides[c / 3].row(c % 3, y));
         };
         Ok(Planes::from_rows(6, (passes.width, passes.height), rows))
     }

@@ -65,7 +65,7 @@ fn infer_in(
     let radiance = passes.require(Pass::Combined, NEEDED_BY)?;
     let albedo = passes.require(Pass::DenoisingAlbedo, NEEDED_BY)?;
     let exposure = exposure(radiance);
-    let shading = Shading::of(passes, exposure, NEEDED_BY)?;
+    let shading = Shading::of(passes, exposure)?;
     let channels = std::iter::once(3).chain(companions.iter().map(|companion| companion.planes.channels));
     let mut written: Vec<Planes> =
         channels.map(|channels| Planes::unwritten(channels, passes.width, passes.height)).collect();
@@ -144,7 +144,7 @@ fn prefilter_bands(
     for band in cut.bands() {
         let padded = cut.padded(&band);
         let band = passes.padded_rows(&PREFILTERED_PASSES, band, padded).columns(cut.padded_columns());
-        feed.push(guide_inputs(&band, exposure, NEEDED_BY)?, exposure.recip(), done)?;
+        feed.push(guide_inputs(&band, exposure)?, exposure.recip(), done)?;
     }
     Ok(())
 }
@@ -309,10 +309,10 @@ impl Whole<'_> {
     ) -> Result<(LightInputs, Vec<Planes>)> {
         let Self { passes, radiance, exposure, .. } = *self;
         let (padded, columns) = (cut.padded(&rows), cut.padded_columns());
-        let shading = self.shading.rows(passes, rows.clone(), NEEDED_BY)?.columns(cut.columns.clone());
+        let shading = self.shading.rows(passes, rows.clone())?.columns(cut.columns.clone());
         let refined = Refined { albedo, normal, shading }.padded_to((columns.len(), padded.1));
-        let band = guide_rows(passes, rows.clone(), padded, exposure, NEEDED_BY)?.columns(columns.clone());
-        let inputs = light_inputs(&band, refined, exposure, NEEDED_BY)?;
+        let band = guide_rows(passes, rows.clone(), padded, exposure)?.columns(columns.clone());
+        let inputs = light_inputs(&band, refined, exposure)?;
         let tamed = band.require(Pass::Combined, NEEDED_BY)?;
         let part = |planes: &Planes| planes.padded_rows(rows.clone(), padded).columns(columns.clone());
         let is_lit = self.companions.iter().any(|companion| companion.kind == Kind::Light);
