@@ -11,7 +11,7 @@ use common::demc;
 use demc::{
     frame::HALF_MAX,
     lint::{self, About, Trace},
-    passes::{Pass, PassSet},
+    passes::{Pass, PassSet, RENDERERS},
     planes::Planes,
     rng::Rng,
 };
@@ -220,6 +220,37 @@ fn guides_of_another_frame() {
 }
 
 #[test]
+fn guides_that_are_upside_down() {
+    // Tiles of another wall would lie where these do.
+    let guides = [Pass::DenoisingAlbedo, Pass::DenoisingNormal];
+    let flip = |set: &mut PassSet| {
+        let rows = |planes: &mut Planes| {
+            let before = planes.clone();
+            *planes =
+                Planes::from_rows(3, SIZE, |c, y, row| row.copy_from_slice(before.row(c, SIZE.1 - 1 - y)));
+        };
+        guides.iter().for_each(|pass| change(set, *pass, rows));
+    };
+    assert_found(SOUND, flip, &["foreign-guide"]);
+}
+
+#[test]
+fn albedo_and_normal_that_are_swapped() {
+    let mut set = SOUND.passes();
+    let [albedo, normal] =
+        [Pass::DenoisingAlbedo, Pass::DenoisingNormal].map(|pass| set.remove(pass).unwrap());
+    set.insert(Pass::DenoisingAlbedo, normal.clone());
+    set.insert(Pass::DenoisingNormal, albedo);
+    let found = lint::frame(&set, &About::default());
+    let told = |pass: &str| found.iter().any(|f| f.code == "wrong-pass" && f.message.starts_with(pass));
+    assert!(told("Denoising Albedo is below zero") && told("Denoising Normal has no direction"), "{found:?}");
+    // Stored in 0 to 1 they are normals still.
+    let mut encoded = SOUND.passes();
+    each(&mut encoded, Pass::DenoisingNormal, |v| 0.5 + 0.5 * v);
+    assert!(!codes(&encoded, &About::default()).contains(&"wrong-pass"));
+}
+
+#[test]
 fn albedo_above_one_on_surfaces_and_not_on_lamps() {
     assert_found(Render { albedo: 2.2, ..SOUND }, |_| {}, &["albedo-above-one"]);
     // Lamps send what their albedo says, and more.
@@ -262,6 +293,14 @@ fn values_that_are_no_light() {
     put(HALF_MAX)(&mut set);
     assert_eq!(codes(&set, &about), ["half-overflow"]);
     assert_eq!(codes(&set, &About::default()), [""; 0], "floats hold more");
+    put(f32::INFINITY)(&mut set);
+    assert_eq!(codes(&set, &about), ["half-overflow"], "one fault, one finding");
+    put(-0.5)(&mut set);
+    let found = lint::frame(&set, &About { lossy: Some("dwaa"), ..About::default() });
+    assert!(
+        found[0].message.contains("lossy compression DWAA") && found[0].remedy.contains("ZIP"),
+        "{found:?}"
+    );
     // Beyond everything there is no depth.
     set = SOUND.passes();
     set.insert(Pass::Depth, Planes::from_vec(1, SIZE.0, SIZE.1, vec![f32::INFINITY; SIZE.0 * SIZE.1]));
@@ -321,6 +360,11 @@ fn motion_blur_in_the_beauty_alone() {
 fn pixels_encoded_for_a_display() {
     let srgb = |set: &mut PassSet| each(set, Pass::Combined, curve);
     assert_found(SOUND, srgb, &["display-pixels"]);
+    // Brighter, so that lamps' light is cut off: that is no clamp of samples.
+    let clipped = |set: &mut PassSet| each(set, Pass::Combined, |v| (4.0 * v).min(1.0));
+    assert_found(SOUND, clipped, &["display-pixels"]);
+    let bright = |v: f32| f16::from_f32(curve(4.0 * v)).to_f32();
+    assert_found(SOUND, |set| each(set, Pass::Combined, bright), &["display-pixels"]);
     let eight_bits = |set: &mut PassSet| {
         each(set, Pass::Combined, |v| f16::from_f32((255.0 * curve(v)).round() / 255.0).to_f32());
     };
@@ -399,9 +443,15 @@ fn frames_of_a_shot() {
         set
     };
     assert_eq!(codes_after(&still(frozen), &still(first.clone())), [""; 0]);
+    // It has moved, though vectors say that nothing does.
+    let moved = of_shot(Render { seed: 2, moved: (6.0, 0.0), ..SOUND });
+    assert_eq!(codes_after(&still(moved), &still(first.clone())), ["zero-vectors"]);
     let mut without = second;
     without.remove(Pass::Vector);
     assert_eq!(codes_after(&without, &first), ["missing-vectors"]);
+    // No other renderer's motion is followed.
+    without.renderer = RENDERERS.iter().find(|renderer| !renderer.is_blender()).unwrap();
+    assert_eq!(codes_after(&without, &first), [""; 0]);
 }
 
 fn write(set: &PassSet, path: &Path) {

@@ -405,25 +405,82 @@ fn where_a_transparent_film_is_empty_nothing_comes_from_neighbours_either() {
     }
 }
 
+/// Writes a frame that tells how many samples it had, with other noise.
+fn write_sampled(shot: Shot, path: &Path, frame: i64, samples: u32, noise: impl Fn(usize) -> f32) {
+    let mut attributes = LayerAttributes::default();
+    let samples = exr::meta::attribute::AttributeValue::Text(samples.to_string().as_str().into());
+    attributes.other.insert("cycles.ViewLayer.samples".into(), samples);
+    let channels = shot.channels("ViewLayer", "", frame).into_iter().map(|mut channel| {
+        if let Some(c) =
+            ["R", "G", "B"].iter().position(|c| channel.name.eq(&format!("ViewLayer.Combined.{c}")))
+        {
+            let light = (0..shot.size.0 * shot.size.1).map(|i| shot.truth(c, i, frame) * noise(i));
+            channel.sample_data = FlatSamples::F32(light.collect());
+        }
+        channel
+    });
+    let channels = AnyChannels::sort(channels.collect());
+    let layer = Layer::new(shot.size, attributes, Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().to_file(path).unwrap();
+}
+
+#[test]
+fn frames_of_other_numbers_of_samples_are_no_other_light() {
+    let shot = Shot { speed: 0.0, size: (96, 72), ..SHOT };
+    let dir = tempfile::tempdir().unwrap();
+    for frame in 1..=5 {
+        // The noise of so many samples: few are bright, and most are dark.
+        let samples = if frame == 3 { 16 } else { 4 };
+        let of_one = |n: u32, i: usize| -(1.0 - random([n, frame as u32, i as u32])).ln();
+        let noise = |i: usize| (0..samples / 4).map(|n| of_one(n, i)).sum::<f32>() / (samples / 4) as f32;
+        write_sampled(shot, &named(&dir, frame), frame, samples, noise);
+    }
+    let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+    demc(&alone).arg(dir.path()).assert().success();
+    demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+    for n in 2..=4 {
+        let [with, without] = [&out, &alone].map(|dir| {
+            let light = values(&read_exr(result(dir, n)), "ViewLayer.Denoised.G");
+            light.iter().sum::<f32>() / (0..light.len()).map(|i| shot.truth(1, i, n)).sum::<f32>()
+        });
+        assert!((with / without - 1.0).abs() < 0.04, "frame {n}: {with} beside {without}");
+    }
+    // One that has no noise at all is no cut, nor is motion blur to be turned off.
+    write_sampled(shot, &named(&dir, 3), 3, 4096, |_| 1.0);
+    let said = demc(&out).arg(dir.path()).args(["--temporal", "--overwrite"]).assert().success();
+    said.stderr(contains("Motion Blur").not());
+}
+
+#[test]
+fn frames_that_lack_a_pass_are_told_and_so_is_what_a_model_does_without() {
+    let dir = tempfile::tempdir().unwrap();
+    let write = |frame: i64, has_albedo: bool| {
+        let mut channels = SHOT.channels("ViewLayer", "", frame);
+        channels.retain(|channel| has_albedo || !channel.name.to_string().contains("Albedo"));
+        common::shot::write_channels(&named(&dir, frame), SIZE, channels, &[]);
+    };
+    let told = |reach: &str| {
+        let out = dir.path().join("out");
+        let mut command = common::demc();
+        command.args(["denoise", "--model", "demc-s", "--overwrite", "--temporal", reach]);
+        let run = command.arg(dir.path()).arg("--out").arg(out).assert().success();
+        String::from_utf8(run.get_output().stderr.clone()).unwrap()
+    };
+    (1..=3).for_each(|frame| write(frame, false));
+    let text = told("1");
+    assert_eq!(text.matches("without Denoising Albedo").count(), 3, "{text}");
+    write(1, true);
+    write(3, true);
+    let text = told("1");
+    assert_eq!(text.matches("holds other passes").count(), 4, "{text}"); // of both frames beside the second
+    assert!(!text.contains("a cut"), "{text}");
+}
+
 #[test]
 fn a_frame_of_more_samples_takes_little_of_those_of_fewer() {
     let dir = sequence(SHOT, 1..=5);
     // A noisier render of fewer samples would take from the noiseless one what it can.
-    let channels = SHOT.channels("ViewLayer", "", 3);
-    let mut attributes = LayerAttributes::default();
-    let samples = exr::meta::attribute::AttributeValue::Text("4096".into());
-    attributes.other.insert("cycles.ViewLayer.samples".into(), samples);
-    let channels = channels.into_iter().map(|mut channel| {
-        if let Some(c) =
-            ["R", "G", "B"].iter().position(|c| channel.name.eq(&format!("ViewLayer.Combined.{c}")))
-        {
-            channel.sample_data =
-                FlatSamples::F32((0..SIZE.0 * SIZE.1).map(|i| SHOT.truth(c, i, 3)).collect());
-        }
-        channel
-    });
-    let layer = Layer::new(SIZE, attributes, Encoding::SMALL_LOSSLESS, AnyChannels::sort(channels.collect()));
-    Image::from_layer(layer).write().to_file(named(&dir, 3)).unwrap();
+    write_sampled(SHOT, &named(&dir, 3), 3, 4096, |_| 1.0);
     let out = dir.path().join("out");
     demc(&out).arg(dir.path()).arg("--temporal").assert().success();
     let error = SHOT.error(&result(&out, 3), "ViewLayer.Denoised", 3);

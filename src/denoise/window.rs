@@ -91,6 +91,8 @@ struct Moment {
     look: Look,
     /// What brings its render to middle grey.
     exposure: f32,
+    /// What the model has to say of it.
+    note: Option<String>,
     /// The part of the frame that was [rendered](PassSet::rendered).
     region: ((usize, usize), (usize, usize)),
     /// How neighbours belong together with it, by how many frames later these are.
@@ -314,12 +316,14 @@ impl<'a> Window<'a> {
             self.connect(number, view, offset);
         }
         self.explain(number, view, report);
-        self.infer(number, view, report)?;
+        let of_model = self.moment(number, view).and_then(|own| own.note.clone());
+        report.notes.extend(of_model.filter(|note| !report.notes.contains(note)));
+        self.infer(number, view)?;
         report.lacked.extend(self.lost(number, view, renders.max(results)));
         for offset in offsets(results) {
             if self.is_linked(number, view, offset) {
                 let other = number + i64::from(offset);
-                self.infer(other, view, report)?;
+                self.infer(other, view)?;
                 report.lacked.extend(&self.moment(other, view).expect("it was inferred").lacked);
             }
         }
@@ -361,7 +365,7 @@ impl<'a> Window<'a> {
     }
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
-    fn infer(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<()> {
+    fn infer(&mut self, number: i64, view: &ViewKey) -> Result<()> {
         let Self { model, tile, reaches: [renders, _], .. } = *self;
         if self.moment(number, view).is_some_and(|own| own.result.is_some()) {
             return Ok(());
@@ -386,7 +390,8 @@ impl<'a> Window<'a> {
             own.shot()
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number));
-        let (image, _) = run(&shot, &mut [], false, (model, tile), report)?;
+        // What there is to say of it is said where it is a frame's own.
+        let (image, _) = run(&shot, &mut [], false, (model, tile), &mut Report::default())?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
         (moment.result, moment.lacked) = (Some(image), lacked);
@@ -451,7 +456,16 @@ impl<'a> Window<'a> {
                 });
             }
         };
-        let brightness = own.look.brightness(&other.look, &flow);
+        let held = |of: Guides| [of.albedo.is_some(), of.normal.is_some(), of.depth.is_some()];
+        if held(own.guides()) != held(other.guides()) {
+            return said(format!(
+                "frame {there} holds other passes: albedo, normal or depth is missing in one of them"
+            ));
+        }
+        // Of fewer samples, light has more of an excess in few pixels, and looks darker where most are.
+        let [samples, others] = [own, other].map(|moment| moment.shot.passes.samples);
+        let has_as_many = samples == others;
+        let brightness = if has_as_many { own.look.brightness(&other.look, &flow) } else { 1.0 };
         let mut weights = own.look.agreement(&other.look, &flow, brightness, &own.guides(), &other.guides());
         if let [Some(light), Some(there)] = [own, other].map(|moment| moment.values(Pass::Combined)) {
             agreement::dim(&mut weights, &flow, light, there, DARK / own.exposure);
@@ -469,6 +483,11 @@ impl<'a> Window<'a> {
             let vectors = moment.and_then(|moment| moment.pass(Pass::Vector));
             vectors.is_none_or(|vectors| vectors.data.iter().all(|v| *v == 0.0))
         };
+        if !has_as_many && (of_detail < STILL || share < CUT) {
+            return said(format!(
+                "frame {there} shows another picture (a cut), or one that its other number of samples lets not compare"
+            ));
+        }
         if of_detail < STILL && (0..offset.abs()).all(are_zero) {
             return said(format!(
                 "frame {there} shows another picture, and Vector is zero everywhere: a cut, or motion blur was on, with \
@@ -486,7 +505,7 @@ impl<'a> Window<'a> {
             ));
         }
         // The noise of fewer samples would make a frame worse.
-        let share = match (own.shot.passes.samples, other.shot.passes.samples) {
+        let share = match (samples, others) {
             (Some(own), Some(there)) if there < own => there as f32 / own as f32,
             _ => 1.0,
         };
@@ -530,7 +549,7 @@ impl<'a> Window<'a> {
 
 impl Moment {
     fn new(mut shot: Shot, model: &dyn Denoiser) -> Self {
-        let region = shot.passes.rendered();
+        let (region, note) = (shot.passes.rendered(), model.notes(&shot));
         let passes = &mut shot.passes;
         // Of two passes that tell the same, the first is enough.
         for [first, second] in [NORMALS, DEPTHS] {
@@ -554,6 +573,7 @@ impl Moment {
             waiting,
             look,
             exposure,
+            note,
             region,
             links: BTreeMap::new(),
             result: None,

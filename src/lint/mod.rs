@@ -52,6 +52,8 @@ pub struct About {
     pub position_averaged: bool,
     /// Whether the file says that demc denoised this view layer.
     pub denoised_by_demc: bool,
+    /// The compression of Combined, where that loses something.
+    pub lossy: Option<&'static str>,
     /// The colour space that the file names, as OpenEXR, Blender or OpenImageIO write it.
     pub colour_space: Option<String>,
     /// The passes that are missing for the model that is used by default.
@@ -74,10 +76,20 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     let light = light::sums(render);
     noise::check(set, about, render, &light, &mut findings);
     // Shifted guides tell nothing of the beauty's edges.
-    let is_shifted = shift::check(set, &light, &mut findings);
-    edges::check(set, render, (!is_shifted).then_some(&light), &mut findings);
-    noise::clamped(set, &light, &mut findings);
+    let fit = shift::check(set, &light, &mut findings);
+    edges::check(set, render, fit.map(|fit| (&light, fit)), &mut findings);
+    noise::clamped(set, render, &light, &mut findings);
+    if !set.renderer.is_blender() {
+        let blender_s = findings.iter_mut().filter(|finding| finding.remedy.contains(" Properties > "));
+        blender_s.for_each(|finding| finding.remedy.insert_str(0, "as Blender calls it: "));
+    }
     findings
+}
+
+/// Why a frame is not judged as a picture: single values are looked at alone.
+pub fn unjudged(set: &PassSet) -> Option<String> {
+    (set.width < LEAST_SIZE || set.height < LEAST_SIZE)
+        .then(|| format!("not judged as a picture: less than {LEAST_SIZE} pixels wide or high"))
 }
 
 /// The least width and height of a frame that is judged as a picture: smaller ones show too few edges and too

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use super::{
     About, Finding,
     light::{lit_surfaces, median, quantile, usual_logarithms},
+    values::LINEAR,
 };
 use crate::{passes::PassSet, planes::Planes};
 
@@ -121,7 +122,7 @@ const ALONE: f32 = 2.0;
 /// Pixels that a class needs.
 const CLAMPED_PIXELS: f32 = 30.0;
 
-/// More pixels than this that are just as bright as the brightest were clipped.
+/// More pixels than this that are just 1 were clipped.
 const CLIPPED: usize = 20;
 
 /// Finds samples that were clamped. Cycles scales a sample whose channels add up to more than three times the
@@ -129,16 +130,32 @@ const CLIPPED: usize = 20;
 /// so that many pixels stand out from those around them by just that.
 ///
 /// This comes last: values that are cut off at 1 were encoded for a display, which is another fault.
-pub fn clamped(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) {
-    let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
+pub fn clamped(set: &PassSet, render: &Planes, light: &[f32], findings: &mut Vec<Finding>) {
     if findings.iter().any(|finding| ["display-pixels", "eight-bit-pixels"].contains(&finding.code)) {
         return;
     }
-    // What was clipped at white stands out by as much everywhere, too.
-    let most = light.iter().copied().fold(0.0, f32::max);
-    if most <= 1.0 && light.iter().filter(|v| **v == most).count() > CLIPPED {
-        return;
+    // What was clipped at white stands out by as much everywhere, too. A white backdrop is no surface.
+    if render.data.iter().all(|v| *v <= 1.0) {
+        let surfaces = lit_surfaces(set, render);
+        let is_lit = |at: usize| surfaces.as_ref().is_some_and(|surfaces| surfaces[at]);
+        let is_clipped = |at: usize| (0..3).any(|c| render.channel(c)[at] == 1.0);
+        let (clipped, others) =
+            (0..light.len()).filter(|at| is_clipped(*at)).partition::<Vec<_>, _>(|at| is_lit(*at));
+        if clipped.len() > CLIPPED {
+            findings.push(Finding::new(
+                "display-pixels",
+                format!(
+                    "no light is above 1, and {} pixels of lit surfaces are just that: the pixels were cut off for a display",
+                    clipped.len()
+                ),
+                LINEAR,
+            ));
+        }
+        if clipped.len() + others.len() > CLIPPED {
+            return;
+        }
     }
+    let Some(samples) = set.samples.filter(|samples| *samples > 0) else { return };
     let (w, h) = (set.width, set.height);
     let logs: Vec<f32> = (w..w * (h - 1))
         .filter(|at| (1..w - 1).contains(&(at % w)))

@@ -26,19 +26,19 @@ const BETTER: f64 = 1.2;
 /// The most rows that are compared; those of larger frames are picked evenly.
 const ROWS: usize = 400;
 
-/// Whether a guide is shifted against `light`, the sums of the render's channels.
-pub fn check(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) -> bool {
+/// Finds guides that are shifted against `light`, the sums of the render's channels. Where none is, returns how well the
+/// better guide fits as it lies: the correlation of edges.
+pub fn check(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) -> Option<f64> {
     let before = findings.len();
     let (w, h) = (set.width, set.height);
     let blurred = blur(light, w, h);
     let beauty = edges(&[&logarithms(&blurred, 0.05)], w, h, 1.0);
+    let mut best_fit = 0.0f64;
     for pass in GUIDES {
         let Some(guide) = set.get(pass) else { continue };
-        let planes: Vec<Vec<f32>> =
-            (0..3).map(|c| guide.channel(c).iter().map(|v| clean(*v)).collect()).collect();
-        let planes: Vec<&[f32]> = planes.iter().map(Vec::as_slice).collect();
-        let guide = edges(&planes, w, h, 0.6);
-        let Some((x, y)) = shift(&beauty, &guide) else { continue };
+        let (moved, unmoved) = shift(&beauty, &edges_of_guide(guide));
+        best_fit = best_fit.max(unmoved);
+        let Some((x, y)) = moved else { continue };
         let along = |n: isize, back: &str, forth: &str| match n {
             0 => None,
             n => Some(format!("{} px {}", n.abs(), if n < 0 { back } else { forth })),
@@ -54,7 +54,15 @@ pub fn check(set: &PassSet, light: &[f32], findings: &mut Vec<Finding>) -> bool 
             "render beauty and guides in one go, or take the guides of the same frame, size and region",
         ));
     }
-    findings.len() > before
+    (findings.len() == before).then_some(best_fit)
+}
+
+/// The edges of a guide, for [`shift`].
+pub fn edges_of_guide(guide: &Planes) -> Planes {
+    let planes: Vec<Vec<f32>> =
+        (0..3).map(|c| guide.channel(c).iter().map(|v| clean(*v)).collect()).collect();
+    let planes: Vec<&[f32]> = planes.iter().map(Vec::as_slice).collect();
+    edges(&planes, guide.width, guide.height, 0.6)
 }
 
 fn clean(v: f32) -> f32 {
@@ -92,8 +100,8 @@ fn edges(planes: &[&[f32]], w: usize, h: usize, most: f32) -> Planes {
 }
 
 /// Where a guide would have to be moved to fit best, in pixels to the right and down; none where it fits as
-/// it lies, or nowhere.
-fn shift(beauty: &Planes, guide: &Planes) -> Option<(isize, isize)> {
+/// it lies, or nowhere. Besides, how well it fits as it lies.
+pub fn shift(beauty: &Planes, guide: &Planes) -> (Option<(isize, isize)>, f64) {
     let (w, h) = (beauty.width, beauty.height);
     let inner = REACH..h - REACH;
     let rows: Vec<usize> = inner.clone().step_by(inner.len().div_ceil(ROWS)).collect();
@@ -123,6 +131,6 @@ fn shift(beauty: &Planes, guide: &Planes) -> Option<(isize, isize)> {
         shifts.into_par_iter().map(|shift| (shift, correlation(shift))).collect();
     let is_none = |(dx, dy): (isize, isize)| dx.abs() <= NONE && dy.abs() <= NONE;
     let unmoved = found.iter().filter(|(shift, _)| is_none(*shift)).map(|f| f.1).fold(0.0, f64::max);
-    let (best, fit) = *found.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
-    (!is_none(best) && fit > FITS && fit > BETTER * unmoved).then_some(best)
+    let (best, fit) = *found.iter().max_by(|a, b| a.1.total_cmp(&b.1)).expect("shifts are tried");
+    ((!is_none(best) && fit > FITS && fit > BETTER * unmoved).then_some(best), unmoved)
 }

@@ -1,8 +1,11 @@
 //! What frames of a shot tell together: noise that is the same in all, guides that stand still while things
 //! move, and motion that is missing.
 
-use super::{Finding, GUIDES, grain::Grain};
-use crate::passes::{BLENDER, Pass, PassSet};
+use super::{Finding, GUIDES, grain::Grain, shift, unjudged};
+use crate::{
+    passes::{BLENDER, Pass, PassSet},
+    planes::Planes,
+};
 
 /// What is kept of a frame to compare the next one with it.
 pub struct Trace {
@@ -11,6 +14,9 @@ pub struct Trace {
     guides: Vec<(Pass, u64)>,
     /// Share of the pixels that move; none without vectors.
     moving: Option<f64>,
+    /// The edges of the albedo, where vectors say that nothing moves.
+    still: Option<Planes>,
+    is_blender: bool,
 }
 
 /// A pixel moves where its motion is above this many pixels a frame.
@@ -32,7 +38,15 @@ impl Trace {
             let moves = |at: usize| vectors.channel(0)[at].hypot(vectors.channel(1)[at]) > MOTION;
             (0..vectors.pixels()).filter(|at| moves(*at)).count() as f64 / vectors.pixels().max(1) as f64
         });
-        Self { grain: Grain::of(set), guides: guides.collect(), moving }
+        let is_still = set.get(Pass::Vector).is_some_and(|vectors| vectors.data.iter().all(|v| *v == 0.0));
+        let albedo = set.get(Pass::DenoisingAlbedo).filter(|_| is_still && unjudged(set).is_none());
+        Self {
+            grain: Grain::of(set),
+            guides: guides.collect(),
+            moving,
+            still: albedo.map(shift::edges_of_guide),
+            is_blender: set.renderer.is_blender(),
+        }
     }
 
     /// The findings in a frame that follows `before`, whose file is called `name`.
@@ -52,7 +66,17 @@ impl Trace {
                 ));
             }
         }
-        if self.moving.is_none() && !self.guides.is_empty() {
+        if let [Some(own), Some(other)] = [self, before].map(|trace| trace.still.as_ref())
+            && (own.width, own.height) == (other.width, other.height)
+            && shift::shift(own, other).0.is_some()
+        {
+            findings.push(Finding::new(
+                "zero-vectors",
+                format!("Vector is zero everywhere, though the picture has moved since {name}: with motion blur Blender writes none"),
+                "turn off Render Properties > Motion Blur and blur in the compositor, or denoise frame by frame",
+            ));
+        }
+        if self.is_blender && self.moving.is_none() && !self.guides.is_empty() {
             findings.push(Finding::new(
                 "missing-vectors",
                 "Vector is missing, which `demc denoise --temporal` follows from frame to frame",

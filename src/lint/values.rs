@@ -51,6 +51,7 @@ pub fn check(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
         }
     }
     albedo_above_one(set, findings);
+    wrong_passes(set, findings);
     if !display_space(about, findings) {
         eight_bits(set, findings);
     }
@@ -67,7 +68,9 @@ fn single_values(
     // Where nothing is hit there is no depth, which is infinite as a half float.
     let may_be_infinite = matches!(pass, Pass::Depth | Pass::DenoisingDepth);
     let is_well = |v: f32| v.is_finite() || (may_be_infinite && v == f32::INFINITY);
-    let bad = count(&|v| !is_well(v));
+    let is_over = |v: f32| v.is_infinite() || v.abs() == HALF_MAX;
+    let can_overflow = about.half.contains(&pass) && pass.carries_radiance();
+    let bad = count(&|v| !is_well(v) && !(can_overflow && is_over(v)));
     let of = planes.data.len();
     if bad > 0 {
         findings.push(Finding::new(
@@ -76,9 +79,8 @@ fn single_values(
             "`demc denoise` works with values filled in from around them; a material or lamp that divides by zero makes NaN",
         ));
     }
-    let over =
-        if about.half.contains(&pass) { count(&|v| v.is_infinite() || v.abs() == HALF_MAX) } else { 0 };
-    if over > 0 && pass.carries_radiance() {
+    let over = if can_overflow { count(&is_over) } else { 0 };
+    if over > 0 {
         findings.push(Finding::new(
             "half-overflow",
             format!("{pass}: {over} of {of} values are beyond what a half float holds ({HALF_MAX})"),
@@ -94,11 +96,20 @@ fn single_values(
     }
     let negative = count(&|v| v < 0.0);
     if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) {
-        findings.push(Finding::new(
-            "negative-light",
-            format!("{pass}: {negative} negative values, which no light makes; models read them as 0"),
-            "render without filters of negative lobes, and check materials and lamps for negative colours",
-        ));
+        let message =
+            format!("{pass}: {negative} negative values, which no light makes; models read them as 0");
+        findings.push(match about.lossy {
+            Some(lossy) => Finding::new(
+                "negative-light",
+                format!("{message} (the lossy compression {} makes such values)", lossy.to_uppercase()),
+                "set Output Properties > Output > Codec to ZIP",
+            ),
+            None => Finding::new(
+                "negative-light",
+                message,
+                "render without filters of negative lobes, and check materials and lamps for negative colours",
+            ),
+        });
     }
 }
 
@@ -147,6 +158,50 @@ fn albedo_above_one(set: &PassSet, findings: &mut Vec<Finding>) {
     }
 }
 
+/// The values that an albedo has none below, nor a colour, while normals to the left or down have.
+const BELOW_ZERO: f32 = -0.05;
+
+/// The share of an albedo's pixels that must be below that.
+const BELOW_SHARE: f64 = 0.01;
+
+/// Lengths of normals as they are stored; means over edges are shorter.
+const UNIT: std::ops::RangeInclusive<f32> = 0.9..=1.1;
+
+/// Pixels that a normal must have to judge by.
+const NORMALS: usize = 1000;
+
+/// Passes that hold what another one should: a typing error in a mapping, or layers that were swapped.
+fn wrong_passes(set: &PassSet, findings: &mut Vec<Finding>) {
+    let remedy = "check which layers --map, or the program that wrote the file, takes for albedo and normal";
+    let values = |planes: &Planes, at: usize| [0, 1, 2].map(|c| planes.channel(c)[at]);
+    if let Some(albedo) = set.get(Pass::DenoisingAlbedo) {
+        let is_below = |at: &usize| values(albedo, *at).iter().any(|v| *v < BELOW_ZERO);
+        let below = (0..albedo.pixels()).filter(is_below).count();
+        if below as f64 > BELOW_SHARE * albedo.pixels() as f64 {
+            let message = format!(
+                "Denoising Albedo is below zero in {below} of {} pixels, as normals are and no colour is",
+                albedo.pixels()
+            );
+            findings.push(Finding::new("wrong-pass", message, remedy));
+        }
+    }
+    if let Some(normal) = set.get(Pass::DenoisingNormal) {
+        let held = || (0..normal.pixels()).map(|at| values(normal, at)).filter(|n| *n != [0.0; 3]);
+        let length = |n: [f32; 3]| n.iter().map(|v| v * v).sum::<f32>().sqrt();
+        // Some renderers store them in 0 to 1.
+        let is_unit =
+            |n: [f32; 3]| UNIT.contains(&length(n)) || UNIT.contains(&length(n.map(|v| 2.0 * v - 1.0)));
+        let count = held().count();
+        let is_colour = count >= NORMALS
+            && held().all(|n| n.iter().all(|v| *v >= BELOW_ZERO))
+            && held().filter(|n| !is_unit(*n)).count() > count / 2;
+        if is_colour {
+            let message = "Denoising Normal has no direction: no value is below zero and lengths are not 1, as of a colour";
+            findings.push(Finding::new("wrong-pass", message, remedy));
+        }
+    }
+}
+
 /// Whether the file itself says that it is not linear.
 fn display_space(about: &About, findings: &mut Vec<Finding>) -> bool {
     let Some(space) = &about.colour_space else { return false };
@@ -165,7 +220,7 @@ fn display_space(about: &About, findings: &mut Vec<Finding>) -> bool {
 }
 
 /// How a file comes to hold linear pixels.
-pub(super) const LINEAR: &str = "save the render as OpenEXR MultiLayer with Output Properties > Color Management > Follow \
+pub(super) const LINEAR: &str = "save the render as OpenEXR MultiLayer with Output Properties > Output > Color Management > Follow \
                                  Scene, without a Convert Colorspace node or a conversion from PNG or JPEG";
 
 /// Pixels that were stored in 8 bits before.

@@ -23,7 +23,7 @@ pub use layers::{
     read_light_groups, rgb_layers, told_samples,
 };
 pub use mapping::Mapping;
-pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, Renderer, is_bare};
+pub use names::{BLENDER, COMBINED, NOISY_IMAGE, POSITION_AOV, RENDERERS, Renderer, is_bare};
 pub(crate) use names::{is_alike, light_group};
 pub use normals::{Change, Turn, to_camera_space};
 

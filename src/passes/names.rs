@@ -91,7 +91,11 @@ pub static BLENDER: Renderer = Renderer {
             [COMBINED, "Image"],
             "Data > Combined and set Output Properties > Output > Color to RGBA"
         ),
-        blender!(NoisyImage, [NOISY_IMAGE], "Data > Denoising Data and keep Render Properties > Denoise on"),
+        blender!(
+            NoisyImage,
+            [NOISY_IMAGE],
+            "Data > Denoising Data and keep Render Properties > Sampling > Render > Denoise on"
+        ),
         blender!(Depth, ["Depth"], "Data > Z"),
         blender!(Position, [POSITION_AOV, "Position"], "Data > Position"),
         blender!(Normal, ["Normal"], "Data > Normal"),

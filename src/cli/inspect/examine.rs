@@ -70,6 +70,10 @@ pub struct LayerReport {
     /// The name of a motion pass that demc does not follow.
     pub motion: Option<String>,
     pub passes: Vec<PassReport>,
+    /// Its light groups, which `--passes` denoises.
+    pub light_groups: Vec<String>,
+    /// Why the picture is not judged, and findings are of single values alone.
+    pub unjudged: Option<String>,
     /// Channels that demc has no use for.
     pub unrecognised: Vec<String>,
     pub models: Vec<ModelReport>,
@@ -215,7 +219,7 @@ fn examine_layer(
 ) -> Result<(LayerReport, Option<Trace>)> {
     let mut trace = None;
     let mut passes = Vec::new();
-    let mut findings = Vec::new();
+    let (mut findings, mut unjudged) = (Vec::new(), None);
     let part_of = |pass: &Pass| &frame.parts()[layer.passes[pass].part];
     let (decodable, others): (Vec<Pass>, Vec<Pass>) =
         layer.passes.keys().partition(|pass| part_of(pass).undecodable().is_none());
@@ -241,6 +245,7 @@ fn examine_layer(
             });
         }
         findings = lint::frame(&set, &about(frame, layer, methods));
+        unjudged = lint::unjudged(&set).filter(|_| set.get(Pass::Combined).is_some());
     }
     passes.extend(others.into_iter().map(describe));
     let has_beauty = decodable.contains(&Pass::Combined);
@@ -260,11 +265,16 @@ fn examine_layer(
         motion: layer.motion.clone(),
         models: models.collect(),
         passes,
+        light_groups: layer.light_groups.keys().cloned().collect(),
+        unjudged,
         unrecognised: layer.unrecognised.clone(),
         findings,
     };
     Ok((report, trace))
 }
+
+/// Compressions that lose something of half floats.
+const LOSSY: [&str; 4] = ["b44", "b44a", "dwaa", "dwab"];
 
 /// What the file says of a view layer's passes.
 fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
@@ -282,6 +292,11 @@ fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
             let own = [at.name.clone(), format!("{}.{}", layer.name, at.name)];
             own.iter().any(|name| frame.is_own_layer(name))
         }),
+        lossy: layer
+            .passes
+            .get(&Pass::Combined)
+            .map(|at| frame.parts()[at.part].compression)
+            .filter(|kind| LOSSY.contains(kind)),
         colour_space: ["colorInteropID", "oiio:ColorSpace"]
             .iter()
             .find_map(|name| frame.text_attribute(name)),

@@ -65,6 +65,9 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
         let zero = if pass.all_zero == Some(true) { "  all zero" } else { "" };
         writeln!(out, "    {:<22}{:<7}{}{alias}{zero}", pass.pass, pass.kind, pass.compression)?;
     }
+    if !layer.light_groups.is_empty() {
+        writeln!(out, "    light groups: {}", layer.light_groups.join(", "))?;
+    }
     // Layers are listed, not channels: `ViewLayer.Mist`, not `ViewLayer.Mist.Z`.
     let mut others: Vec<&str> = layer
         .unrecognised
@@ -76,6 +79,9 @@ fn write_layer(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
         writeln!(out, "    kept, not read: {}", others.join(", "))?;
     }
     write_models(out, layer)?;
+    if let Some(why) = &layer.unjudged {
+        writeln!(out, "    {why}")?;
+    }
     write_findings(out, "    ", &layer.findings)
 }
 
