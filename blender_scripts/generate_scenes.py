@@ -48,7 +48,11 @@ from demc_scenes.kinds import KINDS
 _LEAST_SAMPLES = 16  # of a pixel in a denoised reference, however even it looks
 _LEAST_CLEAN = 512  # of a pixel in a clean one
 _CLEAN_RATIO = 8  # frames of more than one in so many of its samples, a denoised reference is too coarse for
-_LIT = re.compile(r"(Diffuse|Glossy|Transmission) (?:Direct|Indirect)\.([RGB])$")
+# Light that is stored divided by a colour, and that colour: as Blender 5 calls them, and as Blender 4 does.
+_LIT = (
+    (re.compile(r"(Diffuse|Glossy|Transmission) (?:Direct|Indirect)\.([RGB])$"), r"\1 Color.\2"),
+    (re.compile(r"(Diff|Gloss|Trans)(?:Dir|Ind)\.([RGB])$"), r"\1Col.\2"),
+)
 _DROPPED = (".Depth.Z", "DEMC Position.A")  # passes a network has no use for
 
 
@@ -109,6 +113,21 @@ def parse(arguments):
         default=0.0,
         metavar="F",
         help="share of crops with a pixel filter that is not Blender's default, half of them a box",
+    )
+    parser.add_argument(
+        "--blue-share",
+        type=cl.share,
+        default=0.0,
+        metavar="F",
+        help="share of crops whose noise is blue, as that of files made in Blender 4.4 and later: one noise seed each, "
+        "since mixtures of several would not be (default 0)",
+    )
+    parser.add_argument(
+        "--plain-share",
+        type=cl.share,
+        default=0.0,
+        metavar="F",
+        help="share of scenes whose crops are drawn evenly, walls and sky too, and not by how much they show (default 0)",
     )
     parser.add_argument(
         "--light-passes",
@@ -247,7 +266,11 @@ class Crop:
                     ("GAUSSIAN", 1.5),
                 )
             )
-        self.seeds, self.means = options.noisy_seeds, options.means and options.noisy_seeds > 1
+        self.blue = (
+            bpy.app.version >= (4, 3, 0) and random.Random(f"blue {name}").random() < options.blue_share
+        )
+        self.seeds = 1 if self.blue else options.noisy_seeds
+        self.means = options.means and self.seeds > 1
 
     def _counts(self, options):
         counts = options.spp
@@ -366,6 +389,8 @@ def render_crop(options, ledger, scene, region, crop, facts):
             is_moving = crop.middle is not None
             rendering.enable_passes(passes, layers, vector=is_moving, light=options.light_passes)
             store_position(passes, layers)
+            if crop.blue:
+                passes.set(scene.cycles, "sampling_pattern", "AUTOMATIC")  # as new files have it
             for file, spp, n, frame in crop.noisy():
                 noise = rendering.DEFAULT_NOISE if spp == rendering.DEFAULT_SAMPLES else 0.0
                 words = (crop.seed, crop.name, spp, n)
@@ -374,7 +399,8 @@ def render_crop(options, ledger, scene, region, crop, facts):
                     words += (frame,)
                 rendering.set_sampling(passes, scene, spp, rendering.mixed_seed(*words), noise)
                 seconds = render_compact(scene, os.path.join(options.out, file))
-                ledger.add(file=file, spp=spp, noise_seed=n, seconds=f"{seconds:.1f}", **facts)
+                pattern = "blue" if crop.blue else ""
+                ledger.add(file=file, spp=spp, noise_seed=n, seconds=f"{seconds:.1f}", pattern=pattern, **facts)
         for spp in crop.counts[0] if crop.means else []:
             write_mean(
                 options.out, crop.mean_of(spp), [file for file, count, *_ in crop.noisy() if count == spp]
@@ -435,8 +461,8 @@ def write_mean(folder, name, files):
 
     means = {c: mean(lambda frame, c=c: frame[c].astype("f4")) for c in frames[0]}
     for c in frames[0]:
-        colour = _LIT.sub(r"\1 Color.\2", c)
-        if colour != c and colour in means:
+        colour = next((lit.sub(name, c) for lit, name in _LIT if lit.search(c)), None)
+        if colour in means:
             lit = mean(lambda frame, c=c, colour=colour: frame[c].astype("f4") * frame[colour].astype("f4"))
             means[c] = lit / numpy.maximum(means[colour], 1e-6) * (means[colour] > 0)
     exr.write_half(os.path.join(folder, name), means)
@@ -449,8 +475,9 @@ def render_scene(options, library, records, ledger, seed, kind, scene_name):
     with Edits() as edits:
         making.set_up(edits, stage, options.threads, finished)
         try:
+            plain = random.Random(f"plain {scene_name}").random() < options.plain_share
             regions = making.look(
-                edits, stage, place_camera, options.crops, options.size, finished, options.sequence
+                edits, stage, place_camera, options.crops, options.size, finished, options.sequence, plain
             )
         except making.Unseen as reason:
             records.reject(scene_name, str(reason))

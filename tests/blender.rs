@@ -283,6 +283,33 @@ fn generates_the_same_pixels_for_the_same_seed() {
 }
 
 #[test]
+fn crops_may_be_drawn_evenly_and_have_blue_noise() {
+    let folder = tempfile::tempdir().unwrap();
+    let made = |name: &str, more: &str| {
+        let out = folder.path().join(name);
+        let arguments =
+            "--seeds 3:6 --kinds materials --size 40 --crops 2 --spp 2 --noisy-seeds 2 --ref-spp 4";
+        generate(&out, &format!("{arguments} {more}"));
+        let table = fs::read_to_string(out.join("views.csv")).unwrap();
+        let rows: Vec<Vec<String>> =
+            table.lines().skip(1).map(|line| line.split(',').map(str::to_owned).collect()).collect();
+        (out, rows)
+    };
+    let ((white, of_white), (blue, of_blue)) = (made("white", ""), made("blue", "--blue-share 1"));
+    assert_eq!((of_white.len(), of_blue.len()), (6 * 3, 6 * 2), "one seed of blue noise is enough");
+    for row in &of_blue {
+        let [white, blue] = [&white, &blue].map(|folder| fs::read(folder.join(&row[6])).unwrap());
+        let is_reference = row[8] == "reference";
+        assert_eq!(white == blue, is_reference, "{row:?}");
+        assert_eq!(row[12] == "blue", !is_reference, "{row:?}");
+    }
+    // Other places are looked at where crops need not show much.
+    let (_, of_plain) = made("plain", "--plain-share 1");
+    let places = |rows: &[Vec<String>]| -> Vec<String> { rows.iter().map(|row| row[4].clone()).collect() };
+    assert_ne!(places(&of_white), places(&of_plain));
+}
+
+#[test]
 fn renders_sequences_whose_vectors_lead_to_the_frames_around() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");

@@ -22,11 +22,13 @@ COLUMNS = (
     "seconds",
     "noise",
     "sha256",
+    "pattern",
 )
 
 
 class Ledger:
-    """The folder's table. `seconds` are those of all processors together, `noise` is a reference's own."""
+    """The folder's table. `seconds` are those of all processors together, `noise` is a reference's own, `pattern` that of
+    samples where it is not Cycles' classic one."""
 
     def __init__(self, folder):
         self.folder, self.path = folder, os.path.join(folder, NAME)

@@ -20,7 +20,7 @@ def build(library, seed, kind, blends):
     """Builds a scene; returns its stage and the function that places a camera."""
     rng = random.Random(f"scene {seed} {kind}")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    stage = Stage(rng, library)
+    stage = Stage(rng, library, random.Random(f"aside {seed} {kind}"))
     if kind in blends:
         return stage, open_blend(stage, blends[kind])
     stage.scene.render.engine = "CYCLES"
@@ -54,14 +54,17 @@ def set_up(edits, stage, threads=None, finished=False, size=None):
     scene.frame_set(1)
 
 
-def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
+def look(edits, stage, place_camera, crops, size, finished=False, frames=1, plain=False):
     """Places the camera where it sees enough and exposes the scene; returns the crops, X,Y,W,H each, or
     raises Unseen where three tries find none. Without a size the whole frame is the crop. Of several frames
-    it is the middle one that is looked at, and it stays the current one."""
+    it is the middle one that is looked at, and it stays the current one. Crops are the likelier the more they show,
+    or if they are to be `plain`, all as likely."""
     if frames > 1:
         stage.scene.frame_set(moving.middle(frames))
     reason = "no place for a camera"
     for _ in range(3):
+        if not finished:
+            views.undo_lens_effects(stage)  # of the camera before
         camera = place_camera()
         if camera is None:
             continue
@@ -75,7 +78,7 @@ def look(edits, stage, place_camera, crops, size, finished=False, frames=1):
         if reason:
             continue
         if size:
-            regions = views.crops(stage, guides, crops, size)
+            regions = views.crops(stage, guides, crops, size, plain)
         else:
             regions = [(0, 0, *rendering.frame_size(stage.scene))] if views.shows(stage, guides) else []
         if len(regions) == crops:

@@ -302,7 +302,9 @@ def decorate_walls(shell):
         width, height = rng.uniform(0.25, 1.3), rng.uniform(0.25, 0.9)
         along = rng.uniform(width / 2 + 0.1, shell.wall_length(wall) - width / 2 - 0.1)
         point = Vector(shell.wall_point(wall, along, 0.03))
-        if any((point - Vector((i.x, i.y, 0))).length < 1.3 for _, i, *_ in shell.windows):
+        # The middle of a window lies between where its light comes from and where it goes.
+        middles = [((outside + inside) / 2, w) for outside, inside, w, _ in shell.windows]
+        if any((point - Vector((m.x, m.y, 0))).length < (width + w) / 2 + 0.2 for m, w in middles):
             continue
         z = rng.uniform(1.2, 1.5)
         props.framed(stage, (point.x, point.y, z), width, height, shell.wall_turn(wall))

@@ -1,6 +1,7 @@
 """The scene being built: its random source, library, ground plan, and how things are put in it."""
 
 import math
+import random
 
 import bpy
 from mathutils import Matrix, Vector
@@ -12,8 +13,9 @@ from . import palette
 class Stage:
     """An empty Cycles scene and the means to fill it."""
 
-    def __init__(self, rng, library):
+    def __init__(self, rng, library, aside=None):
         self.rng, self.library = rng, library
+        self.aside = aside or random.Random("aside")  # for draws that came later, and leave others as they were
         self.scene = bpy.context.scene
         self.taken = []  # occupied rectangles of the ground plan: (x0, y0, x1, y1)
         self.tops = []  # objects with a surface to put things on
@@ -175,7 +177,8 @@ def environment(stage, words, strength, without=()):
     background.inputs["Strength"].default_value = strength
     tree.links.new(background.outputs[0], output.inputs["Surface"])
     found = stage.library.environments_like(*words, without=without)
-    if not found:
+    # Where it is not to be night, now and then a sky that is computed, with its sun.
+    if not found or "night" in without and stage.aside.random() < 0.2:
         _sky(rng, tree, background, strength)
         return world
     texture = tree.nodes.new("ShaderNodeTexEnvironment")

@@ -65,6 +65,15 @@ def around_camera(stage, center, radius, height, lens=(28, 70), spread=0.25):
     return None
 
 
+def undo_lens_effects(stage):
+    """Takes back what `lens_effects` did for a camera that was refused."""
+    camera = stage.scene.camera
+    if camera:
+        camera.animation_data_clear()
+        camera.data.dof.use_dof = False
+    stage.scene.render.use_motion_blur = False
+
+
 def lens_effects(stage, camera, blurs=True):
     """Depth of field on what the middle of the view shows, and motion blur now and then where it `blurs`."""
     rng, scene = stage.rng, stage.scene
@@ -81,10 +90,12 @@ def lens_effects(stage, camera, blurs=True):
         scene.render.use_motion_blur = True
         scene.render.motion_blur_shutter = rng.uniform(0.2, 0.8)
         movers = [o for o in scene.objects if o.type == "MESH" and 0.02 < max(o.dimensions) < 5]
-        for obj in rng.sample(movers, min(len(movers), 4)):
-            move(rng, obj, max(obj.dimensions) * 0.12)
-        if rng.random() < 0.4:
-            move(rng, camera, 0.02)
+        movers.sort(key=lambda obj: off_axis(camera, obj))  # what stands in the middle of the view
+        for obj in rng.sample(movers[:12], min(len(movers), 4)):
+            move(rng, obj, max(obj.dimensions) * 0.12, rng.gauss(0, 0.15))
+        if rng.random() < 0.5:
+            # A pan of a fifth of a degree to three degrees a frame.
+            move(rng, camera, 0.02, math.radians(0.2 * 15 ** rng.random()) * rng.choice((-0.5, 0.5)))
 
 
 def all_around(stage, camera):
@@ -97,14 +108,22 @@ def all_around(stage, camera):
     return camera
 
 
-def move(rng, obj, distance):
-    """Two keys around frame 1: a straight shift and a turn."""
-    start = obj.location.copy()
+def off_axis(camera, obj):
+    """How far from the middle of the view an object is, as the sine of an angle; more behind the camera."""
+    toward = (obj.matrix_world.translation - camera.location).normalized()
+    ahead = camera.rotation_euler.to_quaternion() @ Vector((0, 0, -1))
+    return toward.cross(ahead).length if toward.dot(ahead) > 0 else 2.0
+
+
+def move(rng, obj, distance, turn):
+    """Two keys around frame 1: a straight shift, and a turn about the upright axis, in radians."""
+    place, angle = obj.location.copy(), obj.rotation_euler.z
     shift = Vector([rng.gauss(0, distance) for _ in range(3)])
     for frame, side in ((0, -1), (2, 1)):
-        obj.location = start + shift * side
+        obj.location, obj.rotation_euler.z = place + shift * side, angle + turn * side
         obj.keyframe_insert("location", frame=frame)
-    obj.location = start
+        obj.keyframe_insert("rotation_euler", frame=frame)
+    obj.location, obj.rotation_euler.z = place, angle
 
 
 def probe(scene, spp=4):
@@ -183,9 +202,9 @@ def shows(stage, guides):
     return covered > stage.least_covered / 2 and busy(albedo, normal) > _LEAST_BUSY / 3
 
 
-def crops(stage, guides, count, size):
+def crops(stage, guides, count, size, plain=False):
     """Up to `count` regions X,Y,W,H of the frame, the likelier the more they show. Crops with too
-    little detail, or darkness alone, are not offered."""
+    little detail, or darkness alone, are not offered. `plain` ones are all as likely, but for darkness."""
     rng, scene = stage.rng, stage.scene
     image, albedo, normal = guides
     width, height = rendering.frame_size(scene)
@@ -199,15 +218,16 @@ def crops(stage, guides, count, size):
         covered = (np.abs(normal[part]).max(-1) > 0.1).mean()
         if (
             light.mean() < _DARK_SHARE * frame_level
-            or covered < stage.least_covered
+            or not plain
+            and covered < stage.least_covered
             or not stage.dark
             and starved(image[part], normal[part]) > _STARVED + 0.1
         ):
             continue
         level = np.log1p(np.minimum(light / frame_level, 50))
         detail = albedo[part].std((0, 1)).mean() + 0.5 * normal[part].std((0, 1)).mean() + 0.2 * min(float(level.std()), 1.0)
-        shows = busy(albedo[part], normal[part])
-        if detail > _LEAST_DETAIL and shows > _LEAST_BUSY:
+        shows = 1.0 if plain else busy(albedo[part], normal[part])
+        if plain or detail > _LEAST_DETAIL and shows > _LEAST_BUSY:
             found.append((shows, (x, y, *size)))
     chosen = []
     while found and len(chosen) < count:
