@@ -70,7 +70,7 @@ fn single_values(
     let is_well = |v: f32| v.is_finite() || (may_be_infinite && v == f32::INFINITY);
     let is_over = |v: f32| v.is_infinite() || v.abs() == HALF_MAX;
     let can_overflow = about.half.contains(&pass) && pass.carries_radiance();
-    let bad = count(&|v| !is_well(v) && !(can_overflow && is_over(v)));
+    let bad = count(&|v| !(is_well(v) || can_overflow && is_over(v)));
     let of = planes.data.len();
     if bad > 0 {
         findings.push(Finding::new(
