@@ -488,13 +488,16 @@ fn inspect_prints_findings_with_their_remedies_and_as_json() {
         .success()
         .stdout(contains("warning (blur-in-beauty-alone): the beauty is blurred along rows"))
         .stdout(contains("turn off Render Properties > Motion Blur"))
-        .stdout(contains("warning (shared-noise): ").and(contains("warning (missing-vectors): ")));
+        .stdout(contains("warning (shared-noise): ").and(contains("note (missing-vectors): ")));
     let output = inspect().arg("--json").assert().success().get_output().stdout.clone();
     let reports: Vec<serde_json::Value> =
         String::from_utf8(output).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let finding = &reports[0]["layers"][0]["findings"][0];
     assert_eq!(finding["code"], "blur-in-beauty-alone");
     assert!(finding["message"].is_string() && finding["remedy"].is_string(), "{finding}");
+    assert_eq!(finding["harms"], true);
+    let of_shot = &reports[1]["findings"];
+    assert_eq!((&of_shot[0]["harms"], &of_shot[1]["harms"]), (&true.into(), &false.into()));
     let of_shot: Vec<&str> =
         reports[1]["findings"].as_array().unwrap().iter().map(|f| f["code"].as_str().unwrap()).collect();
     assert_eq!(of_shot, ["shared-noise", "missing-vectors"]);

@@ -30,6 +30,9 @@ const PIXELS: usize = 500;
 /// have a correlation of some thousandths.
 const SHARED: f64 = 0.2;
 
+/// The same where nothing moves: what noise does not hide of the light is then the same in both, and with one seed all is.
+const SHARED_AT_REST: f64 = 0.9;
+
 impl Grain {
     /// The grain of a view layer's passes; none without Combined or without any guide to tell texture by.
     pub fn of(set: &PassSet) -> Option<Self> {
@@ -84,9 +87,10 @@ impl Grain {
     }
 
     /// The warning for a frame that shares its noise with `other`, the grain of the frame before it, whose
-    /// name is `before`.
-    pub fn warning(&self, other: &Self, before: &str) -> Option<Finding> {
-        let shared = self.shared(other).filter(|shared| *shared > SHARED)?;
+    /// name is `before`; `is_still` if nothing moves between them.
+    pub fn warning(&self, other: &Self, before: &str, is_still: bool) -> Option<Finding> {
+        let most = if is_still { SHARED_AT_REST } else { SHARED };
+        let shared = self.shared(other).filter(|shared| *shared > most)?;
         Some(Finding::new(
             "shared-noise",
             format!(
@@ -116,9 +120,23 @@ mod tests {
 
     #[test]
     fn noise_that_sticks_to_the_screen_is_found() {
-        let warning = grain(1, 1.0).warning(&grain(1, 0.8), "shot.0001.exr").unwrap();
+        let warning = grain(1, 1.0).warning(&grain(1, 0.8), "shot.0001.exr", false).unwrap();
         assert!(warning.message.contains("shot.0001.exr") && warning.remedy.contains("Seed"), "{warning:?}");
-        assert_eq!(grain(1, 1.0).warning(&grain(2, 1.0), "shot.0001.exr"), None);
-        assert_eq!(grain(1, 0.01).warning(&grain(1, 0.01), "shot.0001.exr"), None, "too little to tell");
+        assert_eq!(grain(1, 1.0).warning(&grain(2, 1.0), "shot.0001.exr", false), None);
+        assert_eq!(
+            grain(1, 0.01).warning(&grain(1, 0.01), "shot.0001.exr", false),
+            None,
+            "too little to tell"
+        );
+        // What is half the same is light, where nothing moves.
+        let mixed = |seed: u64| {
+            let (mut own, light) = (grain(seed, 1.0), grain(9, 1.0));
+            own.values.iter_mut().zip(light.values).for_each(|(v, light)| *v = 0.5 * (*v + light));
+            own
+        };
+        for (is_still, is_warned) in [(true, false), (false, true)] {
+            assert_eq!(mixed(1).warning(&mixed(2), "shot.0001.exr", is_still).is_some(), is_warned);
+        }
+        assert!(mixed(1).warning(&mixed(1), "shot.0001.exr", true).is_some());
     }
 }

@@ -34,12 +34,19 @@ pub struct Finding {
     pub message: String,
     /// What mends it; empty where nothing needs to be done.
     pub remedy: String,
+    /// Whether it makes results of the built-in models worse; if not, it is good to know.
+    pub harms: bool,
 }
 
 impl Finding {
-    /// A finding of that kind.
+    /// A finding of that kind that harms.
     pub fn new(code: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { code, message: message.into(), remedy: remedy.into() }
+        Self { code, message: message.into(), remedy: remedy.into(), harms: true }
+    }
+
+    /// One that does not.
+    pub fn harmless(code: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { harms: false, ..Self::new(code, message, remedy) }
     }
 }
 
@@ -113,7 +120,7 @@ fn missing(renderer: &Renderer, about: &About, findings: &mut Vec<Finding>) {
 
 fn denoised_by_blender(set: &PassSet, findings: &mut Vec<Finding>) {
     if set.get(Pass::NoisyImage).is_some() {
-        findings.push(Finding::new(
+        findings.push(Finding::harmless(
             "already-denoised",
             "Combined was already denoised by Blender; demc uses the Noisy Image pass instead",
             "turn off Render Properties > Sampling > Render > Denoise to save the time",
@@ -123,7 +130,7 @@ fn denoised_by_blender(set: &PassSet, findings: &mut Vec<Finding>) {
 
 fn position(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
     if set.renderer.is_blender() && set.get(Pass::Position).is_some() && !about.position_averaged {
-        findings.push(Finding::new(
+        findings.push(Finding::harmless(
             "aliased-position",
             "Position is Cycles' own pass, one sample a pixel: aliased, and wrong under depth of field and motion blur \
              (models that read no Position, as the built-in ones, are as good)",

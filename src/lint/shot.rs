@@ -52,8 +52,12 @@ impl Trace {
     /// The findings in a frame that follows `before`, whose file is called `name`.
     pub fn after(&self, before: &Self, name: &str) -> Vec<Finding> {
         let mut findings = Vec::new();
+        let is_still = self.moving.is_some_and(|moving| moving <= MOVING);
         findings.extend(
-            self.grain.as_ref().zip(before.grain.as_ref()).and_then(|(own, other)| own.warning(other, name)),
+            self.grain
+                .as_ref()
+                .zip(before.grain.as_ref())
+                .and_then(|(own, other)| own.warning(other, name, is_still)),
         );
         for (pass, hash) in &self.guides {
             if self.moving.is_some_and(|moving| moving > MOVING) && before.guides.contains(&(*pass, *hash)) {
@@ -77,7 +81,7 @@ impl Trace {
             ));
         }
         if self.is_blender && self.moving.is_none() && !self.guides.is_empty() {
-            findings.push(Finding::new(
+            findings.push(Finding::harmless(
                 "missing-vectors",
                 "Vector is missing, which `demc denoise --temporal` follows from frame to frame",
                 format!("{}, and turn off Render Properties > Motion Blur", BLENDER.setting(Pass::Vector)),

@@ -244,10 +244,14 @@ pub fn run(args: Args) -> Result<ExitCode> {
     let batch = batch.at_once(args.jobs.into());
     let stopper = batch.stopper();
     stop::on_request(move || stopper.stop())?;
+    // Files that a watch has met, where it is to be asked which frames have not come.
+    let watched = args.frames.as_ref().filter(|_| args.watch.is_some());
     let mut came = Vec::new();
     let end = batch.run(|job, outcome| {
         progress.report(job, outcome);
-        came.push(denoise::Input { file: job.input.clone(), below: PathBuf::new() });
+        if watched.is_some() {
+            came.push(denoise::Input { file: job.input.clone(), below: PathBuf::new() });
+        }
         if let Some(ranking) = &mut ranking {
             rank(ranking, job, outcome);
         }
@@ -256,7 +260,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
     if let Some(ranking) = ranking {
         ranking.print();
     }
-    if let (Some(frames), true, End::Complete) = (&args.frames, args.watch.is_some(), end) {
+    if let (Some(frames), End::Complete) = (watched, end) {
         if let Some(note) = frames.lacking(&came).filter(|_| !args.quiet) {
             warn_line(&format!("demc: note: {note}"));
         }

@@ -191,7 +191,7 @@ fn windows(frame: &Frame) -> Vec<Finding> {
             at(w),
             at(display)
         );
-        Finding::new("data-window", message, "")
+        Finding::harmless("data-window", message, "")
     };
     differing.into_iter().map(warn).collect()
 }
@@ -206,7 +206,9 @@ fn undecodable(frame: &Frame) -> Vec<Finding> {
         };
         let what = part.name.as_ref().map_or("the file".into(), |name| format!("part '{name}'"));
         let why = if part.deep { "is deep: it is kept as it is, and not denoised".into() } else { why };
-        findings.push(Finding::new("undecodable", format!("{what} {why}"), ""));
+        let message = format!("{what} {why}");
+        let told = if part.deep { Finding::harmless } else { Finding::new };
+        findings.push(told("undecodable", message, ""));
     }
     findings
 }

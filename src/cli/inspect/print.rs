@@ -114,9 +114,10 @@ fn write_models(out: &mut String, layer: &LayerReport) -> std::fmt::Result {
 }
 
 fn write_findings(out: &mut String, indent: &str, findings: &[Finding]) -> std::fmt::Result {
-    findings.iter().try_for_each(|Finding { code, message, remedy }| {
+    findings.iter().try_for_each(|Finding { code, message, remedy, harms }| {
+        let kind = if *harms { "warning" } else { "note" };
         let remedy = if remedy.is_empty() { String::new() } else { format!("; {remedy}") };
-        writeln!(out, "{indent}warning ({code}): {message}{remedy}")
+        writeln!(out, "{indent}{kind} ({code}): {message}{remedy}")
     })
 }
 
