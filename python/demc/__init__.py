@@ -70,6 +70,13 @@ def _path(name, path):
         raise ValueError(f"{name} is a {type(path).__name__}; give a path or a name as text") from None
 
 
+def _name(what, name):
+    """The name of a layer, or None."""
+    if not isinstance(name, str | None):
+        raise ValueError(f"{what} is a {type(name).__name__}; give its name, or None")
+    return name
+
+
 def _lines(names):
     """What `names` says, as `demc denoise --map` takes it."""
     if not isinstance(names or {}, dict):
@@ -151,9 +158,7 @@ def denoise_file(
     source, out, model = _path("source", source), _path("out", out), _path("model", model)
     guides = tuple(None if path is None else _path(name, path) for name, path in (("albedo", albedo), ("normal", normal)))
     lines = _lines(names)
-    for name, text in (("view_layer", view_layer), ("layer", layer)):
-        if not isinstance(text, str | None):
-            raise ValueError(f"{name} is a {type(text).__name__}; give its name, or None")
+    view_layer, layer = _name("view_layer", view_layer), _name("layer", layer)
     if not isinstance(alpha, str):
         raise ValueError(f'alpha is a {type(alpha).__name__}; give "auto", "denoise" or "keep"')
     if os.path.exists(out):
@@ -196,8 +201,5 @@ def compare(image, reference, *, view_layer=None, layer=None, reference_layer=No
     Error: a file cannot be read or lacks a layer, or the images differ in size or place or hold values that are not
     finite.
     """
-    layers = {"view_layer": view_layer, "layer": layer, "reference_layer": reference_layer}
-    for name, text in layers.items():
-        if not isinstance(text, str | None):
-            raise ValueError(f"{name} is a {type(text).__name__}; give its name, or None")
-    return dict(_demc.compare_files(_path("image", image), _path("reference", reference), list(layers.values())))
+    layers = [_name("view_layer", view_layer), _name("layer", layer), _name("reference_layer", reference_layer)]
+    return dict(_demc.compare_files(_path("image", image), _path("reference", reference), layers))

@@ -97,10 +97,8 @@ impl Options {
             Some(format!("{}/{}{variant}", name(place.parent()?), name(&place)))
         });
         let mut said = vec![format!("--model {}", weights.as_deref().unwrap_or(model.name()))];
-        let alpha = Alpha::ALL.into_iter().find(|(_, how)| *how == self.alpha && *how != Alpha::Auto);
-        said.extend(alpha.map(|(name, _)| format!("--alpha {name}")));
-        let wrap = Wrap::ALL.into_iter().find(|(_, how)| *how == self.wrap && *how != Wrap::Auto);
-        said.extend(wrap.map(|(name, _)| format!("--wrap {name}")));
+        said.extend(option("--alpha", Alpha::ALL, self.alpha));
+        said.extend(option("--wrap", Wrap::ALL, self.wrap));
         said.extend(self.temporal.map(|reach| format!("--temporal {reach}")));
         let Sources { mapping, albedo, normal } = &self.sources;
         said.extend(mapping.iter().map(|(pass, name)| format!("--map '{pass}={name}'")));
@@ -109,6 +107,11 @@ impl Options {
         }
         said.join(" ")
     }
+}
+
+/// How a choice among `all` is said on the command line; the first goes without saying.
+fn option<T: Copy + PartialEq>(name: &str, all: [(&str, T); 3], chosen: T) -> Option<String> {
+    all.into_iter().skip(1).find(|(_, how)| *how == chosen).map(|(how, _)| format!("{name} {how}"))
 }
 
 /// Whether a name can be a layer's: it must make channel names that read back as this layer and no other.
@@ -286,11 +289,7 @@ fn refuse_stale(frame: &Frame, layer: &Layer, options: &Options) -> Result<()> {
     if options.passes {
         return Ok(());
     }
-    let name = |at: &PassChannels| match &options.layer {
-        Some(added) => added_name(layer, &at.name, added),
-        None => layer_name(&layer.name, &at.name),
-    };
-    let mut names = denoised_lights(layer).into_iter().map(name);
+    let mut names = denoised_lights(layer).into_iter().map(|at| result_name(layer, at, options));
     let Some(name) = names.find(|name| frame.is_own_layer(name)) else { return Ok(()) };
     let why = format!(
         "holds '{name}', which belongs to the result that would be replaced; say --passes, or --layer NAME for one beside it"
@@ -415,7 +414,10 @@ pub fn denoise(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> 
 fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) -> Result<Views<Denoised>> {
     loaded.each(|frame, layer, mut shot, report| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let (radiance, error) = run(&shot, &mut along.companions, true, (model, options.tile), report)?;
+        report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
+        let start = Instant::now();
+        let (radiance, error) = run(&shot, &mut along.companions, true, (model, options.tile))?;
+        report.seconds += start.elapsed().as_secs_f64();
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
         // What was read is not needed any more, so its memory is freed.
         drop(shot);
@@ -445,7 +447,7 @@ pub fn shot(mut shot: Shot, model: &dyn Denoiser, options: &Options) -> Result<(
     let mut report = Report::default();
     rayon::scope(|_| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
-        let (radiance, _) = run(&shot, &mut along.companions, false, (model, options.tile), &mut report)?;
+        let (radiance, _) = run(&shot, &mut along.companions, false, (model, options.tile))?;
         let radiance = finite(radiance, model.name(), &shot.passes.path, &mut report)?;
         Ok((radiance, along.alpha().or(shot.passes.remove(Pass::Alpha))))
     })
@@ -476,8 +478,8 @@ impl<T> Views<T> {
     }
 }
 
-/// Runs the model over a view, measures its time and adds its notes to the report. Companions are denoised in place; if
-/// the caller `expects` it, how far off the result is expected to be is returned.
+/// Runs the model over a view. Companions are denoised in place; if the caller `expects` it, how far off the result is
+/// expected to be is returned.
 ///
 /// # Errors
 /// The model cannot denoise it.
@@ -486,15 +488,11 @@ pub(super) fn run(
     companions: &mut [Companion],
     expects: bool,
     (model, tile): (&dyn Denoiser, Option<usize>),
-    report: &mut Report,
 ) -> Result<(Planes, Option<ExpectedError>)> {
     let denoise =
         |shot: &Shot, companions: &mut [Companion]| model.denoise_along(shot, companions, tile, expects);
-    report.notes.extend(model.notes(shot).filter(|note| !report.notes.contains(note)));
-    let start = Instant::now();
     let (radiance, error) =
         if shot.wraps { wrap::joined(shot, companions, denoise)? } else { denoise(shot, companions)? };
-    report.seconds += start.elapsed().as_secs_f64();
     let size = (shot.passes.width, shot.passes.height);
     if (radiance.channels, (radiance.width, radiance.height)) != (3, size) {
         return Err(Error::invalid(
@@ -677,6 +675,14 @@ fn added_name(layer: &Layer, pass: &str, added: &str) -> String {
     }
 }
 
+/// The full name of the layer that holds what becomes of a light pass: one that is added, or the pass itself.
+fn result_name(layer: &Layer, at: &PassChannels, options: &Options) -> String {
+    match &options.layer {
+        Some(added) => added_name(layer, &at.name, added),
+        None => layer_name(&layer.name, &at.name),
+    }
+}
+
 /// The mean over stereo views of what each has, if all have it.
 fn mean(of_views: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     let values: Vec<f64> = of_views.collect::<Option<_>>()?;
@@ -774,10 +780,7 @@ impl Existing {
         if views.is_empty() || !headers.is_own_layer(&full_name) {
             return lacks(&format!("'{full_name}'"));
         }
-        let is_own = |at: &PassChannels| match &options.layer {
-            Some(added) => headers.is_own_layer(&added_name(layer, &at.name, added)),
-            None => headers.is_own_layer(&layer_name(chosen, &at.name)),
-        };
+        let is_own = |at: &PassChannels| headers.is_own_layer(&result_name(layer, at, options));
         let lights = denoised_lights(layer);
         if options.passes && !lights.is_empty() && !lights.into_iter().any(is_own) {
             return lacks("denoised light passes");

@@ -390,8 +390,7 @@ impl<'a> Window<'a> {
             own.shot()
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number));
-        // What there is to say of it is said where it is a frame's own.
-        let (image, _) = run(&shot, &mut [], false, (model, tile), &mut Report::default())?;
+        let (image, _) = run(&shot, &mut [], false, (model, tile))?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
         (moment.result, moment.lacked) = (Some(image), lacked);

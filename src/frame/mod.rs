@@ -128,7 +128,7 @@ pub enum SampleKind {
 }
 
 /// A pixel rectangle; the origin may be negative.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Window {
     /// Left edge.
     pub x: i32,

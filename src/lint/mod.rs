@@ -76,7 +76,7 @@ pub fn frame(set: &PassSet, about: &About) -> Vec<Finding> {
     denoised_by_blender(set, &mut findings);
     position(set, about, &mut findings);
     values::check(set, about, &mut findings);
-    if set.width < LEAST_SIZE || set.height < LEAST_SIZE {
+    if unjudged(set).is_some() {
         return findings;
     }
     let Some(render) = render(set) else { return findings };

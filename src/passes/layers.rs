@@ -378,12 +378,9 @@ pub fn choose_like<'a>(
 
 /// The view layers of a file, as a sentence part.
 fn listed(layers: &[Layer]) -> String {
-    let mut names: Vec<String> = Vec::new();
-    for name in layers.iter().map(|l| format!("'{}'", l.name)) {
-        if !names.contains(&name) {
-            names.push(name); // stereo views repeat them
-        }
-    }
+    let mut told = HashSet::new(); // stereo views repeat them
+    let names = layers.iter().filter(|l| told.insert(&l.name));
+    let names: Vec<String> = names.map(|l| format!("'{}'", l.name)).collect();
     match &names[..] {
         [name] if name == "''" => "it has no view layers: save as OpenEXR MultiLayer".into(),
         _ => format!("its view layers: {}", names.join(", ")),

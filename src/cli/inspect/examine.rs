@@ -178,12 +178,9 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
 
 fn windows(frame: &Frame) -> Vec<Finding> {
     let display = frame.display_window();
-    let mut differing: Vec<Window> = Vec::new();
-    for window in frame.parts().iter().map(|p| p.data_window).filter(|w| *w != display) {
-        if !differing.contains(&window) {
-            differing.push(window);
-        }
-    }
+    let mut told = HashSet::new();
+    let windows = frame.parts().iter().map(|p| p.data_window);
+    let differing = windows.filter(|w| *w != display && told.insert(*w));
     let at = |w: Window| format!("{}x{} at {},{}", w.width, w.height, w.x, w.y);
     let warn = |w: Window| {
         let message = format!(
@@ -193,7 +190,7 @@ fn windows(frame: &Frame) -> Vec<Finding> {
         );
         Finding::harmless("data-window", message, "")
     };
-    differing.into_iter().map(warn).collect()
+    differing.map(warn).collect()
 }
 
 /// Findings on parts that are listed but cannot be denoised, each kind once.
