@@ -12,16 +12,17 @@ import zipfile
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "blender_extension/demc"
-# By what a wheel's name ends in, what Blender calls the system.
+# By a pattern of what a wheel's name ends in, what Blender calls the system.
 PLATFORMS = {
-    "manylinux": "linux-x64", "win_amd64": "windows-x64", "macosx_11_0_arm64": "macos-arm64", "macosx_10_12_x86_64": "macos-x64",
+    r"manylinux.*_x86_64": "linux-x64", "win_amd64": "windows-x64", "macosx_11_0_arm64": "macos-arm64",
+    "macosx_10_12_x86_64": "macos-x64",
 }
 
 
 def platform(wheel):
     """What Blender calls the system of a wheel."""
     for ending, name in PLATFORMS.items():
-        if ending in wheel.name:
+        if re.search(ending, wheel.name):
             return name
     sys.exit(f"{wheel.name}: Blender has no name for its system; known are {', '.join(PLATFORMS)}")
 

@@ -141,27 +141,44 @@ impl Shot {
     /// Reads the half buffers that lie beside the frame's file, if there are any.
     ///
     /// # Errors
-    /// A half buffer is unusable, of a stereo frame, or not of this frame's size.
+    /// A half buffer is unusable, of a stereo frame, or not of the pixels of this frame.
     pub fn read_halves(&mut self) -> Result<()> {
         let Some(paths) = half_paths(&self.passes.path) else { return Ok(()) };
         let [a, b] = paths.each_ref().map(|path| self.read_half(path));
-        self.halves = Some([a?, b?]);
+        let halves = [a?, b?];
+        for (pass, count) in halves.iter().flat_map(|half| &half.repaired) {
+            *self.repaired.entry(*pass).or_default() += count;
+        }
+        self.halves = Some(halves.map(|half| half.passes));
         Ok(())
     }
 
-    fn read_half(&self, path: &Path) -> Result<PassSet> {
+    /// Refuses a render of which most was filled in, and is no picture.
+    ///
+    /// # Errors
+    /// More than half of the values of Combined were not finite.
+    pub fn refuse_broken(&self) -> Result<()> {
+        let values = 3 * self.passes.width * self.passes.height;
+        match self.repaired.get(&Pass::Combined) {
+            Some(count) if *count > values / 2 => {
+                let why = format!(
+                    "{count} of the {values} values of Combined are NaN or infinite; render the frame again"
+                );
+                Err(Error::invalid(&self.passes.path, why))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn read_half(&self, path: &Path) -> Result<Self> {
         let whole = &self.passes;
         let frame = Frame::read(path)?;
         if frame.views().len() > 1 {
             return Err(Error::invalid(path, "half buffers of stereo frames are not read; move them away"));
         }
-        let half = Self::new(passes::read(&frame, Some(&whole.view_layer))?).passes;
-        if (half.width, half.height) != (whole.width, whole.height) {
-            return Err(Error::invalid(
-                path,
-                format!("is not of the size of {}; render both alike, or move it away", whole.path.display()),
-            ));
-        }
+        let half = Self::new(passes::read(&frame, Some(&whole.view_layer))?);
+        half.refuse_broken()?;
+        half.passes.check_same_pixels(whole, "its frame")?;
         Ok(half)
     }
 }
@@ -200,22 +217,32 @@ mod tests {
         shot.read_halves().unwrap();
         assert!(shot.halves.is_none());
         // The halves of a render are told apart by their Combined.
-        for (name, value) in [("shot_0004spp_a.0017.exr", 1.0), ("shot_0004spp_b.0017.exr", f32::NAN)] {
+        let write = |name: &str, values: &[f32]| {
             let mut frame = Frame::read(room()).unwrap();
-            let values = vec![value; 128 * 128];
-            let channel = |component| NewChannel { component, kind: SampleKind::Float, values: &values };
+            let channel = |component| NewChannel { component, kind: SampleKind::Float, values };
             let channels = ["R", "G", "B"].map(channel);
             frame.set_layer(0, "ViewLayer.Noisy Image", None, &channels).unwrap();
             frame.write(path(name)).unwrap();
-        }
+        };
+        let mut light = vec![1.0; 128 * 128];
+        write("shot_0004spp_a.0017.exr", &light);
+        light[0] = f32::NAN;
+        write("shot_0004spp_b.0017.exr", &light);
         shot.read_halves().unwrap();
+        assert_eq!(shot.repaired, BTreeMap::from([(Pass::Combined, 3)]));
         let halves = shot.halves.as_ref().expect("both are there");
         let values = halves.each_ref().map(|half| half.get(Pass::Combined).unwrap().data[0]);
-        assert_eq!(values, [1.0, 0.0]);
-        // Half buffers of another frame's size are an error.
+        assert_eq!(values, [1.0, 1.0]);
+        // What is no picture, or one of other pixels, is an error.
+        write("shot_0004spp_b.0017.exr", &[f32::NAN; 128 * 128]);
+        let message = shot.read_halves().unwrap_err().to_string();
+        assert!(message.contains("shot_0004spp_b.0017.exr") && message.contains("NaN"), "{message}");
         let other = room().with_file_name("no_harm/principled_0064spp.exr");
         std::fs::copy(other, path("shot_0004spp_b.0017.exr")).unwrap();
         let message = shot.read_halves().unwrap_err().to_string();
-        assert!(message.contains("shot_0004spp_b.0017.exr") && message.contains("size"), "{message}");
+        assert!(
+            message.contains("shot_0004spp_b.0017.exr") && message.contains("one size and region"),
+            "{message}"
+        );
     }
 }

@@ -157,6 +157,13 @@ fn guides_may_be_missing() {
     let job = Job::new(&blank);
     job.command().assert().success().stderr(contains("Denoising Normal, which hold nothing, at a loss"));
     assert_eq!(job.denoised(), image, "blank guides are as good as none");
+    let mut blank = all.clone();
+    blank.insert(Pass::DenoisingAlbedo, Planes::new(3, all.width, all.height));
+    Job::new(&blank)
+        .command()
+        .assert()
+        .success()
+        .stderr(contains("done without Denoising Albedo, which holds nothing"));
     for (pass, kept) in [(Pass::DenoisingAlbedo, "Normal"), (Pass::DenoisingNormal, "Albedo")] {
         let (image, said) = without(&[pass]);
         assert!(said.contains(&format!("done without {pass},")), "{said}");

@@ -11,6 +11,7 @@ use std::{
 
 use assert_cmd::Command;
 use common::files::{bits, data, read_exr, samples, values, write_bare_parts, write_render};
+use demc::frame::{Frame, NewChannel, SampleKind};
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
 
@@ -124,6 +125,18 @@ fn chooses_among_view_layers() {
         .success()
         .stderr(contains("denoised view layer 'Second.Layer'; --view-layer chooses another: 'ViewLayer'"));
     assert!(samples(&read_exr(out.join(file)), "Second.Layer.Denoised.R").is_some());
+
+    // What the compositor made is no view layer.
+    let dir = tempfile::tempdir().unwrap();
+    let composed = dir.path().join("composed.exr");
+    let mut frame = Frame::read(data("blender5.exr")).unwrap();
+    let window = frame.parts()[0].data_window;
+    let values = vec![0.5; window.width * window.height];
+    let kind = SampleKind::Half;
+    let channels = ["R", "G", "B"].map(|component| NewChannel { component, kind, values: &values });
+    frame.set_layer(0, "Composite.Combined", None, &channels).unwrap();
+    frame.write(&composed).unwrap();
+    demc(&out).arg(&composed).assert().success().stderr("");
 
     let overwrite = ["--overwrite", "--view-layer", "ViewLayer"];
     demc(&out).arg(data(file)).args(overwrite).assert().success().stderr("");

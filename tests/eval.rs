@@ -31,6 +31,33 @@ fn oidn() -> String {
 }
 
 #[test]
+fn a_folder_in_which_another_run_works_is_left_alone() {
+    let out = tempfile::tempdir().unwrap();
+    fs::write(out.path().join("scores.csv"), "what the other run wrote").unwrap();
+    let other = demc::frame::alone_in(out.path()).unwrap();
+    eval(&data("*room*"), out.path(), &["--models", "demc-s"])
+        .failure()
+        .stderr(predicate::str::contains("another run of demc works in this folder"));
+    assert_eq!(fs::read_to_string(out.path().join("scores.csv")).unwrap(), "what the other run wrote");
+    drop(other);
+    fs::remove_file(out.path().join("scores.csv")).unwrap();
+    eval(&data("*room_0004spp.exr"), out.path(), &["--models", "demc-s", "--no-sheets"]).success();
+}
+
+#[test]
+fn a_scene_with_a_very_long_name_gets_its_sheet() {
+    let (set, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    write_render(&set.path().join("n.exr"), 16, 16, |_, i| i as f32 / 256.0);
+    write_render(&set.path().join("r.exr"), 16, 16, |_, i| i as f32 / 300.0);
+    let name = "é".repeat(150);
+    let rows = format!("{name}a,n.exr,r.exr,4\n{name}b,r.exr,n.exr,4\n");
+    let manifest = set.path().join("set.csv");
+    fs::write(&manifest, format!("scene,noisy,reference,spp\n{rows}")).unwrap();
+    eval(&manifest, out.path(), &["--models", "demc-s"]).success();
+    assert_eq!(fs::read_dir(out.path().join("sheets")).unwrap().count(), 2);
+}
+
+#[test]
 fn writes_tables_charts_and_sheets_for_methods_and_the_noisy_input() {
     let out = tempfile::tempdir().unwrap();
     eval(&data(""), out.path(), &["--models", "oidn-fast,oidn-high-prefilter", "--oidn", &oidn()])

@@ -167,6 +167,13 @@ fn a_file_of_two_scenes_says_which_is_rendered() {
         assert_eq!(size(&shot.passes("shot_ref.exr")), (64, 36));
         assert!(!shot.export("--scene Other --name other").contains("note: "));
         assert_eq!(size(&shot.passes("other_ref.exr")), (32, 36));
+        // The frames are those of the scene that is rendered, not of the one that was active.
+        shot.export("--scene Other --frames 1,9 --ref-spp 0 --name moves");
+        let [first, last] = ["0001", "0009"].map(|frame| {
+            let passes = shot.passes(&format!("moves_0001spp.{frame}.exr"));
+            passes.get(Pass::Combined).unwrap().clone()
+        });
+        assert!(first != last, "the card moves");
         let said = shot.refuse("--scene Third", 1);
         assert!(said.contains("no scene 'Third' in shot.blend; it has Main, Other"), "{said}");
     }

@@ -159,6 +159,19 @@ fn frames_of_one_name_are_judged_by_themselves() {
     let scenes: Vec<&str> = own.iter().map(|row| &row["scene"][..]).collect();
     assert_eq!(scenes, ["shot.0001", "shot.0002", "shot.0003"]);
     assert!(own.iter().all(|row| row["seeds"] == "1"), "{own:?}");
+
+    // Also where nothing but the reference tells them apart, and then each has its row of the map.
+    fs::write(
+        &manifest,
+        "scene,noisy,reference,spp\nshot,beauty.0001.exr,clean.0001.exr,4\nshot,beauty.0003.exr,beauty.0003.exr,4\n",
+    )
+    .unwrap();
+    stability("demc-s:unrestrained", &manifest, out.path())
+        .args(["--trials", "as-rendered"])
+        .assert()
+        .success();
+    let map = fs::read_to_string(out.path().join("map_input.svg")).unwrap();
+    assert_eq!(map.matches("shot").count(), 2);
 }
 
 /// Half buffers on disk do not have the change: NFOR must not denoise them in place of the changed frame.

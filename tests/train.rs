@@ -484,7 +484,7 @@ fn a_folder_takes_one_run_at_a_time() {
         }
     })
     .expect("the first run goes on");
-    assert!(second.expect("it is refused").to_string().contains("another demc train works in this folder"));
+    assert!(second.expect("it is refused").to_string().contains("another run of demc works in this folder"));
 }
 
 #[test]

@@ -3,6 +3,8 @@
 //! Python with torch: the one that `DEMC_TORCH_PYTHON` names, or `python3`. Where neither has torch the test
 //! says so and checks nothing.
 
+mod common;
+
 use std::{
     ffi::OsString,
     path::{Path, PathBuf},
@@ -100,12 +102,17 @@ fn compare(
     noisy: &PassSet,
     reference: &PassSet,
     loss: Loss,
+    leak: f32,
 ) {
     let (mut network, _) = weights_file::read(weights).unwrap();
+    network.convolutions().into_iter().for_each(|conv| conv.set_leak(leak));
     let facts = facts(&mut *network, noisy, reference, loss);
     let file = folder.join("facts.safetensors");
     weights::write(&file, "{}", &facts, Storage::Full).unwrap();
-    println!("{}", run(script(python, "check.py").arg(weights).arg(&file).arg(loss.to_string())));
+    println!(
+        "{}",
+        run(script(python, "check.py").arg(weights).arg(&file).args([loss.to_string(), leak.to_string()]))
+    );
 }
 
 fn built_in(folder: &Path, name: &str) -> PathBuf {
@@ -120,8 +127,8 @@ fn the_twin_computes_the_same_outputs_losses_and_gradients() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let (noisy, reference) = (passes("s0000_room_0004spp.exr"), passes("s0000_room_ref.exr"));
-    for loss in [Loss::Ssim, Loss::Geomean] {
-        compare(&python, folder.path(), &built_in(folder.path(), "demc-s"), &noisy, &reference, loss);
+    for (loss, leak) in [(Loss::Ssim, 0.0), (Loss::Geomean, 0.1)] {
+        compare(&python, folder.path(), &built_in(folder.path(), "demc-s"), &noisy, &reference, loss, leak);
     }
     // The prefilter of demc-m by itself; references here keep no guides, and another frame's serve as well.
     let mut prefilter = models::build(&pyramid::prefilter(), 1);
@@ -130,7 +137,42 @@ fn the_twin_computes_the_same_outputs_losses_and_gradients() {
     let (_, metadata) = weights_file::read(&weights).unwrap();
     let path = folder.path().join("prefilter.safetensors");
     weights_file::write(&path, &mut *prefilter, &metadata.training).unwrap();
-    compare(&python, folder.path(), &path, &noisy, &passes("s0010_outdoor_0004spp.exr"), Loss::Geomean);
+    compare(&python, folder.path(), &path, &noisy, &passes("s0010_outdoor_0004spp.exr"), Loss::Geomean, 0.0);
+}
+
+/// Packing needs numpy alone.
+#[test]
+fn a_pack_that_cannot_be_made_is_told_and_leaves_nothing() {
+    let python = common::python::python().into_os_string();
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let room = |kind: &str| root().join(format!("tests/data/s0000_room_{kind}.exr"));
+    let manifest = |noisy: &Path, columns: &str| {
+        let row = format!("room,{},{},4", noisy.display(), room("ref").display());
+        std::fs::write(at("set.csv"), format!("{columns}\n{row}\n")).unwrap();
+    };
+    let pack = |more: &[&str]| {
+        let mut command = script(&python, "pack.py");
+        command.arg(at("set.csv")).arg("--out").arg(at("new/one.pack")).args(more).output().unwrap()
+    };
+    let refused = |more: &[&str], why: &str| {
+        let output = pack(more);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && said.starts_with("pack.py: ") && said.contains(why), "{said}");
+        assert_eq!(std::fs::read_dir(at("new")).map_or(0, Iterator::count), 0);
+    };
+    let columns = "scene,noisy,reference,spp";
+    manifest(&room("0004spp"), columns);
+    refused(&["--megabytes", "0.01"], "nothing was packed");
+    manifest(&room("0004spp"), "scene,noisy,clean,spp");
+    refused(&[], "no column 'reference'");
+    let bytes = std::fs::read(room("0004spp")).unwrap();
+    std::fs::write(at("cut.exr"), &bytes[..bytes.len() / 2]).unwrap();
+    manifest(&at("cut.exr"), columns);
+    refused(&[], "cut.exr: cut off");
+    manifest(&room("0004spp"), columns);
+    assert!(pack(&[]).status.success());
+    assert!(at("new/one.pack").is_file());
 }
 
 #[test]
@@ -167,7 +209,7 @@ fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
         "{said}"
     );
     run(&mut command("3", "room.pack", &[]));
-    let more = ["--resume", "--guide-dropout", "0.5"];
+    let more = ["--resume", "--guide-dropout", "0.5", "--leak", "0.01"];
     run(&mut command("6", "room.pack", &more));
     // A run that is finished says nothing more of itself.
     run(&mut command("6", "room.pack", &more));
@@ -179,7 +221,7 @@ fn the_twin_trains_on_packed_pairs_and_this_crate_reads_its_weights() {
     // The crate reads the weights, says the same of their training, and scores them alike.
     let (network, metadata) = weights_file::read(&at("run/last.safetensors")).unwrap();
     assert_eq!((metadata.training.steps, metadata.training.frames), (6, 1));
-    assert_eq!(metadata.training.guide_dropout, 0.5);
+    assert_eq!((metadata.training.guide_dropout, metadata.training.leak), (0.5, 0.01));
     let reference = passes("s0010_outdoor_ref.exr");
     let image = network.infer(&passes("s0010_outdoor_0004spp.exr"), None).unwrap();
     let score = demc::metrics::error::relmse(&image, reference.get(demc::passes::Pass::Combined).unwrap());

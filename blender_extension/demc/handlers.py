@@ -19,6 +19,8 @@ _written = []
 # When files of the current frame were written that were there before it: a single render that is written has
 # another name, and leaves them as they are.
 _before = {}
+# The timer that waits for the render's thread to end.
+_later = None
 
 
 @persistent
@@ -72,7 +74,7 @@ def _on_cancel(scene, _depsgraph=None):
 
 @persistent
 def _on_complete(scene, _depsgraph=None):
-    global _rendered
+    global _rendered, _later
     if scene.name != _rendered:
         return
     _rendered = None
@@ -85,7 +87,8 @@ def _on_complete(scene, _depsgraph=None):
             _finish(jobs.current().wait())
     else:
         # Not here: this is the thread of the render, where no data may be changed.
-        bpy.app.timers.register(functools.partial(_begin_later, scene.name, frames), first_interval=_LOOK_SECONDS)
+        _later = functools.partial(_begin_later, scene.name, frames)
+        bpy.app.timers.register(_later, first_interval=_LOOK_SECONDS)
 
 
 @persistent
@@ -157,10 +160,11 @@ def register():
 
 
 def unregister():
-    """Takes them away, and the timer."""
+    """Takes them away, and the timers."""
     for name, handler in _HANDLERS:
         listed = getattr(bpy.app.handlers, name)
         if handler in listed:
             listed.remove(handler)
-    if bpy.app.timers.is_registered(_follow):
-        bpy.app.timers.unregister(_follow)
+    for timer in (_follow, _later):
+        if timer is not None and bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)

@@ -193,7 +193,7 @@ class Job:
         if self.layer is None:
             return None
         result = os.path.join(self.folder, os.path.basename(self.inputs[0]))
-        return {"of": result, "layer": self.layer, "as": f"{os.path.splitext(result)[0]}_denoised.exr"}
+        return {"of": result, "noisy": self.inputs[0], "layer": self.layer, "as": f"{os.path.splitext(result)[0]}_denoised.exr"}
 
     def _read(self):
         lines = (self._rest + self._output.read()).split(b"\n")

@@ -79,6 +79,10 @@ def _prepare_output(scene, put):
             put(settings, "file_format", "OPEN_EXR_MULTILAYER", words)
     if settings.exr_codec not in _LOSSLESS:
         put(settings, "exr_codec", "ZIP", "files are compressed without loss (ZIP)")
+    if _views_lack(scene):
+        put(settings, "views_format", "MULTIVIEW", "both eyes go into one file")
+    if _is_unnamed(scene):
+        put(scene.render, "use_file_extension", True, "files are named .exr")
     if _wants_interleave(scene):
         put(settings, "use_exr_interleave", True, "passes are interleaved in one part, as pixels are not square")
 
@@ -88,6 +92,23 @@ def _wants_interleave(scene):
     render = scene.render
     is_square = render.pixel_aspect_x == render.pixel_aspect_y
     return not is_square and getattr(render.image_settings, "use_exr_interleave", None) is False
+
+
+def _views_lack(scene):
+    """What the files of several eyes lack, where it is something."""
+    written = scene.render.image_settings.views_format
+    if not scene.render.use_multiview or written == "MULTIVIEW":
+        return None
+    if written != "INDIVIDUAL":
+        return "Blender writes no Stereo 3D files with passes: set Output > Views Format to Multi-View"
+    if scene.demc.use_temporal:
+        return "Files of one eye each have no frames beside them: set Output > Views Format to Multi-View"
+    return None
+
+
+def _is_unnamed(scene):
+    """Whether frames get no .exr in their names."""
+    return not scene.render.use_file_extension and not scene.render.filepath.lower().endswith(".exr")
 
 
 def _of_scene(scene):
@@ -137,10 +158,14 @@ def _of_sequence(scene):
 def _of_output(scene):
     settings = scene.render.image_settings
     if not is_multilayer(scene):
-        return [Lack(f"{settings.file_format} keeps no passes in files: set Output > File Format to OpenEXR MultiLayer",
-                     True)]
+        where = "Media Type to Multi-Layer EXR" if hasattr(settings, "media_type") else "File Format to OpenEXR MultiLayer"
+        return [Lack(f"{settings.file_format} keeps no passes in files: set Output > {where}", True)]
     if settings.exr_codec not in _LOSSLESS:
         return [Lack(f"{settings.exr_codec} compression loses detail of the passes: set Output > Codec to ZIP", True)]
     if _wants_interleave(scene):
         return [Lack("Blender writes no frames whose pixels are not square: turn on Output > Interleave", True)]
+    if views := _views_lack(scene):
+        return [Lack(views, True)]
+    if _is_unnamed(scene):
+        return [Lack("Files without .exr in their names are not found again: turn on Output > File Extensions", True)]
     return []

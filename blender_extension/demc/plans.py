@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import tempfile
 
 import bpy
@@ -29,16 +30,20 @@ def of_render(scene):
     if render is None:
         raise JobError(_NOTHING)
     _refuse(scene, passes.missing(scene, still=True), "the render")
+    # All that may be refused comes before the render is saved, which takes seconds.
+    folder, options = _output(scene, os.path.dirname(bpy.data.filepath) or bpy.app.tempdir), _options(scene)
     scratch = tempfile.mkdtemp(prefix="demc-", dir=bpy.app.tempdir)
     name = os.path.splitext(os.path.basename(bpy.data.filepath))[0] or "render"
     # What some system lets no file be called.
     plain = re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", f"{name}_{scene.name}")
     noisy = os.path.join(scratch, f"{plain}_{scene.frame_current:04}{_SUFFIX}")
-    _save(render, scene, noisy)
-    beside = os.path.dirname(bpy.data.filepath) or bpy.app.tempdir
+    try:
+        _save(render, scene, noisy)
+    except JobError:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
     job = Job(
-        "this render", [noisy], _output(scene, beside), [*_options(scene), "--overwrite", "--layer", LAYER], 1,
-        picture=LAYER, scene=scene.name,
+        "this render", [noisy], folder, [*options, "--overwrite", "--layer", LAYER], 1, picture=LAYER, scene=scene.name
     )
     job.scratch.append(scratch)
     return job
@@ -88,7 +93,8 @@ def frame_files(scene, frame):
     render = scene.render
     eyes = [""]
     if render.use_multiview and render.image_settings.views_format == "INDIVIDUAL":
-        eyes = [view.name for view in render.views if view.use]
+        views = render.stereo_views if render.views_format == "STEREO_3D" else render.views
+        eyes = [view.name for view in views if view.use]
     try:
         return [bpy.path.abspath(render.frame_path(frame=frame, view=eye)) for eye in eyes]
     except RuntimeError as error:  # from 4.5 on, Blender looks for variables in braces
@@ -103,6 +109,9 @@ def _refuse(scene, lacks, what):
 
 
 def _output(scene, beside):
+    if scene.demc.output.startswith("//") and not bpy.data.filepath:
+        raise JobError(f"{scene.demc.output} begins at the .blend, which has no place yet: save it first, or choose another "
+                       "Output folder")
     folder = bpy.path.abspath(scene.demc.output) if scene.demc.output else os.path.join(beside, "denoised")
     try:
         os.makedirs(folder, exist_ok=True)
@@ -166,7 +175,8 @@ def _save(render, scene, path):
         raise JobError(f"The render cannot be saved to {path}: {' '.join(str(error).split())}") from None
     finally:
         for name, value in kept.items():
-            setattr(settings, name, value)
+            if value != "":  # what Blender says of a choice that this format does not have
+                setattr(settings, name, value)
         if space:
             linear.name = space
 

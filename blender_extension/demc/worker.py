@@ -68,7 +68,7 @@ def _picture(wanted):
     cannot be made is no failure: the result itself is there."""
     try:
         exr = _module("exr")
-        channels = _plain(exr.read(wanted["of"]), wanted["layer"])
+        channels = _plain(exr.read(wanted["of"]), wanted["layer"], exr.channel_names(wanted["noisy"]))
         exr.write_float(wanted["as"], channels, level=1)
         print(json.dumps({"picture": wanted["as"]}))
     except (ImportError, ValueError, KeyError, OSError) as error:
@@ -84,13 +84,13 @@ def _module(name):
     return module
 
 
-def _plain(channels, layer):
-    """The channels R, G, B and A of the layer `<view layer>.<layer>`; of the first eye, where there are
-    two."""
+def _plain(channels, layer, before):
+    """The channels R, G, B and A of the layer `<view layer>.<layer>`, which a file with the channels `before` was given;
+    of the first eye, where there are two. The results of light groups, `<view layer>.<pass>.<layer>`, have longer
+    names."""
     found = {}
-    for name in sorted(channels):
+    for name in sorted(set(channels) - set(before), key=lambda name: (name.count("."), name)):
         parts = name.split(".")
-        # Before it stands the view layer, whose own name may be the same.
         if layer in parts[1:-1] and parts[-1] in "RGBA":
             found.setdefault(parts[-1], channels[name])
     if not {"R", "G", "B"} <= found.keys():

@@ -143,7 +143,16 @@ class Extension(unittest.TestCase):
         bpy.ops.wm.set_working_color_space(working_space="ACEScg")
         bpy.ops.render.render()
         self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
-        self.assertEqual(bpy.data.images[f"Denoised {self.scene.name}"].colorspace_settings.name, "ACEScg")
+        image = bpy.data.images[f"Denoised {self.scene.name}"]
+        self.assertEqual(image.colorspace_settings.name, "ACEScg")
+        # Also where files have colours of their own, which stay as they are.
+        usual = image.pixels[:]
+        settings = self.scene.render.image_settings
+        settings.color_management = "OVERRIDE"
+        settings.view_settings.view_transform, settings.view_settings.exposure = "Raw", 1.5
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        self.assertTrue(image.pixels[:] == usual, "the colours were converted")
+        self.assertEqual((settings.view_settings.view_transform, settings.view_settings.exposure), ("Raw", 1.5))
 
     def test_pixels_that_are_not_square(self):
         self.scene.render.pixel_aspect_x = 2.0
@@ -198,6 +207,64 @@ class Extension(unittest.TestCase):
         self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
         self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
         self.assertEqual(self.scene.render.image_settings.views_format, "INDIVIDUAL")
+        # Files of one eye each are no shot.
+        passes = sys.modules[f"{MODULE}.passes"]
+        self.scene.demc.use_temporal = True
+        self.assertTrue(any("one eye each" in lack.text for lack in passes.missing(self.scene)))
+        passes.prepare(self.scene)
+        self.assertEqual(passes.missing(self.scene), [])
+        self.assertEqual(self.scene.render.image_settings.views_format, "MULTIVIEW")
+
+    def test_one_eye_of_two(self):
+        self.prepared()
+        render = self.scene.render
+        render.use_multiview, render.views["right"].use = True, False
+        # Blender renders none but left and right where the setup is for two eyes.
+        render.views.new("centre")
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        self.assertEqual(self.clean(), ["shot_0001_L.exr", "shot_0002_L.exr"])
+        self.assertEqual(sys.modules[f"{MODULE}.jobs"].current().notes, [])
+
+    def test_stereo_that_keeps_no_passes_is_prepared(self):
+        settings = self.scene.render.image_settings
+        self.scene.render.use_multiview = True
+        settings.views_format = "STEREO_3D"
+        self.prepared()
+        self.assertIn(settings.views_format, ("INDIVIDUAL", "MULTIVIEW"))
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+
+    def test_light_groups_are_not_what_is_shown(self):
+        def picture():
+            bpy.ops.render.render()
+            self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+            return bpy.data.images[f"Denoised {self.scene.name}"].pixels[:]
+
+        self.prepared()
+        self.scene.demc.use_compositor = False
+        usual = picture()
+        for name in ("a_key", "fill"):
+            self.scene.view_layers[0].lightgroups.add(name=name)
+        bpy.data.objects["Sun"].lightgroup = "fill"
+        self.scene.demc.light_passes = True
+        self.assertTrue(picture() == usual, "one light group is shown")
+
+    def test_what_is_refused_leaves_no_copy_of_the_render(self):
+        self.prepared()
+        bpy.ops.render.render()
+        self.scene.demc.model, self.scene.demc.weights = "FILE", ""
+        before = os.listdir(bpy.app.tempdir)
+        self.refused(bpy.ops.demc.denoise_render, "Choose the weights file")
+        self.assertEqual(os.listdir(bpy.app.tempdir), before)
+        self.scene.demc.output = "//clean"
+        self.refused(bpy.ops.demc.denoise_render, "begins at the .blend")
+
+    def test_frames_without_an_ending_in_their_names(self):
+        self.scene.render.use_file_extension = False
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
 
     def test_a_single_render_needs_nothing_that_frames_need(self):
         self.prepared()

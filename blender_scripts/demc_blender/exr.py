@@ -20,14 +20,24 @@ _LEVEL = 6  # of zlib, its own default
 
 
 def read(path):
-    """Channel name -> (height, width) array, over all parts."""
+    """Channel name -> (height, width) array, over all parts. A file that was cut off is a ValueError."""
     with open(path, "rb") as file:
         data = file.read()
-    headers, at, multipart = _headers(path, data)
     channels = {}
-    for header in headers:
-        at = _read_part(data, at, header, multipart, channels)
+    try:
+        headers, at, multipart = _headers(path, data)
+        for header in headers:
+            at = _read_part(data, at, header, multipart, channels)
+    except (IndexError, KeyError, struct.error, zlib.error) as error:
+        raise ValueError(f"{path}: cut off, or not as Blender writes it ({error})") from error
     return channels
+
+
+def channel_names(path):
+    """The names of the channels of all parts; pixels are not read."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        headers, _, _ = _headers(path, data)
+    return [name for header in headers for name, _ in _channel_list(header["channels"])]
 
 
 def is_whole(path):
@@ -211,9 +221,10 @@ def _read_part(data, table, header, multipart, channels):
 
 
 def _decompress(block):
-    delta = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
-    delta[1:] -= 128
-    flat = np.cumsum(delta).astype(np.uint8)
+    # All modulo 256, as bytes compute.
+    delta = np.frombuffer(zlib.decompress(block), np.uint8).copy()
+    delta[1:] += 128
+    flat = np.cumsum(delta, dtype=np.uint8)
     half = (len(flat) + 1) // 2
     out = np.empty_like(flat)
     out[0::2], out[1::2] = flat[:half], flat[half:]
@@ -222,7 +233,7 @@ def _decompress(block):
 
 def _compress(raw, level):
     bytes_ = np.frombuffer(raw, np.uint8)
-    split = np.concatenate([bytes_[0::2], bytes_[1::2]]).astype(np.int64)
+    split = np.concatenate([bytes_[0::2], bytes_[1::2]])
     split[1:] = split[1:] - split[:-1] + 128
-    packed = zlib.compress((split & 255).astype(np.uint8).tobytes(), level)
+    packed = zlib.compress(split.tobytes(), level)
     return packed if len(packed) < len(raw) else raw

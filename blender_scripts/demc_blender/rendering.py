@@ -190,7 +190,9 @@ def render_to(scene, path, layer=None, attributes=None):
     command_line.forget_chatter()
     try:
         try:
-            bpy.ops.render.render(write_still=True, scene=scene.name, **({"layer": layer} if layer else {}))
+            # Of a scene that is not the active one, Blender would render the active one's frame.
+            with bpy.context.temp_override(scene=scene):
+                bpy.ops.render.render(write_still=True, scene=scene.name, **({"layer": layer} if layer else {}))
         except RuntimeError as error:  # it tells where, and of the reason "see console"
             raise RuntimeError(f"{str(error).strip()}; {command_line.trouble_heard()}") from error
         if not os.path.exists(temporary) or not exr.is_whole(temporary):

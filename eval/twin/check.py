@@ -1,6 +1,6 @@
 """Compares the twin's results with the crate's on the same frame (tests/twin.rs writes the file FACTS).
 
-    python check.py WEIGHTS FACTS LOSS
+    python check.py WEIGHTS FACTS LOSS LEAK
 
 Inputs, image and loss must agree to 1e-3, gradients to 1e-2. Each difference is measured as the root of its
 summed squares, relative to that of the crate's values.
@@ -23,8 +23,9 @@ def compare(name, found, wanted, tolerance):
     return error
 
 
-def main(weights, facts, loss):
+def main(weights, facts, loss, leak):
     net, _ = network.read(weights)
+    net.set_leak(float(leak))
     facts, _ = read_tensors(facts)
     facts = {name: torch.from_numpy(values) for name, values in facts.items()}
 

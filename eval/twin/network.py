@@ -100,7 +100,14 @@ def amplified(image, logits):
     return image * (2 * torch.tanh(logits / 2)).exp()
 
 
+def _relu(x, leak):
+    """ReLU. Where it gives nothing, the share `leak` of the gradient passes, as `Conv::set_leak` of the crate has it."""
+    return torch.where(x > 0, x, leak * (x - x.detach())) if leak else F.relu(x)
+
+
 class _Encoder(nn.ModuleList):
+    leak = 0.0
+
     def __init__(self, channels, widths):
         before = [4 * channels, *widths]
         super().__init__(
@@ -112,12 +119,14 @@ class _Encoder(nn.ModuleList):
         for level, (first, second) in enumerate(self):
             if level > 0:
                 x = F.max_pool2d(x, 2)
-            x = F.relu(second(F.relu(first(x))))
+            x = _relu(second(_relu(first(x), self.leak)), self.leak)
             skips.append(x)
         return skips
 
 
 class _Level(nn.Module):
+    leak = 0.0
+
     def __init__(self, skip, below):
         super().__init__()
         width = skip + _DECODER_EXTRA
@@ -126,8 +135,8 @@ class _Level(nn.Module):
         self.refine = _convolution(width, width, 3)
 
     def forward(self, skips, below):
-        sources = [*skips] if below is None else [*skips, F.relu(self.up(below))]
-        return F.relu(self.refine(F.relu(self.fuse(torch.cat(sources, 1)))))
+        sources = [*skips] if below is None else [*skips, _relu(self.up(below), self.leak)]
+        return _relu(self.refine(_relu(self.fuse(torch.cat(sources, 1)), self.leak)), self.leak)
 
 
 class Trunk(nn.Module):
@@ -145,6 +154,12 @@ class Trunk(nn.Module):
         full = 4 * (full_kernel**2 + 6 + extra)
         heads["full"] = _convolution(widths[0] + _DECODER_EXTRA, full, 1, _HEAD_GAIN)
         self.head = nn.ModuleDict(heads)
+
+    def set_leak(self, leak):
+        """Lets a share of the gradient pass the ReLUs where they give nothing, those of the prefilter too."""
+        for part in self.modules():
+            if isinstance(part, (_Encoder, _Level)):
+                part.leak = leak
 
     def hidden(self):
         """The weights of hidden layers, which Muon trains."""

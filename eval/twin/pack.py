@@ -12,6 +12,7 @@ guides where it keeps them. SHA-256 of every entry is checked when a pack is rea
 """
 
 import argparse
+import contextlib
 import csv
 import hashlib
 import json
@@ -90,6 +91,7 @@ def write(manifest, out, megabytes, first, frames, seed):
     random.Random(seed).shuffle(order)
     listing, size, number = [], 0, first
     partial = f"{out}.tmp"
+    os.makedirs(os.path.dirname(os.path.abspath(out)), exist_ok=True)
     with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as pack:
         for number, reference in enumerate(order[first:], first):
             noisy = _chosen(views[reference], frames)
@@ -105,6 +107,8 @@ def write(manifest, out, megabytes, first, frames, seed):
         else:
             number = len(order)
         pack.writestr(_LISTING, json.dumps(listing))
+    if not listing:
+        raise ValueError(f"{out}: nothing was packed: of {len(order)} views {first} are left out, and the next takes {size / 1e6:.1f} MB")
     os.replace(partial, out)
     pairs = sum(len(view["spp"]) for view in listing)
     print(f"{out}: views {first}:{number} of {len(order)}, {pairs} pairs; the next pack begins with --from {number}")
@@ -134,8 +138,13 @@ def main():
     options = parser.parse_args()
     try:
         write(options.manifest, options.out, options.megabytes, options.first, options.frames, options.seed)
+    except KeyError as error:
+        sys.exit(f"pack.py: {options.manifest}: no column {error}")
     except (OSError, ValueError) as error:
         sys.exit(f"pack.py: {error}")
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(f"{options.out}.tmp")
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ def parse():
     parser.add_argument("--loss", choices=losses.LOSSES, default="ssim")
     parser.add_argument("--raw-references", action="store_true", help="see `demc train --help`")
     parser.add_argument("--guide-dropout", type=float, default=0.0, metavar="SHARE", help="see `demc train --help`")
+    parser.add_argument("--leak", type=float, default=0.0, metavar="SHARE", help="see `demc train --help`")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--every", type=float, default=60, metavar="S", help="seconds between validations")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -81,6 +82,7 @@ def make(options):
     if options.model != "prefilter" and not options.learn_guides:
         for parameter in net.prefilter.parameters():
             parameter.requires_grad = False
+    net.set_leak(options.leak)
     for part in net.modules():
         part.narrow = not options.f32
     return net.to(options.device, memory_format=torch.channels_last)
@@ -118,8 +120,8 @@ def facts(options, config, step, seconds, frames, validation, score):
     """The metadata of a weights file, as the crate reads it."""
     training = {
         "frames": frames, "steps": step, "batch": options.batch, "patch": options.patch, "lr": list(options.lr),
-        "loss": options.loss, "raw_references": options.raw_references, "guide_dropout": options.guide_dropout, "optimizer": "muon",
-        "weight_decay": options.weight_decay, "precision": "f32" if options.f32 else "bf16",
+        "loss": options.loss, "raw_references": options.raw_references, "guide_dropout": options.guide_dropout, "leak": options.leak,
+        "optimizer": "muon", "weight_decay": options.weight_decay, "precision": "f32" if options.f32 else "bf16",
         "average": options.average, "seed": options.seed, "init": options.init, "prefilter": options.prefilter,
         "only": [], "seconds": seconds, "validation_frames": validation,
         "validation_relmse": score and score[0], "validation_ssim": score and score[1],
@@ -130,6 +132,7 @@ def facts(options, config, step, seconds, frames, validation, score):
 
 
 def main():
+    start = saved = time.time()  # the minutes given hold whatever is done before the first step too
     options = parse()
     os.makedirs(options.out, exist_ok=True)
     net = make(options)
@@ -156,7 +159,7 @@ def main():
     if not (options.resume and os.path.exists(log)):
         with open(log, "w", encoding="utf-8") as file:
             file.write("step,seconds,megapixels,lr,loss,val_relmse,val_ssim\n")
-    start, saved, total, counted, skipped = time.time(), time.time(), 0.0, 0, 0
+    total, counted, skipped = 0.0, 0, 0
     print(f"{len(frames)} pairs, {len(validation)} to validate, {options.device}, from step {step}", flush=True)
 
     def save():

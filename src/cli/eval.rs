@@ -160,7 +160,12 @@ impl Progress {
         if !row.reason.is_empty() {
             return format!("{counted}: {}", row.reason);
         }
-        let value = |name: &str, v: Option<f64>| v.map(|v| format!("  {name} {v:.4}")).unwrap_or_default();
+        // Four decimals of a share, three digits of an error, which may be tiny.
+        let value = |name: &str, v: Option<f64>| match v {
+            Some(v) if name == "ssim" => format!("  {name} {v:.4}"),
+            Some(v) => format!("  {name} {}", report::number_label(v)),
+            None => String::new(),
+        };
         let time = row.seconds.map(|s| format!("  {:.0} ms", s * 1e3)).unwrap_or_default();
         let scores = [("relmse", row.relmse), ("ssim", row.ssim), ("flicker", row.flicker)];
         let scores: String = scores.map(|(name, score)| value(name, score)).concat();

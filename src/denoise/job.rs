@@ -120,7 +120,7 @@ fn option<T: Copy + PartialEq>(name: &str, all: [(&str, T); 3], chosen: T) -> Op
 /// Why it cannot.
 pub fn check_layer_name(name: &str) -> Result<(), &'static str> {
     let reserved = |p: &Pass| p.to_string() == name || p.blender_names().contains(&name);
-    if name.is_empty() || name.len() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
+    if name.is_empty() || name.chars().count() > 100 || name.contains(|c: char| c == '.' || c.is_control()) {
         Err("wants 1 to 100 characters in one line, without a dot")
     } else if name == NOISY_IMAGE
         || light_group(name).is_some()
@@ -203,18 +203,24 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     if options.layer.is_none() {
         report.notes.extend(note_other_pictures(&layers, chosen));
     }
-    check_added(&frame, chosen, options)?;
+    // Besides its stereo views, a view layer may hold channels that belong to no view.
+    let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
+    let eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).filter(has_beauty).collect();
+    let Some(first) = eyes.first() else {
+        return Err(Error::MissingPass {
+            path: input.into(),
+            view_layer: chosen.name.clone(),
+            renderer: chosen.renderer,
+            passes: vec![Pass::Combined],
+            needed_by: model.name().into(),
+        });
+    };
+    check_added(&frame, first, options)?;
     let mut needed = vec![Pass::Combined];
     needed.extend(model.passes().iter().filter(|pass| **pass != Pass::Combined));
     let of_motion = if options.temporal.is_some() { &window::PASSES[..] } else { &[] };
     let lights = if options.passes { light_passes() } else { Vec::new() };
     let wanted = [&needed, model.optional_passes(), &[Pass::Alpha], of_motion, &lights].concat();
-    // Besides its stereo views, a view layer may hold channels that belong to no view.
-    let mut eyes: Vec<&Layer> = layers.iter().filter(|l| l.name == chosen.name).collect();
-    let has_beauty = |layer: &&Layer| layer.passes.contains_key(&Pass::Combined);
-    if eyes.iter().any(has_beauty) {
-        eyes.retain(has_beauty);
-    }
     let mut views = Vec::new();
     for layer in eyes {
         refuse_stale(&frame, layer, options)?;
@@ -245,7 +251,7 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
                 report.notes.push(why.into());
             }
         }
-        refuse_broken(&shot)?;
+        shot.refuse_broken()?;
         // Before any work: a missing pass is the user's commonest mistake.
         model.check(&shot.passes)?;
         let is_given = options.sources.normal.is_some();
@@ -268,20 +274,6 @@ pub(super) fn take_apart(frame: Frame, model: &dyn Denoiser, options: &Options) 
     }
     report.notes.dedup(); // stereo views repeat them
     Ok(Views { frame, views, report })
-}
-
-/// Refuses a render of which most was filled in, and is no picture.
-fn refuse_broken(shot: &Shot) -> Result<()> {
-    let values = 3 * shot.passes.width * shot.passes.height;
-    match shot.repaired.get(&Pass::Combined) {
-        Some(count) if *count > values / 2 => {
-            let why = format!(
-                "{count} of the {values} values of Combined are NaN or infinite; render the frame again"
-            );
-            Err(Error::invalid(&shot.passes.path, why))
-        }
-        _ => Ok(()),
-    }
 }
 
 /// Refuses to replace a result whose light passes would stay, as they add up to that result alone.
@@ -366,10 +358,14 @@ pub fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
     Ok(())
 }
 
+/// Other view layers are told of. What the compositor made is none.
 fn note_other_layers(layers: &[Layer], chosen: &Layer) -> Option<String> {
     let mut others: Vec<String> = layers
         .iter()
-        .filter(|l| l.name != chosen.name && l.passes.contains_key(&Pass::Combined))
+        .filter(|l| {
+            ![&chosen.name[..], COMPOSITE].contains(&l.name.as_str())
+                && l.passes.contains_key(&Pass::Combined)
+        })
         .map(|l| format!("'{}'", l.name))
         .collect();
     others.dedup();
@@ -443,7 +439,7 @@ pub fn shot(mut shot: Shot, model: &dyn Denoiser, options: &Options) -> Result<(
     if shot.passes.width * shot.passes.height == 0 {
         return Err(Error::invalid(&shot.passes.path, "has no pixels"));
     }
-    refuse_broken(&shot)?;
+    shot.refuse_broken()?;
     let mut report = Report::default();
     rayon::scope(|_| {
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
@@ -637,7 +633,10 @@ fn put(
     options: &Options,
 ) -> Result<Option<Recoded>> {
     if let Some(added) = &options.layer {
-        let kind = frame.parts()[at.part].channels[at.channels[0]].kind;
+        let kind = match frame.parts()[at.part].channels[at.channels[0]].kind {
+            SampleKind::Uint => SampleKind::Float, // light is no whole number
+            kind => kind,
+        };
         let beside = if has_window_of_beauty(frame, layer, at) { at } else { &layer.passes[&Pass::Combined] };
         let mut channels: Vec<NewChannel<'_>> = ["R", "G", "B"]
             .iter()

@@ -25,9 +25,7 @@ impl Temporal {
         let optional = model.optional_passes().iter().copied().chain(wanted).collect();
         Self { name: format!("{}{SUFFIX}", model.name()), model, reach, optional }
     }
-}
 
-impl Temporal {
     /// A window around a frame with the neighbours that the shot has.
     fn window(&self, shot: &Shot) -> Window<'_> {
         let mut window = Window::new(self.reach, &*self.model, None);

@@ -200,6 +200,8 @@ impl State {
             }
             self.files.insert(file.job.input.clone(), file);
         }
+        // What was taken and is away for a moment, as on a network drive, is not new when it is back.
+        self.files.extend(before.into_iter().filter(|(_, file)| matches!(file.status, Status::Taken)));
     }
 }
 
@@ -291,6 +293,21 @@ mod tests {
         scene.write(b"");
         assert!(!scene.is_taken());
         assert!(scene.watch.leftovers(End::Complete)[0].1.to_string().contains("is empty"));
+    }
+
+    #[test]
+    fn a_file_that_is_away_for_a_moment_is_not_taken_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let job = Job { input: folder.path().join("a.exr"), output: PathBuf::new() };
+        fs::write(&job.input, "a").unwrap();
+        let looks = std::sync::atomic::AtomicUsize::new(0);
+        let look = move || {
+            let is_there = looks.fetch_add(1, std::sync::atomic::Ordering::Relaxed) != 3;
+            Look { jobs: is_there.then(|| job.clone()).into_iter().collect(), ..Look::default() }
+        };
+        let watch = Watch::new(look, Some(Duration::from_millis(6500)), true);
+        let taken = std::iter::from_fn(|| matches!(watch.next(|| false), Next::Job(_)).then_some(()));
+        assert_eq!(taken.count(), 1);
     }
 
     #[test]

@@ -508,7 +508,6 @@ impl<'a> Window<'a> {
             (Some(own), Some(there)) if there < own => there as f32 / own as f32,
             _ => 1.0,
         };
-        weights.data.iter_mut().for_each(|weight| *weight *= share);
         Ok(Found { weights: HalfFloats::of(&weights), brightness, share })
     }
 
@@ -661,6 +660,8 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
 /// as alpha, remain its own.
 fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
     let passes = &own.shot.passes;
+    // With as many samples as the frame alone: fireflies are spread over more pixels, but not rarer. Told that there are
+    // more samples, the shrinkage would take them for detail.
     let mut set = passes.empty((passes.width, passes.height));
     for &pass in model.passes().iter().chain(model.optional_passes()).chain(&[Pass::Alpha]) {
         let Some(values) = own.values(pass) else { continue };
@@ -670,13 +671,10 @@ fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> Pass
         } else {
             let of_others: Vec<(&dyn Values, &Link)> =
                 others.iter().filter_map(|other| Some((other.moment.values(pass)?, &other.link))).collect();
-            let is_light = pass.quantity() == Quantity::Radiance;
+            let is_light = pass.carries_radiance();
             set.insert(pass, own.inside(temporal::merge(values, is_light, &of_others)));
         }
     }
     set.origin = passes.origin;
-    // Fireflies are spread over more pixels, but not rarer than in the frame alone. Told that there are more
-    // samples, the shrinkage would take them for detail.
-    set.samples = passes.samples;
     set
 }

@@ -97,9 +97,13 @@ impl Shading {
         lines.par_chunks_mut(KEPT * squares).enumerate().for_each_init(
             memory,
             |[of_rows, moments], (row, lines)| {
-                let near = |tap: usize| rows.get((row + tap).checked_sub(WINDOW.len() / 2)?);
-                let near = WINDOW.iter().enumerate().filter_map(|(tap, weight)| Some((*weight, *near(tap)?)));
-                squares::around(near, squares, &WINDOW, of_rows, moments);
+                squares::around(
+                    squares::rows_around(&rows, row, &WINDOW),
+                    squares,
+                    &WINDOW,
+                    of_rows,
+                    moments,
+                );
                 for first in (0..squares).step_by(LANES) {
                     let part = first..(first + LANES).min(squares);
                     let kept = fit(std::array::from_fn(|k| {

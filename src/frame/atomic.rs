@@ -6,7 +6,7 @@
 //! leftovers after a day.
 
 use std::{
-    fs::{self, File},
+    fs::{self, File, TryLockError},
     path::{Path, PathBuf},
     sync::LazyLock,
     time::Duration,
@@ -90,6 +90,23 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Keeps other runs of demc that ask for this out of a folder for results, until what is returned is dropped. Where the
+/// disk knows no locks nothing is kept out.
+///
+/// # Errors
+/// Another run works there, or no file can be made.
+pub fn alone_in(folder: &Path) -> Result<File> {
+    let path = folder.join(".lock");
+    let file = File::create(&path).map_err(Error::io("write", &path))?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(Error::invalid(
+            folder,
+            "another run of demc works in this folder; wait for it, or choose another --out",
+        )),
+        _ => Ok(file),
+    }
 }
 
 /// Whether a folder, or if it is not there yet the one that it will lie in, takes capital letters for small ones,

@@ -39,8 +39,13 @@ pub fn is_readable(header: &Header) -> bool {
     let (origin, size) = (header.own_attributes.layer_position, header.layer_size);
     let is_even = [origin.x(), origin.y()].iter().all(|edge| edge % 2 == 0)
         && [size.width(), size.height()].iter().all(|edge| edge.is_multiple_of(DISTANCE));
+    let bytes_of_halved: usize =
+        header.channels.list.iter().filter(|c| halves(c)).map(|c| c.sample_type.bytes_per_sample()).sum();
+    // A block of several rows that holds no whole number of bytes a pixel is taken for shorter than it is.
+    let is_whole = header.compression.scan_lines_per_block() == 1 || bytes_of_halved.is_multiple_of(4);
     let is_lossy = matches!(header.compression, C::B44 | C::B44A | C::DWAA(_) | C::DWAB(_));
     is_even
+        && is_whole
         && !is_lossy
         && header.blocks == BlockDescription::ScanLines
         && header.channels.list.iter().all(|c| c.sampling == Vec2(1, 1) || halves(c))

@@ -33,7 +33,9 @@ impl Frame {
         }
         let area = header.layer_size.area();
         let mut decoded: Vec<PlaneBuffer> = Vec::new();
-        let of_part: Vec<&StoredChunk> = self.chunks.iter().filter(|c| c.part == part).collect();
+        // Coarser levels are not decompressed.
+        let is_finest = |chunk: &&StoredChunk| chunk.part == part && chunk.place.level_index == Vec2(0, 0);
+        let of_part: Vec<&StoredChunk> = self.chunks.iter().filter(is_finest).collect();
         for batch in of_part.chunks(BLOCKS_PER_THREAD * rayon::current_num_threads()) {
             let blocks: Vec<UncompressedBlock> =
                 batch.par_iter().map(|stored| self.decompress(stored)).collect::<Result<_>>()?;
@@ -45,9 +47,8 @@ impl Frame {
             let planes: Vec<&mut [f32]> =
                 decoded.iter_mut().flat_map(|image| image.chunks_mut(area)).collect();
             planes.into_par_iter().zip(&channels).for_each(|(plane, &channel)| {
-                let finest = blocks.iter().filter(|block| block.index.level == Vec2(0, 0));
                 let copy = if chroma::is_subsampled(header) { chroma::copy_block } else { copy_block };
-                finest.for_each(|block| copy(header, block, channel, plane));
+                blocks.iter().for_each(|block| copy(header, block, channel, plane));
             });
         }
         let planes = decoded.iter_mut().flat_map(|image| image.chunks_mut(area)).zip(&channels);

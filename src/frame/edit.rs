@@ -323,7 +323,7 @@ impl Frame {
                 None => part.name.as_deref().unwrap_or_default(),
             };
             // Stereo views are named `<layer>.<view>` in channels, `<layer>-<view>` in parts.
-            let rest = layer.get(name.len()..).filter(|_| layer.is_char_boundary(name.len()));
+            let rest = layer.get(name.len()..);
             rest.is_some_and(|rest| {
                 layer[..name.len()].eq_ignore_ascii_case(name)
                     && (rest.is_empty() || self.views().iter().any(|view| rest.get(1..) == Some(view)))

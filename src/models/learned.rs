@@ -162,16 +162,21 @@ impl Denoiser for Learned {
         let is_missing = |pass: &Pass| shot.passes.get(*pass).is_none();
         let is_zero =
             |pass: &Pass| shot.passes.get(*pass).is_some_and(|planes| planes.data.iter().all(|v| *v == 0.0));
-        // A sky has no normal, but what has neither normal nor albedo and is not black was never written.
-        let wanted = self.dispensable();
-        let is_blank = !wanted.is_empty() && wanted.iter().all(is_zero) && !is_zero(&Pass::Combined);
-        let missed: Vec<Pass> = wanted.iter().copied().filter(|pass| is_blank || is_missing(pass)).collect();
+        // A sky has no normal, but light without albedo has one that was never written, and then its normal was not either.
+        let is_unwritten =
+            |pass: &Pass| is_zero(pass) && is_zero(&Pass::DenoisingAlbedo) && !is_zero(&Pass::Combined);
+        let wanted = self.dispensable().iter().copied();
+        let missed: Vec<Pass> = wanted.filter(|pass| is_missing(pass) || is_unwritten(pass)).collect();
+        let nothing = match missed.len() {
+            _ if !missed.iter().all(is_zero) => "",
+            1 => ", which holds nothing",
+            _ => ", which hold nothing",
+        };
         let names: Vec<String> = missed.iter().map(Pass::to_string).collect();
         (!missed.is_empty()).then(|| {
             format!(
-                "done without {}{}, at a loss of detail; {}",
+                "done without {}{nothing}, at a loss of detail; {}",
                 names.join(" and "),
-                if is_blank { ", which hold nothing" } else { "" },
                 remedy(view_layer, renderer, &missed)
             )
         })

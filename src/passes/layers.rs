@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 use super::{
-    Mapping, Pass, PassSet, Quantity,
+    Mapping, Pass, PassSet,
     channels::{ByPass, LayerKey, Place, by_pass, is_component},
     names::{
         BARE_DEPTH, BLENDER, COMBINED, POSITION_AOV, RENDERERS, Renderer, components, is_alike, is_bare,
@@ -136,7 +136,7 @@ fn assign((name, view): LayerKey, channels: &ByPass, mapping: &Mapping, part: Op
     // A file that a compositor wrote may have names of several renderers. Passes that Blender leaves out stay
     // out, since its passes differ from those of the same name in other renderers. Light, which Blender alone divides by
     // the surface's colour, stays out for the same reason.
-    let is_light = |pass: &Pass| pass.quantity() == Quantity::Radiance && *pass != Pass::Combined;
+    let is_light = |pass: &Pass| pass.carries_radiance() && *pass != Pass::Combined;
     if !renderer.is_blender() {
         for (pass, at) in by_all.iter().flat_map(|(_, passes)| passes) {
             if is_common(&at.name) && *pass != Pass::Normal && !is_light(pass) {

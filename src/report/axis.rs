@@ -96,8 +96,8 @@ fn round_step(step: f64) -> f64 {
 
 /// A tick's value without a tail of zeros or rounding noise.
 pub fn tick_label(value: f64) -> String {
-    if value != 0.0 && !(1e-6..1e6).contains(&value.abs()) {
-        return format!("{value:.0e}");
+    if value != 0.0 && !(1e-4..1e6).contains(&value.abs()) {
+        return format!("{value:.1e}").replace(".0e", "e");
     }
     let text = format!("{value:.6}");
     text.trim_end_matches('0').trim_end_matches('.').into()
@@ -105,6 +105,8 @@ pub fn tick_label(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     #[test]
@@ -116,6 +118,7 @@ mod tests {
             (vec![0.81, 0.83], false),
             (vec![0.1, 0.95], false),
             (vec![7.0], true),
+            (vec![2e-6], true),
             (vec![5e-324], true),
             (vec![5e-324, 1.0], true),
             (vec![5e-324, f64::MAX], true),
@@ -125,7 +128,9 @@ mod tests {
         ] {
             let ticks = Scale::new(values.iter().copied(), logarithmic, (0, 100)).ticks();
             assert!((2..=12).contains(&ticks.len()), "{values:?}: {ticks:?}");
-            assert!(ticks.iter().all(|t| tick_label(*t).len() <= 6), "{ticks:?}");
+            let labels: BTreeSet<String> = ticks.iter().map(|tick| tick_label(*tick)).collect();
+            assert!(labels.iter().all(|label| label.len() <= 8), "{labels:?}");
+            assert_eq!(labels.len(), ticks.len(), "{labels:?}");
         }
         assert_eq!(tick_label(0.30000000000000004), "0.3");
         assert_eq!(tick_label(1000.0), "1000");

@@ -181,13 +181,11 @@ impl Bars {
         canvas.line(&[(area.left, area.bottom), (end, area.bottom)], INK, 1)
     }
 
-    /// Which bar of a group is the best; none where fewer than two methods have a value.
-    fn best(&self, group: &Group) -> Option<usize> {
-        let cost = |value: f64| if self.is_error { value } else { -value };
-        let scored = group.values.iter().enumerate().filter_map(|(i, v)| Some((i, cost((*v)?))));
-        let scored: Vec<(usize, f64)> = scored.collect();
-        let best = scored.iter().min_by(|a, b| a.1.total_cmp(&b.1))?;
-        (scored.len() > 1).then_some(best.0)
+    /// The best value of a group; none where fewer than two methods have one.
+    fn best(&self, group: &Group) -> Option<f64> {
+        let scored = group.values.iter().flatten().copied();
+        let is_comparison = scored.clone().count() > 1;
+        scored.reduce(if self.is_error { f64::min } else { f64::max }).filter(|_| is_comparison)
     }
 
     fn draw_group<B: DrawingBackend>(
@@ -225,7 +223,7 @@ impl Bars {
                 let ink = if fits && is_dark(*colour) { WHITE } else { INK };
                 canvas.vertical_text(&text, (middle + 1, at), Style { colour: ink, ..VALUE })?;
             }
-            if best == Some(i) {
+            if best == Some(*value) {
                 canvas.dot((middle, above - 7), 3, INK)?;
             }
         }
@@ -344,6 +342,17 @@ mod tests {
             assert!(text.contains(expected), "{expected}");
         }
         assert!(!text.contains('×'));
+    }
+
+    #[test]
+    fn equals_are_all_the_best() {
+        let methods = ["noisy", "demc-m", "demc-l"];
+        let mut rows = rows(1, &methods);
+        let dots = |rows: &[Row]| svg(&bars(rows, &methods)).matches("<circle").count();
+        let of_one = dots(&rows);
+        assert!(of_one > 0);
+        rows.iter_mut().for_each(|row| row.relmse = Some(0.1));
+        assert_eq!(dots(&rows), 3 * of_one);
     }
 
     #[test]

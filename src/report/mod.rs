@@ -32,6 +32,7 @@ mod summary;
 
 use std::path::{Path, PathBuf};
 
+pub(crate) use chart::number_label;
 pub use figure::Figure;
 pub use heat::{HeatCell, HeatMap};
 #[cfg(feature = "train")]

@@ -21,7 +21,11 @@ use super::{
     sheet,
     summary::{self, MethodSummary},
 };
-use crate::{Error, Result, frame::prepare_folder, testset::Pair};
+use crate::{
+    Error, Result,
+    frame::{alone_in, prepare_folder},
+    testset::Pair,
+};
 
 /// What a run tells while it goes on.
 #[derive(Debug)]
@@ -45,13 +49,15 @@ pub enum EvalEvent<'a> {
 /// those kept from an earlier run included, pair by pair in the order of the methods.
 ///
 /// # Errors
-/// The folder cannot be written. A pair or method that fails is no error: its row says why.
+/// The folder cannot be written, or another run writes to it. A pair or method that fails is no error: its row says why.
 pub fn evaluate(
     pairs: &[Pair],
     methods: &[Contender],
     options: &EvalOptions,
     on: &mut dyn FnMut(EvalEvent),
 ) -> Result<Vec<Row>> {
+    prepare_folder(&options.out)?;
+    let _alone = alone_in(&options.out)?;
     let mut evaluation = Evaluation::begin(pairs, methods, options, on)?;
     let mut carried = Carried::new(pairs, options);
     for (pair, sheet) in pairs.iter().zip(evaluation.sheets.clone()) {
@@ -83,7 +89,6 @@ impl<'a> Evaluation<'a> {
         options: &'a EvalOptions,
         on: &mut dyn FnMut(EvalEvent),
     ) -> Result<Self> {
-        prepare_folder(&options.out)?;
         if options.sheets {
             prepare_folder(&options.out.join("sheets"))?;
         }
@@ -321,9 +326,16 @@ pub fn remove_chart(out: &Path, name: &str) -> Result<()> {
     Ok(())
 }
 
+/// The most bytes of a scene's name in the name of its sheet: file systems take 255 of them, number and ending included.
+const LONGEST_NAME: usize = 200;
+
 /// The file name of the pair's sheet: unique in the test set even where a manifest repeats a scene.
 pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
-    let file_name = |pair: &Pair| pair.id().replace(['/', '\\'], "_");
+    let file_name = |pair: &Pair| {
+        let mut name = pair.id().replace(['/', '\\'], "_");
+        name.truncate(name.floor_char_boundary(LONGEST_NAME));
+        name
+    };
     let id = file_name(pair);
     // Some disks take capital letters for small ones.
     let is_twin = |other: &&Pair| file_name(other).to_lowercase() == id.to_lowercase();

@@ -12,6 +12,7 @@ use plotters::prelude::{DrawingBackend, RGBColor};
 use super::{
     NOISY,
     canvas::{Anchor, Canvas, Style, draw_on, write_png},
+    chart::number_label,
     rows::Row,
 };
 use crate::{
@@ -324,7 +325,8 @@ impl Layout {
         let Some(row) = row else { return Ok(()) };
         let below = top + (self.lines() * (self.cell_height + GAP)) as i32;
         let value = |v: Option<f64>, digits: usize| v.map_or("-".into(), |v| format!("{v:.digits$}"));
-        let first = format!("RelMSE {}   SSIM {}", value(row.relmse, 4), value(row.ssim, 4));
+        let relmse = row.relmse.map_or("-".into(), number_label);
+        let first = format!("RelMSE {relmse}   SSIM {}", value(row.ssim, 4));
         let second = match row.seconds {
             Some(seconds) => format!("FLIP {}   {}", value(row.flip, 3), duration(seconds)),
             None => format!("FLIP {}", value(row.flip, 3)),

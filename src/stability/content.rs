@@ -42,6 +42,8 @@ pub const COLUMNS: [Column<Case>; 12] = [
 pub struct Case {
     /// Scene, and the frame where it belongs to a sequence.
     pub scene: String,
+    /// The reference, which tells frames of one name apart.
+    pub reference: PathBuf,
     /// Samples per pixel of the noisy renders.
     pub spp: u32,
     /// Method.
@@ -67,6 +69,11 @@ pub struct Case {
 }
 
 impl Case {
+    /// What tells a frame from others: its scene and its reference.
+    fn frame(&self) -> (&str, &Path) {
+        (&self.scene, &self.reference)
+    }
+
     /// Whether it is within the bounds; none for the input itself.
     pub fn passes(&self) -> Option<bool> {
         (self.model != NOISY).then_some(self.faults.is_empty())
@@ -138,6 +145,7 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
         let input: Vec<f64> = of(frame, NOISY).iter().filter_map(|row| row.energy).collect();
         let mut case = Case {
             scene: scene.into(),
+            reference: reference.into(),
             spp,
             model: model.into(),
             seeds: own.iter().map(|row| row.noisy.clone()).collect(),
@@ -161,21 +169,21 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
 /// A map of scenes by methods, with a group of columns for each sample count.
 pub fn map(title: String, methods: &[String], cases: &[Case], value: fn(&Case) -> Option<f64>) -> HeatMap {
     let counts: Vec<u32> = cases.iter().map(|case| case.spp).collect::<BTreeSet<_>>().into_iter().collect();
-    let mut scenes: Vec<&str> = Vec::new();
+    let mut scenes: Vec<(&str, &Path)> = Vec::new();
     for case in cases {
-        if !scenes.contains(&case.scene.as_str()) {
-            scenes.push(&case.scene);
+        if !scenes.contains(&case.frame()) {
+            scenes.push(case.frame());
         }
     }
-    let cell = |scene: &str, spp: u32, model: &String| {
-        let of_cell = |case: &&Case| case.scene == scene && case.spp == spp && case.model == *model;
+    let cell = |frame: (&str, &Path), spp: u32, model: &String| {
+        let of_cell = |case: &&Case| case.frame() == frame && case.spp == spp && case.model == *model;
         let case = cases.iter().find(of_cell);
         let is_marked = case.is_some_and(|case| !case.faults.is_empty());
         HeatCell { value: case.and_then(value), is_marked }
     };
-    let row = |scene: &&str| {
+    let row = |frame: &(&str, &Path)| {
         let cells = counts.iter().flat_map(|spp| methods.iter().map(move |model| (*spp, model)));
-        ((*scene).to_owned(), cells.map(|(spp, model)| cell(scene, spp, model)).collect())
+        (frame.0.to_owned(), cells.map(|(spp, model)| cell(*frame, spp, model)).collect())
     };
     HeatMap {
         title,

@@ -18,7 +18,7 @@ use std::path::PathBuf;
 use crate::{
     Error, Result,
     error::attempt,
-    frame::prepare_folder,
+    frame::{alone_in, prepare_folder},
     metrics::{self, display, error, ssim},
     planes::Planes,
     report::{
@@ -115,7 +115,7 @@ pub struct StabilityOptions {
 /// and `stability.html` are written. Rows of a pair or method that fails say why.
 ///
 /// # Errors
-/// A file cannot be written.
+/// A file cannot be written, or another run writes to the folder.
 pub fn run(
     pairs: &[Pair],
     methods: &[Contender],
@@ -124,6 +124,7 @@ pub fn run(
 ) -> Result<(Vec<TrialRow>, Vec<Case>)> {
     let out = &options.out;
     prepare_folder(out)?;
+    let _alone = alone_in(out)?;
     let provenance = Provenance::now();
     let made = serde_json::json!({ "provenance": &provenance, "threads": options.threads });
     write_json(&out.join("run.json"), &made)?;
@@ -248,7 +249,8 @@ fn worst(pairs: &[Pair], cases: &[Case], options: &StabilityOptions) -> Vec<Pair
     let mut chosen: Vec<Pair> = Vec::new();
     for (_, case) in ranked {
         let pair = pairs.iter().find(|pair| case.seeds.first() == Some(&pair.noisy));
-        let is_new = |pair: &&Pair| chosen.iter().all(|other| other.label() != pair.label());
+        let frame = |pair: &Pair| (pair.label(), pair.reference.clone());
+        let is_new = |pair: &&Pair| chosen.iter().all(|other| frame(other) != frame(pair));
         if chosen.len() < options.worst {
             chosen.extend(pair.filter(is_new).cloned());
         }

@@ -34,7 +34,7 @@ pub fn write(
     let body = html! {
         p {
             (failed.len()) " of " (judged) " cases are out of bounds: worse than their input in RelMSE, or with light that is "
-            "neither the reference's within 2 % nor as far off as the input's."
+            "off by 2 % more than the input's."
         }
         @for (title, svg) in maps {
             h2 { (title) }

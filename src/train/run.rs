@@ -2,7 +2,6 @@
 
 use std::{
     collections::BTreeSet,
-    fs::{File, TryLockError},
     io::Write,
     path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
@@ -21,7 +20,7 @@ use super::{
 use crate::{
     Error, Result,
     features::Inputs,
-    frame::{atomically, prepare_folder},
+    frame::{alone_in, atomically, prepare_folder},
     metrics,
     models::{
         self,
@@ -82,7 +81,7 @@ pub fn run(
     on: &mut dyn FnMut(TrainEvent),
 ) -> Result<()> {
     prepare_folder(out)?;
-    let _lock = lock(out)?;
+    let _alone = alone_in(out)?;
     let mut run = Run::begin(options, out, resume)?;
     if run.progress.step >= options.steps && !run.is_to_be_logged() {
         on(TrainEvent::Warning(format!(
@@ -103,22 +102,6 @@ pub fn run(
         on(TrainEvent::Warning(why.into()));
     }
     run.train(&training, &validation, stop, on)
-}
-
-/// Keeps other runs out of a folder until it is dropped, where the disk knows locks.
-///
-/// # Errors
-/// Another run works there, or no file can be made.
-fn lock(out: &Path) -> Result<File> {
-    let path = out.join(".lock");
-    let file = File::create(&path).map_err(Error::io("write", &path))?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => Err(Error::invalid(
-            out,
-            "another demc train works in this folder; wait for it, or choose another --out",
-        )),
-        _ => Ok(file),
-    }
 }
 
 /// A run under way.

@@ -19,7 +19,7 @@ pub struct Link {
     pub weights: Planes,
     /// How many times as bright the frame is as the neighbour: its light is multiplied by that.
     pub brightness: f32,
-    /// From 0 to 1: how far the neighbour's result counts beside what is seen of it, since its samples are fewer.
+    /// From 0 to 1: how far the neighbour counts beside its weights, since its samples are fewer.
     pub share: f32,
 }
 
@@ -62,10 +62,14 @@ pub fn merge(own: &dyn Values, is_light: bool, neighbours: &[(&dyn Values, &Link
     }
     Planes::from_rows_of_all(channels, size, |y, rows| {
         let stretches: Vec<_> = neighbours.iter().map(|(_, link)| link.flow.nearest_of_row(y)).collect();
-        let weights: Vec<_> = neighbours.iter().map(|(_, link)| link.weights.row(0, y)).collect();
+        let weights = neighbours.iter().map(|(_, link)| {
+            let weights = link.weights.row(0, y).iter().map(|weight| weight * link.share);
+            weights.collect::<Vec<f32>>()
+        });
+        let weights: Vec<Vec<f32>> = weights.collect();
         let mut sums = vec![1.0; size.0];
         for weights in &weights {
-            sums.iter_mut().zip(*weights).for_each(|(sum, weight)| *sum += weight);
+            sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
         }
         let mut there = vec![0.0; size.0];
         for (c, out) in rows.iter_mut().enumerate() {

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use table::{Better, Column, Line, ratio, score, share, table, whole};
 
 use super::{
-    EvalOptions, NOISY,
+    EvalOptions,
     palette::colours,
     picture::{self, Picture},
     plural,
@@ -109,8 +109,6 @@ impl Page<'_> {
     fn document(&self, scenes: &[Markup]) -> Markup {
         let title = format!("demc eval: {}", self.counted());
         let p = self.provenance;
-        let notes: BTreeSet<&str> =
-            self.rows.iter().map(|row| row.note.as_str()).filter(|note| !note.is_empty()).collect();
         let spp: BTreeSet<u32> = self.scenes.iter().map(|(pair, _)| pair.spp).collect();
         let body = html! {
                     p.faint {
@@ -125,9 +123,7 @@ impl Page<'_> {
                          scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
                     }
                     (self.summary())
-                    @if !notes.is_empty() {
-                        ul.faint #notes { @for note in notes { li { (note) } } }
-                    }
+                    (self.notes())
                     @for (title, svg) in self.charts {
                         h2 { (title) }
                         figure { (PreEscaped(svg)) }
@@ -162,17 +158,10 @@ impl Page<'_> {
 
     /// The best methods by RelMSE, SSIM and time, which the page names before any table.
     fn best(&self) -> Markup {
-        let winner = |value: fn(&MethodSummary) -> Option<f64>, sign: f64| {
-            let scored = self.overall().filter(|s| s.model != NOISY);
-            let scored = scored.filter_map(|s| Some((s.model.as_str(), value(s)?)));
-            let scored: Vec<(&str, f64)> = scored.collect();
-            let best = *scored.iter().min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))?;
-            // Of equals, none is the best.
-            (scored.iter().filter(|other| other.1 == best.1).count() == 1).then_some(best)
-        };
-        let relmse = winner(|s| s.of("relmse").geomean, 1.0);
-        let ssim = winner(|s| s.of("ssim").mean, -1.0);
-        let fastest = winner(|s| s.of("ms_per_mpx").geomean, 1.0);
+        let overall: Vec<&MethodSummary> = self.overall().collect();
+        let relmse = winner(&overall, |s| s.of("relmse").geomean, 1.0);
+        let ssim = winner(&overall, |s| s.of("ssim").mean, -1.0);
+        let fastest = winner(&overall, |s| s.of("ms_per_mpx").geomean, 1.0);
         html! {
             ul.best {
                 @if let Some((name, value)) = relmse {
@@ -184,6 +173,23 @@ impl Page<'_> {
                 @if let Some((name, value)) = fastest {
                     li { span { "fastest" } b { (name) } (whole(value)) " ms per megapixel" }
                 }
+            }
+        }
+    }
+
+    /// What the rows note, each with the methods and the scenes that it is of.
+    fn notes(&self) -> Markup {
+        let mut notes: BTreeMap<&str, [BTreeSet<&str>; 2]> = BTreeMap::new();
+        for row in self.rows.iter().filter(|row| !row.note.is_empty()) {
+            let [methods, scenes] = notes.entry(&row.note).or_default();
+            methods.insert(&row.model);
+            scenes.insert(&row.scene);
+        }
+        html! {
+            @if !notes.is_empty() {
+                ul.faint #notes { @for (note, [methods, scenes]) in notes {
+                    li { b { (listed(&methods)) ", " (listed(&scenes)) } ": " (note) }
+                } }
             }
         }
     }
@@ -266,7 +272,8 @@ impl Page<'_> {
             (
                 "times",
                 format!(
-                    "denoising alone, without file traffic; all methods took turns{}, each run after one that warms up{}",
+                    "denoising alone, without file traffic; all methods took turns{}, each run after one that warms up, but \
+                     of methods that take seconds{}",
                     match self.options.repeats {
                         1 => String::new(),
                         repeats => format!(" {repeats} times, whose median counts"),
@@ -282,7 +289,7 @@ impl Page<'_> {
             ),
             (
                 "memory",
-                "what denoising adds at its peak, in a process of its own; largest of all renders".into(),
+                "what denoising adds at its peak, in a process of its own; measured once for each size of frame".into(),
             ),
             ("RelMSE", "mean of (x - r)² / (r² + 0.001) over pixels and channels of linear radiance".into()),
             ("trimmed RelMSE", "the same without the worst 0.1 % of pixels".into()),
@@ -303,6 +310,30 @@ impl Page<'_> {
                 @for (name, text) in p.facts().iter().chain(&facts) { dt { (name) } dd { (text) } }
             }
         }
+    }
+}
+
+/// The name and value of the method whose `sign * value` is lowest. The input takes part: where every method makes
+/// frames worse, none of them is the best. Of equals there is no best, nor of one alone.
+fn winner<'a>(
+    methods: &[&'a MethodSummary],
+    value: fn(&MethodSummary) -> Option<f64>,
+    sign: f64,
+) -> Option<(&'a str, f64)> {
+    let scored: Vec<(&str, f64)> =
+        methods.iter().filter_map(|method| Some((method.model.as_str(), value(method)?))).collect();
+    let best = *scored.iter().min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))?;
+    let has_equal = scored.iter().filter(|other| other.1 == best.1).count() > 1;
+    (scored.len() > 1 && !has_equal).then_some(best)
+}
+
+/// Names in a list, the first few of many.
+fn listed(names: &BTreeSet<&str>) -> String {
+    const MOST: usize = 8;
+    let shown: Vec<&str> = names.iter().copied().take(MOST).collect();
+    match names.len().saturating_sub(MOST) {
+        0 => shown.join(", "),
+        more => format!("{} and {more} more", shown.join(", ")),
     }
 }
 
@@ -408,3 +439,36 @@ const SCENE: [Column<Row>; 11] = [
     cell!("ms/Mpx", Low, whole, ms_per_mpx),
     cell!("MiB", Low, whole, peak_mib),
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::{NOISY, summary::summarise};
+
+    #[test]
+    fn no_method_is_the_best_that_is_worse_than_the_input_or_alone() {
+        let best = |scores: &[(&str, f64)]| {
+            let row = |&(model, relmse): &(&str, f64)| Row {
+                model: model.into(),
+                relmse: Some(relmse),
+                ..Row::default()
+            };
+            let rows: Vec<Row> = scores.iter().map(row).collect();
+            let names: Vec<String> = scores.iter().map(|(name, _)| (*name).into()).collect();
+            let summaries = summarise(&rows, &names, NOISY);
+            let all: Vec<&MethodSummary> = summaries.iter().collect();
+            winner(&all, |s| s.of("relmse").geomean, 1.0).map(|(name, _)| name.to_owned())
+        };
+        assert_eq!(best(&[(NOISY, 0.1), ("m", 0.01), ("n", 0.02)]).as_deref(), Some("m"));
+        assert_eq!(best(&[(NOISY, 1e-6), ("m", 0.01)]).as_deref(), Some(NOISY));
+        assert_eq!(best(&[("m", 0.01)]), None);
+        assert_eq!(best(&[(NOISY, 0.1), ("m", 0.01), ("n", 0.01)]), None);
+    }
+
+    #[test]
+    fn long_lists_are_cut() {
+        let names: Vec<String> = (0..10).map(|n| n.to_string()).collect();
+        let of = |count: usize| listed(&names[..count].iter().map(String::as_str).collect());
+        assert_eq!((of(2), of(10)), ("0, 1".into(), "0, 1, 2, 3, 4, 5, 6, 7 and 2 more".into()));
+    }
+}

@@ -3,7 +3,7 @@
 use maud::{Markup, html};
 use plotters::prelude::RGBColor;
 
-use crate::report::NOISY;
+use crate::report::{NOISY, chart::number_label};
 
 /// Which values of a column are better, and come first when the page is sorted by it.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -109,7 +109,7 @@ pub fn share(value: f64) -> String {
 
 /// A multiple of the baseline.
 pub fn ratio(value: f64) -> String {
-    format!("{value:.2} ×")
+    format!("{} ×", number_label(value))
 }
 
 /// A whole number, or one decimal for fractions below ten.
@@ -149,6 +149,10 @@ mod tests {
         assert_eq!(score(1.303102), "1.303");
         assert_eq!(score(121.7875), "121.8");
         assert_eq!(score(1.2e-9), "1.200e-9");
+        assert_eq!(
+            (ratio(1.0), ratio(0.0324), ratio(12.34)),
+            ("1.00 ×".into(), "0.0324 ×".into(), "12.3 ×".into())
+        );
         assert_eq!((whole(9.53), whole(954.89), whole(0.0)), ("9.5".into(), "955".into(), "0".into()));
     }
 }
