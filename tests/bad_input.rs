@@ -39,6 +39,22 @@ fn fails_with(input: &Path, args: &[&str], code: i32, expected: &[&str]) {
     }
 }
 
+#[test]
+fn a_view_layer_without_a_beauty_is_told_by_name() {
+    use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
+
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("nobeauty.exr");
+    let list = ["V.Depth.Z", "V.Diffuse Direct.R", "W.Combined.R", "W.Combined.G", "W.Combined.B"]
+        .map(|name| AnyChannel::new(name, FlatSamples::F32(vec![0.5; 64])));
+    let channels = AnyChannels::sort(list.into_iter().collect());
+    Image::from_channels((8, 8), channels).write().to_file(&path).unwrap();
+    for more in [&[][..], &["--passes", "--replace"]] {
+        let args = [&["--view-layer", "V"], more].concat();
+        fails_with(&path, &args, 1, &["view layer 'V' has no Combined pass", "Passes > Data > Combined"]);
+    }
+}
+
 fn file(bytes: &[u8]) -> (TempDir, std::path::PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("broken.exr");

@@ -137,6 +137,52 @@ fn a_report_and_inspect_search_folders_too() {
 }
 
 #[test]
+fn a_report_goes_by_the_last_try_of_a_log_and_finds_what_was_never_rendered() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::create_dir(path("shot")).unwrap();
+    for name in ["a.0001.exr", "a.0002.exr"] {
+        write_render(&path("shot").join(name), 24, 18, |_, pixel| (pixel % 7) as f32 / 7.0);
+    }
+    let log = |name: &str, arguments: &str| {
+        let mut command = demc();
+        command.current_dir(folder.path()).args(["denoise", "shot", "--json", "--model", "noisy", "--out"]);
+        let run = command.args(arguments.split_whitespace()).output().unwrap();
+        let mut lines = fs::read(path(name)).unwrap_or_default();
+        lines.extend(run.stdout);
+        fs::write(path(name), lines).unwrap();
+    };
+    let report = |arguments: &str| {
+        let mut command = demc();
+        command.current_dir(folder.path()).arg("report").args(arguments.split_whitespace()).assert()
+    };
+    // Results among the renders are no renders.
+    log("one.jsonl", "shot/clean");
+    report("one.jsonl --of shot --recursive").success().stdout(contains("2 denoised"));
+    report("one.jsonl --of shot --frames 1-2").success();
+    report("one.jsonl --of shot --frames 1-4")
+        .code(1)
+        .stdout(contains("frames 3-4").and(contains("1 missing")));
+    // What a farm's engine puts before each line, an editor before the first, and a killed task before the next.
+    let lines = fs::read_to_string(path("one.jsonl")).unwrap();
+    let prefixed =
+        format!("\u{feff}{}", lines.replace("{\"input\":", "pid=12 > {\"input\":\"a.exr\",\"out{\"input\":"));
+    fs::write(path("prefixed.jsonl"), prefixed).unwrap();
+    report("prefixed.jsonl --of shot").success().stderr("");
+    // A frame that is rendered again and cannot be denoised is not what it was before; in another log it may be.
+    let whole = fs::read(path("shot/a.0002.exr")).unwrap();
+    fs::write(path("shot/a.0002.exr"), &whole[..whole.len() / 2]).unwrap();
+    log("two.jsonl", "shot/clean --overwrite");
+    report("one.jsonl two.jsonl").success();
+    report("two.jsonl one.jsonl").success();
+    log("one.jsonl", "shot/clean --overwrite");
+    report("one.jsonl").code(1).stdout(contains("failed: ").and(contains("a.0002.exr")));
+    fs::write(path("shot/a.0002.exr"), &whole).unwrap();
+    log("one.jsonl", "shot/clean --overwrite");
+    report("one.jsonl").success();
+}
+
+#[test]
 fn no_more_threads_are_started_than_there_is_use_for() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = demc();
@@ -210,6 +256,8 @@ fn results_older_than_their_renders_are_told_and_kept() {
 
 #[test]
 fn results_that_were_made_otherwise_are_told_and_kept() {
+    const BY: &str = concat!("demc ", env!("CARGO_PKG_VERSION"));
+
     let folder = tempfile::tempdir().unwrap();
     SHOT.write(&folder.path().join("a.exr"), 1);
     fs::create_dir(folder.path().join("weights")).unwrap();
@@ -225,7 +273,7 @@ fn results_that_were_made_otherwise_are_told_and_kept() {
     run(first).stderr(is_made().not());
     run(first).stdout(contains("is there already")).stderr(is_made().not());
     let told = |made: &str, now: &str| {
-        let why = format!("was made with {made}, and was kept; --overwrite makes it with {now}");
+        let why = format!("was made with {BY} {made}, and was kept; --overwrite makes it with {BY} {now}");
         contains(format!("demc: note: out{}a.exr: {why}", std::path::MAIN_SEPARATOR))
     };
     let made = "--model weights/mine.safetensors:f32 --alpha keep";
@@ -243,17 +291,19 @@ fn results_that_were_made_otherwise_are_told_and_kept() {
     run("out --out more --layer Second --model demc-s");
     run("out --out more --layer Second --model demc-s").stderr(is_made().not());
     run(&first.replace("a.exr --out out", "out --out more")).stderr(is_made().not());
-    run("out --out more --layer Second").stderr(contains("made with --model demc-s, and was kept"));
+    run("out --out more --layer Second")
+        .stderr(contains(format!("made with {BY} --model demc-s, and was kept")));
     demc()
         .current_dir(folder.path())
         .args(["inspect", "more/a.exr"])
         .assert()
         .success()
-        .stdout(contains(format!("'ViewLayer.Denoised' was made with {made}\n")))
-        .stdout(contains("'ViewLayer.Second' was made with --model demc-s\n"));
+        .stdout(contains(format!("'ViewLayer.Denoised' was made with {BY} {made}\n")))
+        .stdout(contains(format!("'ViewLayer.Second' was made with {BY} --model demc-s\n")));
     // Names of layers may hold what stands between other things.
     run("a.exr --out odd --layer Final:_v2 --model demc-s");
-    run("a.exr --out odd --layer Final:_v2").stderr(contains("made with --model demc-s, and was kept"));
+    run("a.exr --out odd --layer Final:_v2")
+        .stderr(contains(format!("made with {BY} --model demc-s, and was kept")));
     // What is made anew is made as it was asked for.
     run("a.exr --out out --model demc-s --overwrite");
     run("a.exr --out out --model demc-s").stderr(is_made().not());

@@ -123,7 +123,10 @@ fn a_part_that_is_added_says_of_its_colours_what_the_beauty_does() {
         [
             ("colorInteropID".to_string(), text("lin_ap1_scene")),
             ("demc".to_string(), text("V.Denoised")),
-            ("demcMethod".to_string(), text("V.Denoised\n--model noisy"))
+            (
+                "demcMethod".to_string(),
+                text(concat!("V.Denoised\ndemc ", env!("CARGO_PKG_VERSION"), " --model noisy"))
+            )
         ]
     );
 }

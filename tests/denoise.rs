@@ -116,6 +116,23 @@ fn denoises_both_eyes_of_stereo_renders() {
 }
 
 #[test]
+fn light_stored_as_whole_numbers_gets_a_result_that_is_none() {
+    use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
+
+    let (dir, out) = out();
+    let path = dir.path().join("whole.exr");
+    let list = ["R", "G", "B"].map(|component| {
+        AnyChannel::new(format!("ViewLayer.Combined.{component}").as_str(), FlatSamples::U32(vec![2; 64]))
+    });
+    let channels = AnyChannels::sort(list.into_iter().collect());
+    Image::from_channels((8, 8), channels).write().to_file(&path).unwrap();
+    demc(&out).arg(&path).assert().success();
+    let result = read_exr(out.join("whole.exr"));
+    let added = samples(&result, "ViewLayer.Denoised.R").unwrap();
+    assert!(matches!(added, FlatSamples::F32(values) if *values == [2.0; 64]), "{added:?}");
+}
+
+#[test]
 fn chooses_among_view_layers() {
     let file = "blender4_two_layers.exr";
     let (_dir, out) = out();

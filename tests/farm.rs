@@ -269,7 +269,7 @@ fn the_open_job_description_runs_in_chunks_and_reports() {
             ("Input", folder.path().join("renders").display().to_string()),
             ("Output", folder.path().join(out).display().to_string()),
             ("Frames", frames.into()),
-            ("FramesPerTask", "3".into()),
+            ("FramesPerTask", if frames.len() > 100 { "100" } else { "3" }.into()),
             ("Model", "noisy".into()),
             ("ExtraArguments", "--preview --threads 1".into()),
             ("Demc", cargo_bin("demc").display().to_string()),
@@ -293,6 +293,15 @@ fn the_open_job_description_runs_in_chunks_and_reports() {
     let mut made = results(&folder.path().join("some"));
     made.retain(|name, _| name.ends_with(".exr"));
     assert_eq!(made, expected);
+
+    // Many single frames in one task, of which some were never rendered.
+    let scattered: Vec<String> = (1..80).map(|n| (n * n).to_string()).collect();
+    let many = job(&scattered.join(","), "many");
+    let said = String::from_utf8_lossy(&many.stdout);
+    assert!(
+        !many.status.success() && said.contains("3 denoised in ") && said.contains("frames 16,25,"),
+        "{said}"
+    );
 
     // A job with a frame that cannot be denoised fails, lists it, and does all others. A quote in a path is no shell's.
     fs::write(folder.path().join("renders/shot_0004spp.0002.exr"), "broken").unwrap();

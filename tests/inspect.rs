@@ -145,4 +145,12 @@ fn a_bad_file_is_named_and_the_others_are_shown() {
         .code(1)
         .stderr(contains("bad.exr: is not an EXR file"))
         .stdout(contains("blender4.exr"));
+    let run = inspect().arg("--json").args([&bad, &data("blender4.exr")]).assert().code(1);
+    let lines: Vec<serde_json::Value> = String::from_utf8_lossy(&run.get_output().stdout)
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!((lines.len(), &lines[0]["path"]), (2, &bad.to_str().unwrap().into()));
+    assert!(lines[0]["error"].as_str().unwrap().contains("is not an EXR file"), "{}", lines[0]);
+    assert!(lines[1].get("error").is_none());
 }

@@ -79,7 +79,7 @@ def _prepare_output(scene, put):
             put(settings, "file_format", "OPEN_EXR_MULTILAYER", words)
     if settings.exr_codec not in _LOSSLESS:
         put(settings, "exr_codec", "ZIP", "files are compressed without loss (ZIP)")
-    if _views_lack(scene):
+    if _keeps_no_views(scene):
         put(settings, "views_format", "MULTIVIEW", "both eyes go into one file")
     if _is_unnamed(scene):
         put(scene.render, "use_file_extension", True, "files are named .exr")
@@ -94,16 +94,10 @@ def _wants_interleave(scene):
     return not is_square and getattr(render.image_settings, "use_exr_interleave", None) is False
 
 
-def _views_lack(scene):
-    """What the files of several eyes lack, where it is something."""
-    written = scene.render.image_settings.views_format
-    if not scene.render.use_multiview or written == "MULTIVIEW":
-        return None
-    if written != "INDIVIDUAL":
-        return "Blender writes no Stereo 3D files with passes: set Output > Views Format to Multi-View"
-    if scene.demc.use_temporal:
-        return "Files of one eye each have no frames beside them: set Output > Views Format to Multi-View"
-    return None
+def _keeps_no_views(scene):
+    """Whether two eyes go into one picture, which Blender writes to no file with passes."""
+    render = scene.render
+    return render.use_multiview and render.image_settings.views_format not in ("INDIVIDUAL", "MULTIVIEW")
 
 
 def _is_unnamed(scene):
@@ -164,8 +158,8 @@ def _of_output(scene):
         return [Lack(f"{settings.exr_codec} compression loses detail of the passes: set Output > Codec to ZIP", True)]
     if _wants_interleave(scene):
         return [Lack("Blender writes no frames whose pixels are not square: turn on Output > Interleave", True)]
-    if views := _views_lack(scene):
-        return [Lack(views, True)]
+    if _keeps_no_views(scene):
+        return [Lack("Blender writes no Stereo 3D files with passes: set Output > Views Format to Multi-View", True)]
     if _is_unnamed(scene):
         return [Lack("Files without .exr in their names are not found again: turn on Output > File Extensions", True)]
     return []

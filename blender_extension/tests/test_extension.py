@@ -207,13 +207,13 @@ class Extension(unittest.TestCase):
         self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
         self.assertIn(f"Denoised {self.scene.name}", bpy.data.images)
         self.assertEqual(self.scene.render.image_settings.views_format, "INDIVIDUAL")
-        # Files of one eye each are no shot.
-        passes = sys.modules[f"{MODULE}.passes"]
-        self.scene.demc.use_temporal = True
-        self.assertTrue(any("one eye each" in lack.text for lack in passes.missing(self.scene)))
-        passes.prepare(self.scene)
-        self.assertEqual(passes.missing(self.scene), [])
-        self.assertEqual(self.scene.render.image_settings.views_format, "MULTIVIEW")
+        # Frames of one eye each are shots.
+        self.scene.demc.use_temporal = self.scene.demc.overwrite = True
+        self.prepared()
+        bpy.ops.render.render(animation=True)
+        self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
+        notes = sys.modules[f"{MODULE}.jobs"].current().notes
+        self.assertFalse([note for note in notes if "denoised alone" in note], notes)
 
     def test_one_eye_of_two(self):
         self.prepared()

@@ -76,6 +76,7 @@ if [[ -z ${SLURM_ARRAY_TASK_ID:-} ]]; then
 fi
 
 mine=("${all[@]:SLURM_ARRAY_TASK_ID * chunk:chunk}")
+((${#mine[@]})) || fail "task $SLURM_ARRAY_TASK_ID has no frames; unset SLURM_ARRAY_TASK_ID to submit"
 joined=$(IFS=, && echo "${mine[*]}")
 command=()
 for word in "$@"; do

@@ -5,7 +5,7 @@
 //! status.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs::File,
     io::{BufRead, BufReader},
     path::PathBuf,
@@ -14,6 +14,7 @@ use std::{
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 
+use super::denoise::Frames;
 use super::inputs::{self, Inputs, Search};
 use super::lines::{ExitCode, SOME_FAILED, print_line, warn_line};
 use super::ranking::{Ranking, parse_wish};
@@ -25,7 +26,7 @@ use crate::{Error, Result, frame::place_of};
 Examples:
   demc report logs/*.jsonl
   demc report logs/*.jsonl --by-error 0.005
-  demc report logs/*.jsonl --of renders")]
+  demc report logs/*.jsonl --of renders --frames 1-240")]
 pub struct Args {
     /// Files of what `demc denoise --json` printed, one or several tasks in each
     #[arg(required = true, value_name = "LOG")]
@@ -42,6 +43,11 @@ pub struct Args {
     #[allow(clippy::option_option, reason = "not at all, the list, what is wanted besides")]
     by_error: Option<Option<f64>>,
 
+    /// Of these inputs those whose names end in one of these numbers, as --frames of `demc denoise` takes them; numbers
+    /// that none of them has are missing too
+    #[arg(long, value_name = "LIST", requires = "of", allow_hyphen_values = true)]
+    frames: Option<Frames>,
+
     /// Search the directories of --of with all that are in them
     #[arg(long, requires = "of")]
     recursive: bool,
@@ -51,6 +57,7 @@ pub struct Args {
 #[derive(Deserialize)]
 struct Line {
     input: PathBuf,
+    output: Option<PathBuf>,
     status: Status,
     error: Option<String>,
     seconds: Option<f64>,
@@ -71,6 +78,8 @@ struct Fate {
     /// Its path, as it was told.
     input: PathBuf,
     status: Status,
+    /// Which log told of it.
+    log: usize,
     error: String,
     /// The result's expected RelMSE, and the samples of its render.
     expected_error: Option<f64>,
@@ -83,16 +92,18 @@ struct Fate {
 /// A log cannot be read, or the inputs of `--of` name no file.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let mut frames: BTreeMap<PathBuf, Fate> = BTreeMap::new();
+    let mut results: BTreeSet<PathBuf> = BTreeSet::new();
     let (mut seconds, mut lines) = (0.0, 0usize);
-    for log in &args.logs {
+    for (number, log) in args.logs.iter().enumerate() {
         let mut unreadable = 0;
         for text in BufReader::new(File::open(log).map_err(Error::io("read", log))?).split(b'\n') {
             let text = text.map_err(Error::io("read", log))?;
-            match serde_json::from_slice::<Line>(&text) {
+            match serde_json::from_slice::<Line>(&text[start_of_object(&text)..]) {
                 Ok(line) => {
                     lines += 1;
                     seconds += line.seconds.unwrap_or_default();
-                    add(&mut frames, line);
+                    results.extend(line.output.as_deref().map(place_of));
+                    add(&mut frames, line, number);
                 }
                 Err(_) if text.trim_ascii().is_empty() => {}
                 Err(_) => unreadable += 1,
@@ -104,7 +115,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
     }
     forgive_folders(&mut frames);
-    let missing = missing(&args.of, args.recursive, &frames)?;
+    let missing = missing(args, |place| frames.contains_key(place) || results.contains(place))?;
     let count = |status| frames.values().filter(|frame| frame.status == status).count();
     for frame in frames.values().filter(|frame| frame.status == Status::Failed) {
         // Errors name their file already.
@@ -143,8 +154,16 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     Ok(if is_silent || failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
-/// Adds a line. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap.
-fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
+/// Where the object of a line begins. A farm's engine may put words of its own before it (`pid=1234 > `), as an editor
+/// does with a byte-order mark, and a task that was killed the beginning of an object.
+fn start_of_object(text: &[u8]) -> usize {
+    const BEGINNING: &[u8] = br#"{"input":"#;
+    text.windows(BEGINNING.len()).rposition(|window| window == BEGINNING).unwrap_or(0)
+}
+
+/// Adds a line of a log. A frame counts as denoised if any try denoised it, since tasks may be run again or overlap;
+/// but not if it failed later in the same log, which tells in which order things happened.
+fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line, log: usize) {
     let rank = |status| match status {
         Status::Failed => 0,
         Status::Skipped => 1,
@@ -152,25 +171,30 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line) {
     };
     // Tasks may reach a folder by different paths.
     let place = place_of(&line.input);
-    let known = frames.get(&place).map(|frame| rank(frame.status));
-    if known.is_none_or(|known| known <= rank(line.status)) {
+    let is_later = |known: &Fate| {
+        rank(known.status) <= rank(line.status) || (known.log == log && line.status == Status::Failed)
+    };
+    if frames.get(&place).is_none_or(is_later) {
         let Line { input, status, error, expected_error, samples, .. } = line;
-        let fate = Fate { input, status, error: error.unwrap_or_default(), expected_error, samples };
+        let fate = Fate { input, status, log, error: error.unwrap_or_default(), expected_error, samples };
         frames.insert(place, fate);
     }
 }
 
-/// Says of which inputs no task tells, and which of them cannot be looked at.
-fn missing(of: &[PathBuf], recursive: bool, frames: &BTreeMap<PathBuf, Fate>) -> Result<Vec<String>> {
-    if of.is_empty() {
+/// Says of which inputs no task tells, which of them cannot be looked at, and which frames asked for are not there.
+/// `is_told` of the [place](place_of) of an input or a result.
+fn missing(args: &Args, is_told: impl Fn(&PathBuf) -> bool) -> Result<Vec<String>> {
+    if args.of.is_empty() {
         return Ok(Vec::new());
     }
-    let search = Search { recursive, ..Search::default() };
-    let Inputs { files, unusable, .. } = inputs::expand(of, &search)?;
+    let search = Search { recursive: args.recursive, ..Search::default() };
+    let Inputs { mut files, unusable, .. } = inputs::expand(&args.of, &search)?;
+    files.retain(|input| args.frames.as_ref().is_none_or(|frames| frames.has(input)));
     let unseen = unusable.into_iter().map(|(_, error)| error.to_string());
-    let files = files.into_iter().map(|input| input.file);
-    let untold = files.filter(|file| !frames.contains_key(&place_of(file)));
-    Ok(unseen.chain(untold.map(|file| format!("{}: no task tells of it", file.display()))).collect())
+    let lacking = args.frames.as_ref().and_then(|frames| frames.lacking(&files));
+    let untold = files.iter().map(|input| &input.file).filter(|file| !is_told(&place_of(file)));
+    let untold = untold.map(|file| format!("{}: no task tells of it", file.display()));
+    Ok(unseen.chain(lacking).chain(untold).collect())
 }
 
 /// Leaves out folders that could not be read at first, and of which files were done later.

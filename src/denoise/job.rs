@@ -86,8 +86,8 @@ impl Default for Options {
 }
 
 impl Options {
-    /// How a result is made: the options that decide what is in it and that nothing else in the file tells, as they
-    /// are said on the command line. Guides go by their names, wherever they lie, and weights by that of their folder too,
+    /// How a result is made: by which version, and the options that decide what is in it and that nothing else in the
+    /// file tells, as they are said on the command line. Guides go by their names, wherever they lie, and weights by that of their folder too,
     /// since every run's are called alike.
     fn method(&self, model: &dyn Denoiser) -> String {
         let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
@@ -96,7 +96,8 @@ impl Options {
             let (place, variant) = (file.canonicalize().ok()?, &model.name()[file.as_os_str().len()..]);
             Some(format!("{}/{}{variant}", name(place.parent()?), name(&place)))
         });
-        let mut said = vec![format!("--model {}", weights.as_deref().unwrap_or(model.name()))];
+        let model = weights.as_deref().unwrap_or(model.name());
+        let mut said = vec![format!("demc {} --model {model}", env!("CARGO_PKG_VERSION"))];
         said.extend(option("--alpha", Alpha::ALL, self.alpha));
         said.extend(option("--wrap", Wrap::ALL, self.wrap));
         said.extend(self.temporal.map(|reach| format!("--temporal {reach}")));

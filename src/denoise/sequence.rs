@@ -35,11 +35,11 @@ impl Place {
     fn of(file: &Path) -> Option<Self> {
         let (name, stem) = (file.file_name()?, file.file_stem()?);
         let readable = stem.to_string_lossy();
-        let (head, number) = split(&readable)?;
-        // The number has as many bytes in the name itself.
+        let (head, number, eye) = split(&readable)?;
+        // What comes after the head has as many bytes in the name itself.
         let (stem, name) = (stem.as_encoded_bytes(), name.as_encoded_bytes());
         let before = stem[..stem.len() - (readable.len() - head.len())].to_vec();
-        let after = name[stem.len()..].to_vec();
+        let after = name[stem.len() - eye.len()..].to_vec();
         Some(Self { key: Key { folder: file.parent()?.to_owned(), before, after }, number })
     }
 
@@ -161,6 +161,16 @@ mod tests {
         );
         assert!(sequences[0].files[&12].ends_with("a.0012.exr"));
         assert!(sequences[3].files[&12].ends_with("a.012.exr"));
+    }
+
+    #[test]
+    fn each_eye_has_neighbours_of_its_own() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["e_0001_L.exr", "e_0001_R.exr", "e_0002_L.exr", "e_0002_R.exr", "e_0003_left.exr"] {
+            fs::write(dir.path().join(name), "").unwrap();
+        }
+        let found = neighbours(&dir.path().join("e_0002_L.exr"), 1);
+        assert_eq!(found, BTreeMap::from([(-1, dir.path().join("e_0001_L.exr"))]));
     }
 
     #[test]

@@ -13,6 +13,25 @@ pub fn between(at: usize, squares: usize) -> (usize, f32) {
     (place as usize, place.fract())
 }
 
+/// Writes, for every pixel of a row, the value of a line of squares between the centres of the two that are nearest.
+#[inline(always)]
+pub fn spread(line: &[f32], row: &mut [f32]) {
+    const HALF: usize = SQUARE / 2;
+    let (width, squares) = (row.len(), line.len());
+    // All pixels from the centre of one square to the centre of the next are interpolated between these two.
+    let runs = row.get_mut(HALF..).unwrap_or_default().as_chunks_mut::<SQUARE>().0;
+    let end = HALF + SQUARE * runs.len().min(squares - 1);
+    for (run, (left, right)) in runs.iter_mut().zip(line.iter().zip(&line[1..])) {
+        for (i, value) in run.iter_mut().enumerate() {
+            *value = left + (right - left) * ((i as f32 + 0.5) / SQUARE as f32);
+        }
+    }
+    for x in (0..HALF.min(width)).chain(end..width) {
+        let (left, share) = between(x, squares);
+        row[x] = line[left] + (line[(left + 1).min(squares - 1)] - line[left]) * share;
+    }
+}
+
 /// The rows above, at and below `row` that `window` reaches, each with its weight, as [`around`] reads them.
 pub fn rows_around<'a>(
     rows: &'a [&'a [f32]],
@@ -77,6 +96,30 @@ fn add_weighted<'a>(mut lines: impl Iterator<Item = (f32, &'a [f32])>, output: &
                 }
             }
             None => output.iter_mut().zip(line).for_each(|(sum, v)| *sum += weight * v),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_is_spread_between_the_centres_of_squares() {
+        for width in [1usize, 2, 3, 4, 5, 7, 8, 93, 1917] {
+            let squares = width.div_ceil(SQUARE);
+            let line: Vec<f32> = (0..squares).map(|s| ((s * 37) % 11) as f32 - 4.3).collect();
+            let mut row = vec![f32::NAN; width];
+            spread(&line, &mut row);
+            for (x, value) in row.into_iter().enumerate() {
+                let (left, share) = between(x, squares);
+                let right = line[(left + 1).min(squares - 1)];
+                assert_eq!(
+                    value.to_bits(),
+                    (line[left] + (right - line[left]) * share).to_bits(),
+                    "{x} of {width}"
+                );
+            }
         }
     }
 }

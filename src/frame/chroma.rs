@@ -159,6 +159,22 @@ mod tests {
     }
 
     #[test]
+    fn one_half_channel_of_half_resolution_is_read_where_a_block_is_a_row() {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/containers/luminance_chroma.exr");
+        let frame = crate::frame::Frame::read(file).unwrap();
+        let mut header = frame.layout(0).unwrap().clone();
+        assert!(is_readable(&header));
+        let chroma = header.channels.list.iter().position(|c| is_chroma(c.name.as_slice())).unwrap();
+        header.channels.list.remove(chroma);
+        for (compression, is_read) in
+            [(C::ZIP16, false), (C::ZIP1, true), (C::PIZ, false), (C::Uncompressed, true)]
+        {
+            header.compression = compression;
+            assert_eq!(is_readable(&header), is_read, "{compression:?}");
+        }
+    }
+
+    #[test]
     fn weights_of_primaries() {
         // Rec. 709 and D65 (ITU-R BT.709-6), and ACEScg (S-2014-004).
         let rec709 = weights([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290]).unwrap();

@@ -51,10 +51,12 @@ fn weights(logits: &[f32], pixels: usize, at: usize) -> [f32; CORNERS] {
 /// What the network predicts for a blend. Logits beyond +-40 count as +-40 and have no gradient.
 #[derive(Clone, Copy)]
 pub struct Masks<'a> {
-    /// The share of the coarse level before its logistic, (1, H, W).
+    /// The share of the coarse level before its logistic, (1, L, W).
     pub alpha: &'a [f32],
-    /// Logits of the four corners, (4, H, W).
+    /// Logits of the four corners, (4, L, W).
     pub corners: &'a [f32],
+    /// The row of these that is that of the first row to blend. H rows from there on are read.
+    pub first: usize,
 }
 
 /// Which rows of a taller frame are blended.
@@ -77,7 +79,8 @@ pub struct Place {
 pub fn blend(size: Size, place: Place, (fine, coarse): (&[f32], &[f32]), masks: Masks, output: &mut [f32]) {
     let n = size.pixels();
     assert_eq!((fine.len(), output.len(), coarse.len() % (3 * size.w / 2).max(1)), (3 * n, 3 * n, 0));
-    assert_eq!((masks.alpha.len(), masks.corners.len()), (n, CORNERS * n));
+    assert_eq!((masks.alpha.len() % size.w.max(1), masks.corners.len()), (0, CORNERS * masks.alpha.len()));
+    assert!(masks.first * size.w + n <= masks.alpha.len(), "masks of all rows to blend");
     assert!(size.w.is_multiple_of(2), "only even rows have halves");
     let [red, green, blue] = thirds(output).map(|plane| plane.par_chunks_mut(size.w));
     red.zip(green).zip(blue).enumerate().for_each(|(y, ((red, green), blue))| {
@@ -104,6 +107,10 @@ impl Kernel for BlendRow<'_> {
         let h = coarse.len() / (3 * narrow).max(1);
         let (own, other) = near(place.first + y, place.total / 2);
         let of = |values: &'_ [f32], plane: usize| values[plane * n + y * w..][..w].as_ptr();
+        let predicted = masks.alpha.len();
+        let of_masks = |values: &'_ [f32], plane: usize| {
+            values[plane * predicted + (masks.first + y) * w..][..w].as_ptr()
+        };
         // The coarse lines of each colour with the edge repeated, and room for what a group of pixels may
         // read beyond.
         let stride = narrow + 2 + LANES;
@@ -114,8 +121,8 @@ impl Kernel for BlendRow<'_> {
             line[1..=narrow].copy_from_slice(row);
             (line[0], line[narrow + 1]) = (row[0], row[narrow - 1]);
         }
-        let alpha = of(masks.alpha, 0);
-        let corners: [_; CORNERS] = std::array::from_fn(|i| of(masks.corners, i));
+        let alpha = of_masks(masks.alpha, 0);
+        let corners: [_; CORNERS] = std::array::from_fn(|i| of_masks(masks.corners, i));
         for x in (0..w).step_by(LANES) {
             let count = LANES.min(w - x);
             // SAFETY: of rows no more is read and written than they have, and a group of a

@@ -45,8 +45,10 @@ pub struct Filter<'a> {
     pub k: usize,
     /// The image, (3, H, W).
     pub image: &'a [f32],
-    /// Kernel logits, (k*k, R, W).
+    /// Kernel logits, (k*k, L, W).
     pub logits: &'a [f32],
+    /// The row of the logits that is that of the first row to filter. R rows from there on are read.
+    pub first: usize,
     /// Confidence of each pixel, (1, H, W), or nothing for equal trust.
     pub confidence: Option<&'a [f32]>,
 }
@@ -90,13 +92,25 @@ impl<'a> Filter<'a> {
         let n = self.size.pixels();
         assert!(self.k % 2 == 1, "kernels have a centre");
         assert!(self.rows.0 <= self.rows.1 && self.rows.1 <= self.size.h, "only rows of the image");
-        assert_eq!((self.image.len(), self.logits.len()), (3 * n, self.k * self.k * self.filtered()));
+        assert_eq!(
+            (self.image.len(), self.logits.len() % (self.k * self.k * self.size.w).max(1)),
+            (3 * n, 0)
+        );
+        assert!(
+            self.first * self.size.w + self.filtered() <= self.predicted(),
+            "logits of all rows to filter"
+        );
         assert!(self.confidence.is_none_or(|c| c.len() == n));
     }
 
     /// Number of pixels that are filtered.
     fn filtered(&self) -> usize {
         (self.rows.1 - self.rows.0) * self.size.w
+    }
+
+    /// Number of pixels that there are logits of.
+    fn predicted(&self) -> usize {
+        self.logits.len() / (self.k * self.k)
     }
 
     /// The taps of row `y` of the filtered rows that read a row inside the image. Each is its place in the
@@ -126,7 +140,7 @@ impl<'a> Filter<'a> {
     ) {
         let Size { w, .. } = self.size;
         let (x0, x1) = columns(w, dx);
-        let logits = &self.logits[tap * self.filtered() + y * w..][x0..x1];
+        let logits = &self.logits[tap * self.predicted() + (self.first + y) * w..][x0..x1];
         let out = &mut out[x0..x1];
         match self.confidence {
             Some(confidence) => {
@@ -193,7 +207,7 @@ impl<'a> Filter<'a> {
         each_row(w, outputs, total, |y, output, total| {
             let line = |values: &'a [f32], row: usize| &values[row * w..][..w];
             let taps = self.taps(y).into_iter().map(|(tap, row, dx)| Tap {
-                logits: line(self.logits, tap * (n / w) + y),
+                logits: line(self.logits, tap * (self.predicted() / w) + self.first + y),
                 confidence: self.confidence.map_or(&equal[..], |trust| line(trust, row)),
                 images: images.map(|image| std::array::from_fn(|c| line(image, c * self.size.h + row))),
                 dx,
@@ -479,7 +493,8 @@ mod tests {
         let confidence: Vec<f32> = (0..n).map(|i| wave(i + 5, 30.0)).collect();
         for (offset, confidence) in [(0.0, None), (500.0, Some(&confidence[..])), (-500.0, None)] {
             let logits: Vec<f32> = (0..k * k * n).map(|i| offset + wave(i, 150.0)).collect();
-            let filter = Filter { size, rows: (0, size.h), k, image: &image, logits: &logits, confidence };
+            let filter =
+                Filter { size, rows: (0, size.h), k, image: &image, logits: &logits, first: 0, confidence };
             let (mut output, mut total) = (vec![0.0; 3 * n], vec![0.0; n]);
             for tier in Tier::available() {
                 filter.apply(tier, &mut output, &mut total);

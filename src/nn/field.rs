@@ -529,15 +529,15 @@ impl Field<NoneTape> {
     }
 
     /// [`Field::filter`] of some rows of several fields by the same kernels. Each field holds one image, and
-    /// may hold more rows of it. `logits` are of the filtered rows only, `confidence` of all rows that the
-    /// fields hold. (1, 3, H, W) -> (1, 3, R, W)
+    /// may hold more rows of it. `logits` are of the filtered rows from row `first` of theirs on, `confidence` of all rows
+    /// that the fields hold. (1, 3, H, W) -> (1, 3, R, W)
     ///
     /// # Panics
     /// As [`Field::filter`], or if there are not as many rows.
     pub fn filter_rows<const N: usize>(
         fields: [&Self; N],
         rows: (usize, usize),
-        logits: &Self,
+        (logits, first): (&Self, usize),
         confidence: &Self,
     ) -> [Self; N] {
         let (_, _, _, w) = confidence.extent();
@@ -545,20 +545,27 @@ impl Field<NoneTape> {
         let values = |field: &Self| field.saved.values.clone();
         let problem = (values(fields[0]), values(logits), Some(values(confidence)));
         let (mut outputs, mut total) = (fields.map(|_| plane_buffer(3 * h * w)), plane_buffer(h * w));
-        let filter = filter_of(&problem, 0, k, rows);
+        let filter = Filter { first, ..filter_of(&problem, 0, k, rows) };
         let into = outputs.each_mut().map(|output| &mut output[..]);
         filter.apply_to_all(Tier::detect(), fields.map(Self::values), into, &mut total);
         outputs.map(|output| Self::from_buffer((1, 3, h, w), output))
     }
 
-    /// [`Field::blend`] of some rows of a taller image. (1, 3, R, W) -> (1, 3, R, W)
+    /// [`Field::blend`] of some rows of a taller image, whose masks begin at row `first` of `alpha` and `corners`.
+    /// (1, 3, R, W) -> (1, 3, R, W)
     ///
     /// # Panics
     /// As [`Field::blend`], or if a coarse row next to a fine one is not there.
-    pub fn blend_rows(&self, place: Place, coarse: &Self, alpha: &Self, corners: &Self) -> Self {
+    pub fn blend_rows(
+        &self,
+        place: Place,
+        coarse: &Self,
+        (alpha, corners): (&Self, &Self),
+        first: usize,
+    ) -> Self {
         let (_, _, h, w) = self.extent();
         let mut output = plane_buffer(3 * h * w);
-        let masks = Masks { alpha: alpha.values(), corners: corners.values() };
+        let masks = Masks { alpha: alpha.values(), corners: corners.values(), first };
         blend(Size { h, w }, place, (self.values(), coarse.values()), masks, &mut output);
         Self::from_buffer((1, 3, h, w), output)
     }
@@ -573,7 +580,7 @@ fn combine(out: &mut [f32], a: &[f32], b: &[f32], put: impl Fn(&mut f32, f32, f3
 
 /// What was predicted for the blend of image `n`.
 fn masks_of((alpha, corners): &(Values, Values), n: usize) -> Masks<'_> {
-    Masks { alpha: alpha.image(n), corners: corners.image(n) }
+    Masks { alpha: alpha.image(n), corners: corners.image(n), first: 0 }
 }
 
 /// The filter of image `n`.
@@ -589,6 +596,7 @@ fn filter_of(
         k,
         image: image.image(n),
         logits: logits.image(n),
+        first: 0,
         confidence: confidence.as_ref().map(|c| c.image(n)),
     }
 }

@@ -5,7 +5,7 @@
 
 use std::{collections::HashMap, io::Write, path::Path};
 
-use half::f16;
+use half::{f16, slice::HalfFloatSliceExt};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
 use crate::{Error, Result, frame::atomically};
@@ -103,7 +103,11 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<(String, Vec<Tensor>)> {
                     bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
                 }
                 Dtype::F16 => {
-                    bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect()
+                    let halves = bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]));
+                    let halves: Vec<f16> = halves.collect();
+                    let mut values = vec![0.0; halves.len()];
+                    halves.convert_to_f32_slice(&mut values);
+                    values
                 }
                 other => return Err(foreign(&format!("tensor {name} is {other:?}, not F32 or F16"))),
             };

@@ -87,7 +87,7 @@ impl Frames {
             let named = format!("{}{more}", first.display());
             return Err(Error::invalid(
                 named,
-                "no file of --frames, whose name ends in a number as shot.0017.exr",
+                "no file of --frames; the number of a frame ends its file's name, as in shot.0017.exr",
             ));
         }
         Ok(picked)

@@ -16,7 +16,7 @@ use clap::{
     Args as ClapArgs,
     builder::{PossibleValuesParser, TypedValueParser},
 };
-use frames::Frames;
+pub(super) use frames::Frames;
 use progress::{Progress, Style};
 
 use super::environment;
@@ -265,7 +265,9 @@ pub fn run(args: Args) -> Result<ExitCode> {
             warn_line(&format!("demc: note: {note}"));
         }
         if came.is_empty() {
-            warn_line("demc: no file of --frames has come, whose name ends in a number as shot.0017.exr");
+            warn_line(
+                "demc: no file of --frames has come; the number of a frame ends its file's name, as in shot.0017.exr",
+            );
             return Ok(ExitCode::from(SOME_FAILED));
         }
     }

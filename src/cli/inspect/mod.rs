@@ -4,7 +4,7 @@
 pub(super) mod examine;
 mod print;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
@@ -13,7 +13,7 @@ use super::{
     inputs::{self, Search},
     sources::Names,
 };
-use crate::{Result, denoise, error::attempt, lint::Trace};
+use crate::{Error, Result, denoise, error::attempt, lint::Trace};
 
 /// Arguments of `demc inspect`.
 #[derive(Debug, ClapArgs)]
@@ -44,7 +44,14 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mapping = args.names.mapping()?;
     let inputs = inputs::expand(&args.files, &Search { recursive: args.recursive, except: None })?;
     let mut failed = !inputs.unusable.is_empty();
-    inputs.unusable.iter().for_each(|(_, error)| warn_line(&format!("demc: {error}")));
+    // Also for a program that reads standard output alone.
+    let fail = |path: &Path, error: &Error| {
+        warn_line(&format!("demc: {error}"));
+        if args.json {
+            print_line(&serde_json::json!({ "path": path, "error": error.to_string() }).to_string());
+        }
+    };
+    inputs.unusable.iter().for_each(|(path, error)| fail(path, error));
     // The frame before, while files are frames of one sequence in order.
     let mut before: Option<(PathBuf, Trace)> = None;
     let is_compared = inputs.files.len() > 1;
@@ -56,7 +63,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             if let (Some(trace), Some((earlier, of_earlier))) = (&trace, &of_before) {
                 report.findings.extend(trace.after(of_earlier, &earlier.display().to_string()));
             }
-            before = trace.map(|trace| (path, trace));
+            before = trace.map(|trace| (path.clone(), trace));
         }
         match examined {
             Ok(report) if args.json => {
@@ -64,7 +71,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             }
             Ok(report) => print_line(&print::text(&report)),
             Err(error) => {
-                warn_line(&format!("demc: {error}"));
+                fail(&path, &error);
                 failed = true;
             }
         }

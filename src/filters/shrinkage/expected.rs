@@ -18,7 +18,11 @@ use crate::{
         perceptron::Perceptron,
         squares::{self, SQUARE},
     },
-    kernels::{exponential::exp, logarithm::ln},
+    kernels::{
+        exponential::exp,
+        logarithm::ln,
+        vectorised::{self, Vectorised},
+    },
     metrics::error::RELMSE_EPSILON,
     planes::Planes,
 };
@@ -72,6 +76,39 @@ pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
     Planes::from_vec(1, squares, rows.len(), errors)
 }
 
+/// Finds for each pixel of a row its squared relative change, and the factor of its error.
+struct Compare<'a> {
+    noisy: [&'a [f32]; 3],
+    clean: [&'a [f32]; 3],
+    floor: f32,
+    least: f32,
+    changes_of_row: &'a mut [f32],
+    units_of_row: &'a mut [f32],
+}
+
+impl Vectorised for Compare<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { noisy, clean, floor, least, changes_of_row, units_of_row } = self;
+        changes_of_row.fill(0.0);
+        units_of_row.fill(0.0);
+        for (noisy, clean) in noisy.into_iter().zip(clean) {
+            for (change, (noisy, clean)) in changes_of_row.iter_mut().zip(noisy.iter().zip(clean)) {
+                *change += (noisy.max(0.0) - clean) / (clean + floor);
+            }
+            for (unit, clean) in units_of_row.iter_mut().zip(clean) {
+                let square = (clean * clean).min(f32::MAX);
+                *unit += (square + least) / (square + RELMSE_EPSILON as f32);
+            }
+        }
+        for (change, unit) in changes_of_row.iter_mut().zip(units_of_row) {
+            let mean = *change / 3.0;
+            *change = (mean * mean).min(LARGEST_CHANGE);
+            *unit /= 3.0;
+        }
+    }
+}
+
 /// Three lines of each row of squares: the mean squared relative change that is left between render and
 /// result; ones; and the factor that turns the perceptron's error into one that RelMSE is the mean of. The
 /// perceptron sees a frame as exposed and does not know its brightness, so in dark frames its errors are
@@ -87,23 +124,19 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
         let (ones, units) = rest.split_at_mut(squares);
         ones.fill(1.0);
         let mut is_near = vec![true; width];
+        let [mut of_row, mut units_of_row] = [(); 2].map(|()| vec![0.0; width]);
         let rows = row * SQUARE..((row + 1) * SQUARE).min(height);
         for y in rows.clone() {
             if let Some(empty) = &render.empty {
                 empty.row(y, &mut is_near);
             }
             let [noisy, clean] = [render.radiance, result].map(|planes| planes.rows(y));
+            let (changes_of_row, units_of_row) = (&mut of_row[..], &mut units_of_row[..]);
+            vectorised::run(Compare { noisy, clean, floor, least, changes_of_row, units_of_row });
             for x in 0..width {
-                let change: f32 =
-                    (0..3).map(|c| (noisy[c][x].max(0.0) - clean[c][x]) / (clean[c][x] + floor)).sum::<f32>()
-                        / 3.0;
-                let unit: f32 = (0..3)
-                    .map(|c| (clean[c][x] * clean[c][x]).min(f32::MAX))
-                    .map(|square| (square + least) / (square + RELMSE_EPSILON as f32))
-                    .sum();
-                changes[x / SQUARE] += (change * change).min(LARGEST_CHANGE);
+                changes[x / SQUARE] += changes_of_row[x];
                 // What stays as rendered because nothing was met has no error.
-                units[x / SQUARE] += if is_near[x] { unit / 3.0 } else { 0.0 };
+                units[x / SQUARE] += if is_near[x] { units_of_row[x] } else { 0.0 };
             }
         }
         for (square, (change, unit)) in changes.iter_mut().zip(units).enumerate() {

@@ -102,29 +102,29 @@ impl Vectorised for Describe<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { sums, features, squares } = self;
-        for s in 0..squares {
-            let per_pixel = 1.0 / sums[COUNT * squares + s];
-            let mean = |line: usize| sums[line * squares + s] * per_pixel;
-            let level = |line: usize| ln(mean(line).max(0.0) + TINY);
-            let residual = mean(RESIDUAL);
-            let share = |line: usize| mean(line) / (residual + TINY);
-            let alike = |line: usize, with: usize| {
-                mean(line) / (mean(with) * residual + TINY * TINY).max(f32::MIN_POSITIVE).sqrt()
-            };
-            let described: [f32; OF_WINDOW] = [
-                level(RESIDUAL),
-                level(NOISE[0]),
-                level(NOISE[1]),
-                level(CUT),
-                level(DETAIL[0]),
-                level(DETAIL[1]),
-                share(NEXT[0]),
-                share(NEXT[1]),
-                share(BY_DETAIL[2]),
-                alike(BY_DETAIL[0], DETAIL[0]),
-                alike(BY_DETAIL[1], DETAIL[1]),
-            ];
-            described.into_iter().enumerate().for_each(|(line, v)| features[line * squares + s] = v);
+        let line = |line: usize| &sums[line * squares..][..squares];
+        // A feature of all squares at a time: the compiler vectorises loops that write one line.
+        let per_square = || line(COUNT).iter().map(|count| 1.0 / count);
+        let residuals = || line(RESIDUAL).iter().zip(per_square()).map(|(sum, per_pixel)| sum * per_pixel);
+        let mut features = features.chunks_exact_mut(squares);
+        let mut next = || features.next().expect("a line for each feature");
+        for level in [RESIDUAL, NOISE[0], NOISE[1], CUT, DETAIL[0], DETAIL[1]] {
+            for ((feature, sum), per_pixel) in next().iter_mut().zip(line(level)).zip(per_square()) {
+                *feature = ln((sum * per_pixel).max(0.0) + TINY);
+            }
+        }
+        for share in [NEXT[0], NEXT[1], BY_DETAIL[2]] {
+            let sums = line(share).iter().zip(per_square()).zip(residuals());
+            for (feature, ((sum, per_pixel), residual)) in next().iter_mut().zip(sums) {
+                *feature = sum * per_pixel / (residual + TINY);
+            }
+        }
+        for (alike, with) in [(BY_DETAIL[0], DETAIL[0]), (BY_DETAIL[1], DETAIL[1])] {
+            let sums = line(alike).iter().zip(line(with)).zip(per_square()).zip(residuals());
+            for (feature, (((sum, with), per_pixel), residual)) in next().iter_mut().zip(sums) {
+                let square = with * per_pixel * residual + TINY * TINY;
+                *feature = sum * per_pixel / square.max(f32::MIN_POSITIVE).sqrt();
+            }
         }
     }
 }

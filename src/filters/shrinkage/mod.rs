@@ -30,12 +30,17 @@ use rayon::prelude::*;
 pub use self::empty::Empty;
 use self::{
     restraint::OUTPUTS,
-    seen::{Seen, is_firefly},
+    seen::{Seen, SeenRow, is_firefly},
     sums::LARGEST_RESIDUAL,
 };
-use super::squares::{SQUARE, between};
+use super::squares::{SQUARE, between, spread};
 use crate::{
-    kernels::{exponential::exp, logarithm::ln, thirds},
+    kernels::{
+        exponential::exp,
+        logarithm::ln,
+        thirds,
+        vectorised::{self, Vectorised},
+    },
     planes::Planes,
 };
 
@@ -221,6 +226,7 @@ impl Belief {
     }
 
     /// In a pixel whose light changes by `change`, relative to the denoised light, if all of the render is taken.
+    #[inline(always)]
     fn at(self, change: f32) -> f32 {
         self.by_samples.max(self.by_noise * (LARGEST_CHANGE / change.abs()).min(1.0))
     }
@@ -251,67 +257,158 @@ fn mix(
         None => (0..height).map(|_| None).collect(),
     };
     red.zip(green).zip(blue).zip(shares).enumerate().for_each_init(
-        || (vec![0.0; OUTPUTS * squares], vec![true; width]),
-        |(line, is_near), (y, (((red, green), blue), mut shares))| {
+        || Memory::of(width, squares),
+        |Memory { line, judged: of_pixels, changes, backs, is_near, seen_row },
+         (y, (((red, green), blue), shares))| {
             if let Some(empty) = &render.empty {
                 empty.row(y, is_near);
             }
-            let mut note = |x: usize, share: f32| shares.iter_mut().for_each(|row| row[x] = share);
             let (above, share) = between(y, square_rows);
             let of =
                 |row: usize| &judged[row.min(square_rows - 1) * OUTPUTS * squares..][..OUTPUTS * squares];
             for (line, (a, b)) in line.iter_mut().zip(of(above).iter().zip(of(above + 1))) {
                 *line = a + (b - a) * share;
             }
-            let radiance = render.radiance.rows(y);
-            for x in 0..width {
-                let (left, share) = between(x, squares);
-                let right = (left + 1).min(squares - 1);
-                let judged = [0, 1, 2].map(|k| {
-                    let line = &line[k * squares..][..squares];
-                    line[left] + (line[right] - line[left]) * share
-                });
-                let noisy = radiance.map(|row| row[x].max(0.0));
-                let colours = [&mut red[x], &mut green[x], &mut blue[x]];
-                let is_seen = is_all_seen || (keeps > 0.0 && seen.is_at(x, y));
+            let noisy = render.radiance.rows(y);
+            let image = [&*red, &*green, &*blue];
+            vectorised::run(Judge {
+                line,
+                noisy,
+                image,
+                belief,
+                doubt,
+                floor,
+                judged: of_pixels,
+                changes,
+                backs,
+            });
+            if is_all_seen {
+                seen_row.is_seen.fill(1.0);
+            } else if keeps > 0.0 {
+                seen.read_row(y, seen_row);
+            }
+            for (x, back) in backs.iter_mut().enumerate() {
+                let is_seen = seen_row.is_seen[x] > 0.0;
                 if (is_seen && keeps == 1.0) || !is_near[x] {
-                    colours.into_iter().zip(noisy).for_each(|(colour, noisy)| *colour = noisy);
-                    note(x, 1.0);
+                    *back = 1.0;
                     continue;
                 }
-                let denoised: f32 = colours.iter().map(|v| v.max(0.0)).sum();
-                let change = (noisy.iter().sum::<f32>() - denoised) / (denoised + 3.0 * floor);
-                let shrunk = 1.0 - belief.at(change) * (1.0 - share_of_render(judged, change, doubt));
                 let direct = match keeps {
                     0.0 => 0.0,
                     _ if is_seen => keeps,
                     _ => keeps * seen.beyond_white(x, y),
                 };
-                let back = shrunk + direct - shrunk * direct;
-                let is_noise = !is_seen && change >= LARGEST_RESIDUAL && is_firefly(render, x, y);
-                let back = if is_noise { 0.0 } else { back };
-                if back == 1.0 {
-                    colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v = noisy);
-                } else if back > 0.0 {
-                    colours.into_iter().zip(noisy).for_each(|(v, noisy)| *v += (noisy - *v) * back);
+                *back = *back + direct - *back * direct;
+                if !is_seen && changes[x] >= LARGEST_RESIDUAL && is_firefly(render, x, y) {
+                    *back = 0.0;
                 }
-                note(x, back);
+            }
+            vectorised::run(Blend { image: [red, green, blue], noisy, backs });
+            if let Some(shares) = shares {
+                shares.copy_from_slice(backs);
             }
         },
     );
 }
 
+/// Memory for a row of pixels.
+struct Memory {
+    /// What was judged of the squares, interpolated vertically to the row, [`OUTPUTS`] lines.
+    line: Vec<f32>,
+    /// The same of every pixel.
+    judged: Vec<f32>,
+    changes: Vec<f32>,
+    backs: Vec<f32>,
+    is_near: Vec<bool>,
+    seen_row: SeenRow,
+}
+
+impl Memory {
+    fn of(width: usize, squares: usize) -> Self {
+        Self {
+            line: vec![0.0; OUTPUTS * squares],
+            judged: vec![0.0; OUTPUTS * width],
+            changes: vec![0.0; width],
+            backs: vec![0.0; width],
+            is_near: vec![true; width],
+            seen_row: SeenRow::none(width),
+        }
+    }
+}
+
+/// Finds the share of the render in each pixel of a row.
+struct Judge<'a> {
+    /// What was judged of the squares, [`OUTPUTS`] lines.
+    line: &'a [f32],
+    noisy: [&'a [f32]; 3],
+    image: [&'a [f32]; 3],
+    belief: Belief,
+    doubt: f32,
+    floor: f32,
+    /// Memory for [`OUTPUTS`] rows.
+    judged: &'a mut [f32],
+    /// By how much each pixel's light would change, relative to the denoised light, if all of the render were taken.
+    changes: &'a mut [f32],
+    /// The shares.
+    backs: &'a mut [f32],
+}
+
+impl Vectorised for Judge<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { line, noisy, image, belief, doubt, floor, judged, changes, backs } = self;
+        let width = backs.len();
+        let squares = line.len() / OUTPUTS;
+        for (line, row) in line.chunks_exact(squares).zip(judged.chunks_exact_mut(width)) {
+            spread(line, row);
+        }
+        let [logits, slopes, usual] = [0, 1, 2].map(|k| &judged[k * width..][..width]);
+        let [[red, green, blue], of_image] = [noisy, image].map(|planes| planes.map(|row| &row[..width]));
+        let changes = &mut changes[..width];
+        // Without closures over arrays, which are not inlined and keep the loop from being vectorised.
+        for x in 0..width {
+            let light = red[x].max(0.0) + green[x].max(0.0) + blue[x].max(0.0);
+            let denoised = of_image[0][x].max(0.0) + of_image[1][x].max(0.0) + of_image[2][x].max(0.0);
+            let change = (light - denoised) / (denoised + 3.0 * floor);
+            let share = share_of_render([logits[x], slopes[x], usual[x]], change, doubt);
+            changes[x] = change;
+            backs[x] = 1.0 - belief.at(change) * (1.0 - share);
+        }
+    }
+}
+
+/// Mixes a row of the denoised image with the render, of which each pixel takes its share.
+struct Blend<'a> {
+    image: [&'a mut [f32]; 3],
+    noisy: [&'a [f32]; 3],
+    backs: &'a [f32],
+}
+
+impl Vectorised for Blend<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { image, noisy, backs } = self;
+        for (image, noisy) in image.into_iter().zip(noisy) {
+            for ((value, noisy), back) in image.iter_mut().zip(noisy).zip(backs) {
+                let (own, noisy) = (*value, noisy.max(0.0));
+                let mixed = own + (noisy - own) * back;
+                let mixed = if *back > 0.0 { mixed } else { own };
+                *value = if *back == 1.0 { noisy } else { mixed };
+            }
+        }
+    }
+}
+
 /// The share of the render in a pixel, by what was [judged](restraint::judge) of the place. `change` is the
 /// relative change of the pixel's light if all of the render were taken. Shares below `doubt` are none.
+#[inline(always)]
 fn share_of_render([logit, slope, usual]: [f32; OUTPUTS], change: f32, doubt: f32) -> f32 {
     let own = change.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL);
     let unusual = (ln(own * own + OWN_FLOOR) - usual).clamp(-OWN_RANGE, OWN_RANGE) / OWN_RANGE;
     let share = 1.0 / (1.0 + exp(-(logit + slope * unusual)));
     let share = ((share - doubt) / (1.0 - SNAP - doubt)).clamp(0.0, 1.0);
-    if share == 1.0 {
-        return share;
-    }
-    share * (LARGEST_CHANGE / ((1.0 - share) * change.abs()).max(f32::MIN_POSITIVE)).min(1.0)
+    let less = share * (LARGEST_CHANGE / ((1.0 - share) * change.abs()).max(f32::MIN_POSITIVE)).min(1.0);
+    if share == 1.0 { share } else { less }
 }
 
 #[cfg(test)]

@@ -5,7 +5,14 @@
 //! such pixels agree on.
 
 use super::Render;
-use crate::{filters::FIREFLY, kernels::logarithm::ln, planes::Planes};
+use crate::{
+    filters::FIREFLY,
+    kernels::{
+        logarithm::ln,
+        vectorised::{self, Vectorised},
+    },
+    planes::Planes,
+};
 
 /// A frame in which no more than this share of the pixels differ from their albedo is no picture of light on
 /// surfaces, and all of it is kept.
@@ -35,7 +42,7 @@ const COUNTED: usize = 1 << 17;
 
 /// For a pixel to be seen directly, this many of the 3x3 around it, itself included, must be as bright as
 /// their albedo, because any pixel may be so by chance.
-const SEEN_TOGETHER: usize = 6;
+const SEEN_TOGETHER: f32 = 6.0;
 
 /// The film's exposure, by which light that is seen directly was multiplied. It is 1 if enough pixels equal
 /// their albedo, else what most such light of the frame agrees on, and 1 if there is none.
@@ -75,7 +82,10 @@ pub fn film_exposure(render: &Render) -> f32 {
 #[inline(always)]
 fn equals(light: [f32; 3], white: [f32; 3], film: f32) -> bool {
     let (relative, absolute) = SAME;
-    (0..3).all(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute))
+    let alike = [0, 1, 2]
+        .map(|c| (light[c] - film * white[c]).abs() <= film * (relative * white[c].abs() + absolute));
+    // All three are compared in any case, so that no branch keeps the compiler from vectorising.
+    alike[0] & alike[1] & alike[2]
 }
 
 /// Tells light that comes straight to the camera.
@@ -108,17 +118,22 @@ impl Seen<'_> {
         (0..pixels).filter(|at| !self.equals_albedo(*at)).take(most + 1).count() <= most
     }
 
-    /// Whether the light of a pixel is seen directly, as that of its neighbours is.
-    pub fn is_at(&self, x: usize, y: usize) -> bool {
-        let width = self.radiance.width;
-        let equals_albedo = |x: usize, y: usize| self.equals_albedo(y * width + x);
-        // A black pixel is no light itself. As a neighbour it counts, because lamps and stars end in black.
-        let is_lit = (0..3).any(|c| self.albedo.channel(c)[y * width + x] > 0.0);
-        is_lit && equals_albedo(x, y) && {
-            let beyond = 9 - self.radiance.near(x, y, 1).count();
-            let seen = self.radiance.near(x, y, 1).filter(|&(x, y)| equals_albedo(x, y)).count();
-            seen + beyond >= SEEN_TOGETHER
+    /// Finds in which pixels of a row light is seen directly, as that of their neighbours is. Pixels beyond the frame
+    /// count as such.
+    pub fn read_row(&self, y: usize, row: &mut SeenRow) {
+        let SeenRow { equal, around, is_seen } = row;
+        around.fill(0.0);
+        // The row itself is the last, and stays in `equal`.
+        for there in [y.checked_sub(1), Some(y + 1).filter(|below| *below < self.radiance.height), Some(y)] {
+            match there {
+                Some(there) => {
+                    let [light, white] = [self.radiance, self.albedo].map(|planes| planes.rows(there));
+                    vectorised::run(Equal { light, white, film: self.film, equal, around });
+                }
+                None => around.iter_mut().for_each(|sum| *sum += 1.0),
+            }
         }
+        vectorised::run(Together { albedo: self.albedo.rows(y), equal, around, is_seen });
     }
 
     /// The share of a pixel's light that is seen directly or by way of mirrors, as far as the albedo shows it
@@ -142,6 +157,74 @@ impl Seen<'_> {
         });
         let share = film * light / radiance.channel(c)[y * radiance.width + x];
         share * (ALONE * second / light).min(1.0)
+    }
+}
+
+/// Where light is seen directly in a row of pixels, with the memory that finding it takes.
+pub struct SeenRow {
+    equal: Vec<f32>,
+    around: Vec<f32>,
+    /// 1 where it is, else 0.
+    pub is_seen: Vec<f32>,
+}
+
+impl SeenRow {
+    /// Of a row in which none is.
+    pub fn none(width: usize) -> Self {
+        let [equal, around, is_seen] = [(); 3].map(|()| vec![0.0; width]);
+        Self { equal, around, is_seen }
+    }
+}
+
+/// Writes to `equal` 1 for every pixel of a row that has the brightness of its albedo, else 0, and adds that to `around`.
+struct Equal<'a> {
+    light: [&'a [f32]; 3],
+    white: [&'a [f32]; 3],
+    film: f32,
+    equal: &'a mut [f32],
+    around: &'a mut [f32],
+}
+
+impl Vectorised for Equal<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { light, white, film, equal, around } = self;
+        let width = equal.len();
+        let [[r, g, b], white] = [light, white].map(|planes| planes.map(|row| &row[..width]));
+        for (x, equal) in equal.iter_mut().enumerate() {
+            let white = [white[0][x], white[1][x], white[2][x]];
+            *equal = if equals([r[x], g[x], b[x]], white, film) { 1.0 } else { 0.0 };
+        }
+        around.iter_mut().zip(equal).for_each(|(sum, equal)| *sum += *equal);
+    }
+}
+
+/// Writes to `is_seen` 1 for every pixel of a row whose light is seen directly, else 0.
+struct Together<'a> {
+    albedo: [&'a [f32]; 3],
+    equal: &'a [f32],
+    /// How many of a pixel, the one above and the one below have the brightness of their albedo.
+    around: &'a [f32],
+    is_seen: &'a mut [f32],
+}
+
+impl Vectorised for Together<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { albedo: [red, green, blue], equal, around, is_seen } = self;
+        // Three beyond each end of the row count.
+        is_seen.copy_from_slice(around);
+        is_seen[0] += 3.0;
+        is_seen[around.len() - 1] += 3.0;
+        is_seen[1..].iter_mut().zip(around).for_each(|(sum, left)| *sum += left);
+        is_seen.iter_mut().zip(&around[1..]).for_each(|(sum, right)| *sum += right);
+        for (seen, equal) in is_seen.iter_mut().zip(equal) {
+            *seen = if *seen >= SEEN_TOGETHER { *equal } else { 0.0 };
+        }
+        // A black pixel is no light itself. As a neighbour it counts, because lamps and stars end in black.
+        for (((seen, red), green), blue) in is_seen.iter_mut().zip(red).zip(green).zip(blue) {
+            *seen = if red.max(*green).max(*blue) > 0.0 { *seen } else { 0.0 };
+        }
     }
 }
 

@@ -166,6 +166,21 @@ mod tests {
     }
 
     #[test]
+    fn a_neighbour_of_fewer_samples_counts_by_as_much_less() {
+        let full = link(0.0, 0.8);
+        let quarter = Link { share: 0.25, ..full.clone() };
+        let own = grey(|_, _| 1.0);
+        let merged = merge(&own, true, &[(&grey(|_, _| 2.0), &quarter)]);
+        assert!((merged.data[0] - (1.0 + 0.2 / 1.2)).abs() < 1e-6, "{}", merged.data[0]);
+        // Of results too: it is no less alike for that.
+        let radiance = grey(|x, y| 0.5 + 0.1 * ((x + y) % 2) as f32);
+        let own = Own::of(&own, &radiance, 0.6);
+        let other = grey(|_, _| 1.01);
+        let [whole, part] = [&full, &quarter].map(|link| own.weigh(&other, link).1.data[0]);
+        assert!((part / whole - 0.25).abs() < 1e-6, "{part} {whole}");
+    }
+
+    #[test]
     fn results_that_agree_are_averaged_and_others_left_out() {
         let mut rng = Rng::new(3, 0);
         let noise: Vec<f32> = (0..SIZE.0 * SIZE.1).map(|_| rng.uniform()).collect();

@@ -148,9 +148,12 @@ impl Weights {
                     *value = weights[weight_index(geometry, outputs, total, o, i, t)] * steps.step;
                 }
             }
-            let mut step = f32::MIN_POSITIVE;
-            for (pair, t) in pairs.iter().flat_map(|pair| (0..taps).map(move |t| (pair, t))) {
-                step = step.max(least_step(in_16_bits, pair.clone().map(|i| of_output[i * taps + t])));
+            let largest = of_output.iter().fold(0.0f32, |largest, weight| largest.max(weight.abs()));
+            let mut step = (largest / WEIGHT_STEPS).max(f32::MIN_POSITIVE);
+            if in_16_bits {
+                for (pair, t) in pairs.iter().flat_map(|pair| (0..taps).map(move |t| (pair, t))) {
+                    step = step.max(step_of_sums(pair.clone().map(|i| of_output[i * taps + t])));
+                }
             }
             for sign in [1.0, -1.0] {
                 let sum: f32 = of_output.iter().map(|value| (sign * value).max(0.0)).sum();
@@ -258,18 +261,15 @@ fn row_pairs(sources: &[(usize, Steps)]) -> Vec<Range<usize>> {
     pairs
 }
 
-/// The finest step that the weights of the channels of two rows, or of fewer, allow. `in_16_bits` says
-/// whether products are first added up in 16 bits.
-fn least_step(in_16_bits: bool, channels: impl Iterator<Item = f32>) -> f32 {
-    let mut largest = 0.0f32;
+/// The finest step that the weights of the channels of two rows, or of fewer, allow where their products are first
+/// added up in 16 bits.
+fn step_of_sums(channels: impl Iterator<Item = f32>) -> f32 {
     // One sum for the first two channels of each row and one for the other two, and each for either sign.
     let mut sums = [[0.0f32; 2]; WORD / 2];
     for (i, weight) in channels.enumerate() {
-        largest = largest.max(weight.abs());
         sums[i % WORD / 2][usize::from(weight < 0.0)] += weight.abs();
     }
-    let fitting = if in_16_bits { FITTING_STEPS } else { f32::INFINITY };
-    sums.as_flattened().iter().fold(largest / WEIGHT_STEPS, |least, sum| least.max(sum / fitting))
+    sums.as_flattened().iter().fold(0.0, |least, sum| least.max(sum / FITTING_STEPS))
 }
 
 /// Rounds a channel's weights at some taps to whole steps. The rounding error of a tap is added to the next
@@ -278,10 +278,18 @@ fn round(taps: &[Tap], weights: &mut [f32]) {
     let mut lost = 0.0;
     for tap in taps {
         let wanted = weights[tap.index] + lost;
-        let rounded = wanted.round_ties_even().clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
+        let rounded = nearest(wanted).clamp(-WEIGHT_STEPS, WEIGHT_STEPS);
         weights[tap.index] = rounded;
         lost = wanted - rounded;
     }
+}
+
+/// The nearest whole number, of two the even one, of a value up to 2^22: the sum has no digits behind the point. The
+/// standard library calls a function for each, as not every processor has an instruction for it.
+#[inline(always)]
+fn nearest(value: f32) -> f32 {
+    const ROUND: f32 = 12_582_912.0;
+    (value + ROUND) - ROUND
 }
 
 /// Where a convolution writes.

@@ -122,10 +122,38 @@ struct Scale {
     images: Vec<Filtered>,
     confidence: Line<Field>,
     /// What the head predicted for bands not yet blended, and for those not yet filtered.
-    masks: VecDeque<(Range<usize>, Field, Field)>,
-    kernels: VecDeque<(Range<usize>, Field)>,
+    masks: VecDeque<Predicted<(Field, Field)>>,
+    kernels: VecDeque<Predicted<Field>>,
     /// Rows filtered.
     filtered: usize,
+}
+
+/// What was predicted for a band.
+struct Predicted<T> {
+    /// The rows of it that are still to be done.
+    rows: Range<usize>,
+    /// The first row of `planes`.
+    first: usize,
+    planes: T,
+}
+
+impl<T> Predicted<T> {
+    fn new(rows: Range<usize>, planes: T) -> Self {
+        Self { first: rows.start, rows, planes }
+    }
+
+    /// The next rows to be done, of which the first is that row of the planes: as far as row `ready`, or none. Where
+    /// a band is not `divisible`, all of it or none.
+    fn next(&mut self, ready: usize, divisible: bool) -> Option<(Range<usize>, usize)> {
+        // An even number of rows, so that each row of the level below belongs to one part.
+        let to = if ready >= self.rows.end { self.rows.end } else { ready & !1 };
+        if to <= self.rows.start || (to < self.rows.end && !divisible) {
+            return None;
+        }
+        let rows = self.rows.start..to;
+        self.rows.start = to;
+        Some((rows.clone(), rows.start - self.first))
+    }
 }
 
 /// A level of an image.
@@ -254,20 +282,20 @@ impl<'a, S: Subject> Progress<'a, S> {
         let (finer, coarser) = self.scales.split_at_mut(scale + 1);
         let Scale { images, masks, .. } = &mut finer[scale];
         let Some(below) = coarser.first().map(|c| &c.images) else { return };
-        while let Some((rows, _, _)) = masks.front() {
-            let are_there = |(fine, below): (&Filtered, &Filtered)| {
-                rows.end <= fine.image.end() && rows.end <= 2 * below.smooth.settled(1)
-            };
-            if !images.iter().zip(below).all(are_there) {
-                break;
-            }
-            let (rows, mask, corners) = masks.pop_front().expect("there is one");
+        while let Some(predicted) = masks.front_mut() {
+            let ready =
+                |(fine, below): (&Filtered, &Filtered)| fine.image.end().min(2 * below.smooth.settled(1));
+            let ready = images.iter().zip(below).map(ready).min().expect("something is filtered");
+            let Some((rows, first)) = predicted.next(ready, scale > 0) else { break };
+            let (mask, corners) = &predicted.planes;
             for (Filtered { image, blended, .. }, below) in images.iter_mut().zip(below) {
                 let below = &below.smooth;
                 let near = (rows.start / 2).saturating_sub(1)..(rows.end / 2 + 1).min(below.total());
                 let place = Place { first: rows.start, total: image.total(), coarse: near.start };
-                blended.push(image.rows(rows.clone()).blend_rows(place, &below.rows(near), &mask, &corners));
+                let image = image.rows(rows.clone());
+                blended.push(image.blend_rows(place, &below.rows(near), (mask, corners), first));
             }
+            masks.pop_front_if(|predicted| predicted.rows.is_empty());
         }
     }
 
@@ -275,30 +303,33 @@ impl<'a, S: Subject> Progress<'a, S> {
     fn filter(&mut self, scale: usize, done: &mut impl FnMut(usize, &[Field])) {
         let reach = self.trunk.kernel(scale) / 2;
         let Scale { images, confidence, kernels, filtered, .. } = &mut self.scales[scale];
-        while let Some((rows, _)) = kernels.front() {
+        while let Some(predicted) = kernels.front_mut() {
             let settled = images.iter().map(|image| image.source(scale).settled(reach)).min();
-            if settled.expect("something is filtered").min(confidence.settled(reach)) < rows.end {
-                break;
-            }
-            let (rows, kernel) = kernels.pop_front().expect("there is one");
+            let ready = settled.expect("something is filtered").min(confidence.settled(reach));
+            // What is done at full resolution goes on as whole bands: what comes next would take as long for two rows.
+            let Some((rows, first)) = predicted.next(ready, scale > 0) else { break };
+            let kernel = (&predicted.planes, first);
             let (near, inside) = around(&rows, reach, confidence.total());
             let trust = confidence.rows(near.clone());
             let sources: Vec<Field> =
                 images.iter().map(|image| image.source(scale).rows(near.clone())).collect();
             // For images that are filtered together, each weight is computed only once.
             let filtered_together = |images: &[Field]| match images {
-                [a, b, c] => Field::filter_rows([a, b, c], inside, &kernel, &trust).into(),
-                [a, b] => Field::filter_rows([a, b], inside, &kernel, &trust).into(),
-                images => Vec::from(Field::filter_rows([&images[0]], inside, &kernel, &trust)),
+                [a, b, c] => Field::filter_rows([a, b, c], inside, kernel, &trust).into(),
+                [a, b] => Field::filter_rows([a, b], inside, kernel, &trust).into(),
+                images => Vec::from(Field::filter_rows([&images[0]], inside, kernel, &trust)),
             };
             let outputs = sources.chunks(3).flat_map(filtered_together);
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
+                kernels.pop_front_if(|predicted| predicted.rows.is_empty());
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            done(rows.start, &self.subject.finish(rows, outputs.collect(), gain));
+            let outputs = outputs.collect();
+            kernels.pop_front();
+            done(rows.start, &self.subject.finish(rows, outputs, gain));
         }
     }
 
@@ -346,8 +377,8 @@ impl Scale {
         // The confidence is copied, since it is kept for longer than the head's other planes, and would keep
         // the memory of them all.
         self.confidence.push(Field::input(confidence.extent(), confidence.values()));
-        self.masks.extend(below.map(|(mask, corners)| (rows.clone(), mask, corners)));
-        self.kernels.push_back((rows, kernel));
+        self.masks.extend(below.map(|masks| Predicted::new(rows.clone(), masks)));
+        self.kernels.push_back(Predicted::new(rows, kernel));
     }
 }
 
