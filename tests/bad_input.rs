@@ -49,7 +49,7 @@ fn a_view_layer_without_a_beauty_is_told_by_name() {
         .map(|name| AnyChannel::new(name, FlatSamples::F32(vec![0.5; 64])));
     let channels = AnyChannels::sort(list.into_iter().collect());
     Image::from_channels((8, 8), channels).write().to_file(&path).unwrap();
-    for more in [&[][..], &["--passes", "--replace"]] {
+    for more in [&[][..], &["--passes", "--replace", "--model", "demc-s"]] {
         let args = [&["--view-layer", "V"], more].concat();
         fails_with(&path, &args, 1, &["view layer 'V' has no Combined pass", "Passes > Data > Combined"]);
     }

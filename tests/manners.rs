@@ -79,7 +79,7 @@ fn the_examples_of_every_help_run() {
             let _ = fs::copy(data("s0000_room_0004spp.exr"), folder.path().join("clean/shot_0004spp.exr"));
             let done = shell(folder.path(), &script).output().unwrap();
             // The report on frames 1 and 2 misses the others, and says so.
-            let expected = if example.ends_with("--of renders") { 1 } else { 0 };
+            let expected = if example.contains("--of renders") { 1 } else { 0 };
             let errors = String::from_utf8_lossy(&done.stderr);
             assert_eq!(done.status.code(), Some(expected), "{example}: {errors}");
             ran += 1;

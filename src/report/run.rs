@@ -333,7 +333,7 @@ const LONGEST_NAME: usize = 200;
 pub fn sheet_name(pairs: &[Pair], pair: &Pair) -> String {
     let file_name = |pair: &Pair| {
         let mut name = pair.id().replace(['/', '\\'], "_");
-        name.truncate(name.floor_char_boundary(LONGEST_NAME));
+        name.truncate((0..=LONGEST_NAME).rev().find(|at| name.is_char_boundary(*at)).unwrap_or(0));
         name
     };
     let id = file_name(pair);

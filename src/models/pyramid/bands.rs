@@ -295,7 +295,9 @@ impl<'a, S: Subject> Progress<'a, S> {
                 let image = image.rows(rows.clone());
                 blended.push(image.blend_rows(place, &below.rows(near), (mask, corners), first));
             }
-            masks.pop_front_if(|predicted| predicted.rows.is_empty());
+            if predicted.rows.is_empty() {
+                masks.pop_front();
+            }
         }
     }
 
@@ -323,7 +325,9 @@ impl<'a, S: Subject> Progress<'a, S> {
             *filtered = rows.end;
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
-                kernels.pop_front_if(|predicted| predicted.rows.is_empty());
+                if predicted.rows.is_empty() {
+                    kernels.pop_front();
+                }
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
