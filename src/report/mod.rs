@@ -32,6 +32,7 @@ mod summary;
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "cli")]
 pub(crate) use chart::number_label;
 pub use figure::Figure;
 pub use heat::{HeatCell, HeatMap};
