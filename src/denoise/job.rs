@@ -87,8 +87,8 @@ impl Default for Options {
 
 impl Options {
     /// How a result is made: by which version, and the options that decide what is in it and that nothing else in the
-    /// file tells, as they are said on the command line. Guides go by their names, wherever they lie, and weights by that of their folder too,
-    /// since every run's are called alike.
+    /// file tells, as they are said on the command line. Guides go by their names, wherever they lie, and weights by
+    /// that of their folder too, since every run's are called alike.
     fn method(&self, model: &dyn Denoiser) -> String {
         let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let file = Path::new(without_variant(model.name()));
