@@ -14,7 +14,7 @@ use std::{
 
 use assert_cmd::cargo::cargo_bin;
 use common::{
-    demc,
+    BY, demc,
     files::{data, read_exr, samples, touch_later, write_render},
     shot::SHOT,
 };
@@ -256,8 +256,6 @@ fn results_older_than_their_renders_are_told_and_kept() {
 
 #[test]
 fn results_that_were_made_otherwise_are_told_and_kept() {
-    const BY: &str = concat!("demc ", env!("CARGO_PKG_VERSION"));
-
     let folder = tempfile::tempdir().unwrap();
     SHOT.write(&folder.path().join("a.exr"), 1);
     fs::create_dir(folder.path().join("weights")).unwrap();

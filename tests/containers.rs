@@ -9,7 +9,7 @@ use std::{
 };
 
 use common::{
-    demc,
+    BY, demc,
     files::{Stored, data, header, read_exr, samples, with_attributes, write_render},
 };
 use exr::{meta::attribute::EnvironmentMap, prelude::*};
@@ -123,10 +123,7 @@ fn a_part_that_is_added_says_of_its_colours_what_the_beauty_does() {
         [
             ("colorInteropID".to_string(), text("lin_ap1_scene")),
             ("demc".to_string(), text("V.Denoised")),
-            (
-                "demcMethod".to_string(),
-                text(concat!("V.Denoised\ndemc ", env!("CARGO_PKG_VERSION"), " --model noisy"))
-            )
+            ("demcMethod".to_string(), text(&format!("V.Denoised\n{BY} --model noisy")))
         ]
     );
 }

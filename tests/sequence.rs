@@ -14,6 +14,7 @@ use std::{
 
 use assert_cmd::Command;
 use common::{
+    BY,
     files::{bits, read_exr, samples, touch_later, values},
     python,
     shot::{SHOT, SIZE, Shot, random, write_channels},
@@ -183,9 +184,8 @@ fn a_result_that_wants_a_frame_beside_it_is_no_other_that_is_wanted() {
     run("--layer B").code(1).stderr(contains("exists without 'ViewLayer.B'")).stdout(contains("3 failed"));
     run("--replace").code(1).stdout(contains("3 failed"));
     let told = run("--layer A --wrap x").success().stdout(contains("0 denoised, 3 already there"));
-    told.stderr(
-        contains("0003.exr: was made with demc ").and(contains("--model noisy --temporal 1, and was kept")),
-    );
+    let why = format!("shot_0004spp.0003.exr: was made with {BY} --model noisy --temporal 1, and was kept");
+    told.stderr(contains(why));
     assert!(before == all());
     run("--layer A").success().stdout(contains("1 denoised, 2 already there"));
 }
@@ -209,7 +209,7 @@ fn what_a_result_was_made_with_is_noted_of_each_layer() {
     run(&third, dir.path(), "--layer C --temporal 1").code(1).stderr(lacking);
     // Whoever leaves neighbours out wants them out.
     let told = run(&third, dir.path(), "--layer B").success();
-    told.stderr(contains("--model noisy --temporal 1, and was kept"));
+    told.stderr(contains(format!("was made with {BY} --model noisy --temporal 1, and was kept")));
 }
 
 #[test]

@@ -140,6 +140,40 @@ fn the_twin_computes_the_same_outputs_losses_and_gradients() {
     compare(&python, folder.path(), &path, &noisy, &passes("s0010_outdoor_0004spp.exr"), Loss::Geomean, 0.0);
 }
 
+/// The script for a lent machine, with a Python that tells how it was called.
+#[test]
+#[cfg(unix)]
+fn the_script_for_a_lent_machine_trains_both_and_wants_packs_to_validate_on() {
+    use std::os::unix::fs::PermissionsExt;
+
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("python3"), "#!/bin/sh\necho \"$@\"\n").unwrap();
+    std::fs::set_permissions(at("python3"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
+    let lent = || {
+        let mut command = Command::new("bash");
+        command.arg(root().join("eval/twin/lent_gpu.sh")).env("PATH", &path);
+        command.env("PACKS", folder.path()).env("OUT", at("out")).output().unwrap()
+    };
+    std::fs::write(at("a.pack"), "").unwrap();
+    let refused = lent();
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && said.contains("no val*.pack in"), "{said}");
+    std::fs::write(at("val.pack"), "").unwrap();
+    let done = lent();
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let calls: Vec<&str> = said.lines().collect();
+    assert_eq!(calls.len(), 2, "{said}");
+    assert!(
+        calls[0].contains("--model prefilter") && calls[1].contains("--model demc-m --prefilter"),
+        "{said}"
+    );
+    let packs = format!("--data {} --val {}", at("a.pack").display(), at("val.pack").display());
+    assert!(calls.iter().all(|call| call.contains(&packs) && call.contains("--leak 0.01")), "{said}");
+}
+
 /// Packing needs numpy alone.
 #[test]
 fn a_pack_that_cannot_be_made_is_told_and_leaves_nothing() {

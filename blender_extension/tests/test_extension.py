@@ -78,6 +78,12 @@ class Extension(unittest.TestCase):
         folder = pathlib.Path(self.folder, "clean")
         return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
 
+    def picture(self):
+        """Renders and denoises; returns the values of the picture that is shown."""
+        bpy.ops.render.render()
+        self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
+        return bpy.data.images[f"Denoised {self.scene.name}"].pixels[:]
+
     def refused(self, operator, words):
         with self.assertRaisesRegex(RuntimeError, words):
             operator()
@@ -236,19 +242,14 @@ class Extension(unittest.TestCase):
         self.assertEqual(bpy.ops.demc.denoise_range(), {"FINISHED"})
 
     def test_light_groups_are_not_what_is_shown(self):
-        def picture():
-            bpy.ops.render.render()
-            self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
-            return bpy.data.images[f"Denoised {self.scene.name}"].pixels[:]
-
         self.prepared()
         self.scene.demc.use_compositor = False
-        usual = picture()
+        usual = self.picture()
         for name in ("a_key", "fill"):
             self.scene.view_layers[0].lightgroups.add(name=name)
         bpy.data.objects["Sun"].lightgroup = "fill"
         self.scene.demc.light_passes = True
-        self.assertTrue(picture() == usual, "one light group is shown")
+        self.assertTrue(self.picture() == usual, "one light group is shown")
 
     def test_what_is_refused_leaves_no_copy_of_the_render(self):
         self.prepared()
@@ -286,17 +287,12 @@ class Extension(unittest.TestCase):
         self.refused(bpy.ops.demc.denoise_range, "set Alpha to")
 
     def test_a_view_layer_of_the_results_name(self):
-        def picture():
-            bpy.ops.render.render()
-            self.assertEqual(bpy.ops.demc.denoise_render(), {"FINISHED"})
-            return bpy.data.images[f"Denoised {self.scene.name}"].pixels[:]
-
         self.prepared()
         self.scene.demc.use_compositor = False
-        usual = picture()
+        usual = self.picture()
         self.scene.view_layers[0].name = "Denoised"
         # Not assertEqual, which would look for hours at how thousands of numbers differ.
-        self.assertTrue(picture() == usual, "the noisy picture is shown")
+        self.assertTrue(self.picture() == usual, "the noisy picture is shown")
 
     def test_frames_of_a_range_and_of_a_folder(self):
         self.prepared()

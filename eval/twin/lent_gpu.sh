@@ -8,11 +8,11 @@
 set -euo pipefail
 here=$(dirname "$0")
 : "${PACKS:?a folder of packs}" "${OUT:?a folder for the results}"
-[ ${#val[@]} -gt 0 ] || { echo "lent_gpu.sh: no val*.pack in $PACKS to validate on" >&2; exit 2; }
 model=${MODEL:-demc-m} prefilter=${PREFILTER:-}
 export PYTHONUNBUFFERED=1
 mapfile -t val < <(find "$PACKS" -name 'val*.pack' | sort)
 mapfile -t data < <(find "$PACKS" -name '*.pack' ! -name 'val*' | sort)
+[ ${#val[@]} -gt 0 ] || { echo "lent_gpu.sh: no val*.pack in $PACKS to validate on" >&2; exit 2; }
 common=(--data "${data[@]}" --val "${val[@]}" --every 45 --resume --batch "${BATCH:-48}" --leak "${LEAK:-0.01}")
 if [ -z "$prefilter" ]; then
     python3 "$here/train.py" --model prefilter --size-of "$model" --loss geomean --minutes "${PREFILTER_MINUTES:-2}" \

@@ -82,26 +82,26 @@ struct Compare<'a> {
     clean: [&'a [f32]; 3],
     floor: f32,
     least: f32,
-    changes_of_row: &'a mut [f32],
-    units_of_row: &'a mut [f32],
+    changes: &'a mut [f32],
+    units: &'a mut [f32],
 }
 
 impl Vectorised for Compare<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self { noisy, clean, floor, least, changes_of_row, units_of_row } = self;
-        changes_of_row.fill(0.0);
-        units_of_row.fill(0.0);
+        let Self { noisy, clean, floor, least, changes, units } = self;
+        changes.fill(0.0);
+        units.fill(0.0);
         for (noisy, clean) in noisy.into_iter().zip(clean) {
-            for (change, (noisy, clean)) in changes_of_row.iter_mut().zip(noisy.iter().zip(clean)) {
+            for (change, (noisy, clean)) in changes.iter_mut().zip(noisy.iter().zip(clean)) {
                 *change += (noisy.max(0.0) - clean) / (clean + floor);
             }
-            for (unit, clean) in units_of_row.iter_mut().zip(clean) {
+            for (unit, clean) in units.iter_mut().zip(clean) {
                 let square = (clean * clean).min(f32::MAX);
                 *unit += (square + least) / (square + RELMSE_EPSILON as f32);
             }
         }
-        for (change, unit) in changes_of_row.iter_mut().zip(units_of_row) {
+        for (change, unit) in changes.iter_mut().zip(units) {
             let mean = *change / 3.0;
             *change = (mean * mean).min(LARGEST_CHANGE);
             *unit /= 3.0;
@@ -124,15 +124,17 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
         let (ones, units) = rest.split_at_mut(squares);
         ones.fill(1.0);
         let mut is_near = vec![true; width];
-        let [mut of_row, mut units_of_row] = [(); 2].map(|()| vec![0.0; width]);
+        let [mut changes_of_row, mut units_of_row] = [(); 2].map(|()| vec![0.0; width]);
         let rows = row * SQUARE..((row + 1) * SQUARE).min(height);
         for y in rows.clone() {
             if let Some(empty) = &render.empty {
                 empty.row(y, &mut is_near);
             }
             let [noisy, clean] = [render.radiance, result].map(|planes| planes.rows(y));
-            let (changes_of_row, units_of_row) = (&mut of_row[..], &mut units_of_row[..]);
-            vectorised::run(Compare { noisy, clean, floor, least, changes_of_row, units_of_row });
+            let (changes_of_row, units_of_row) = (&mut changes_of_row, &mut units_of_row);
+            let compare =
+                Compare { noisy, clean, floor, least, changes: changes_of_row, units: units_of_row };
+            vectorised::run(compare);
             for x in 0..width {
                 changes[x / SQUARE] += changes_of_row[x];
                 // What stays as rendered because nothing was met has no error.

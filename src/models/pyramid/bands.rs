@@ -321,18 +321,16 @@ impl<'a, S: Subject> Progress<'a, S> {
                 [a, b] => Field::filter_rows([a, b], inside, kernel, &trust).into(),
                 images => Vec::from(Field::filter_rows([&images[0]], inside, kernel, &trust)),
             };
-            let outputs = sources.chunks(3).flat_map(filtered_together);
+            let outputs: Vec<Field> = sources.chunks(3).flat_map(filtered_together).collect();
             *filtered = rows.end;
+            if predicted.rows.is_empty() {
+                kernels.pop_front();
+            }
             if scale > 0 {
                 images.iter_mut().zip(outputs).for_each(|(image, output)| image.smooth.push(output));
-                if predicted.rows.is_empty() {
-                    kernels.pop_front();
-                }
                 continue;
             }
             let gain = self.gains.pop_front().expect("there is one for each kernel");
-            let outputs = outputs.collect();
-            kernels.pop_front();
             done(rows.start, &self.subject.finish(rows, outputs, gain));
         }
     }
