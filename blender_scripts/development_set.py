@@ -77,8 +77,7 @@ class View:
         self.filter = "box" if box else "blackman-harris"
 
     def noisy(self, spp, seed):
-        plain = names.noisy_name(self.adaptive if (spp, seed) == _DEFAULTS else self.name, spp)
-        return plain if seed == 0 else plain.replace(".exr", f"_n{seed}.exr")
+        return names.noisy_name(self.adaptive if (spp, seed) == _DEFAULTS else self.name, spp, seed=seed)
 
     def part(self, which):
         return f"parts/{self.name}_ref_{which}.exr"
@@ -136,6 +135,7 @@ def parse(arguments):
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the set")
     parser.add_argument(
         "--assets",
+        type=cl.folder,
         action="append",
         default=[],
         metavar="DIR",
@@ -165,9 +165,6 @@ def parse(arguments):
     if unknown:
         parser.error(f"unknown view {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     options.views = [known[name] for name in chosen]
-    for folder in options.assets:
-        if not os.path.isdir(folder):
-            parser.error(f"{folder}: no such folder (--assets)")
     return options
 
 
@@ -275,13 +272,16 @@ def join(table, view, parts):
     if table.missing(defaults):
         store(table, view, view.reference, parts, mean, variance, seconds)
         return
-    defaults_image, share = read(defaults), len(parts) / (len(parts) + _DEFAULTS_WEIGHT)
-    both = {
-        name: share * plane + (1 - share) * defaults_image[name].astype("f4") for name, plane in mean.items()
-    }
+    share = len(parts) / (len(parts) + _DEFAULTS_WEIGHT)
+    light = {name: plane.astype("f4") for name, plane in read(defaults).items()}
+    # The defaults are stored as half: beyond its range they are cut, and count nothing.
+    shares = {name: np.where(np.abs(light[name]) < exr.MOST_HALF, share, 1) for name in mean}
+    both = {name: shares[name] * plane + (1 - shares[name]) * light[name] for name, plane in mean.items()}
     # The defaults' own variance: what they differ by from the mean of the parts, less what that varies by.
-    beyond = {name: (mean[name] - defaults_image[name].astype("f4")) ** 2 - variance[name] for name in color}
-    variance = {name: share**2 * variance[name] + (1 - share) ** 2 * beyond[name] for name in color}
+    beyond = {name: (mean[name] - light[name]) ** 2 - variance[name] for name in color}
+    variance = {
+        name: shares[name] ** 2 * variance[name] + (1 - shares[name]) ** 2 * beyond[name] for name in color
+    }
     store(
         table, view, view.reference, parts + "+", both, variance, seconds + float(rows[defaults]["seconds"])
     )

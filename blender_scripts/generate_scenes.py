@@ -38,7 +38,7 @@ sys.path.insert(0, os.path.dirname(os.path.abspath(bpy.path.abspath(__file__))))
 from demc_blender import command_line as cl
 from demc_blender import exr, names, rendering
 from demc_blender.edits import Edits
-from demc_blender.ledger import Ledger
+from demc_blender.ledger import Ledger, append, whole_lines
 from demc_blender.position import store_position, write_position
 from demc_scenes import making, moving
 from demc_scenes.assets import Library
@@ -72,9 +72,9 @@ def parse(arguments):
         help=f"allow the seeds {_span(making.DEVELOPMENT_SEEDS)}, of which development_set.py makes what "
         "trained models are judged on: never train on these pairs",
     )
-    parser.add_argument("--assets", action="append", default=[], metavar="DIR",
+    parser.add_argument("--assets", type=cl.folder, action="append", default=[], metavar="DIR",
                         help="models, textures, HDRIs and pictures to furnish with; may be repeated")
-    parser.add_argument("--blend", metavar="DIR", help="also render random views of the .blend scenes below DIR")
+    parser.add_argument("--blend", type=cl.folder, metavar="DIR", help="also render random views of the .blend scenes below DIR")
     parser.add_argument("--blend-share", type=cl.share, default=0.3, metavar="F",
                         help="share of seeds that go to --blend scenes (default 0.3)")
     parser.add_argument("--kinds", metavar="a,b", help="kinds of scenes (default: all)")
@@ -198,10 +198,6 @@ def parse(arguments):
         parser.error("--all-references goes with --sequence")
     if options.sequence > 1 and (options.noisy_seeds > 1 or options.also_spp or options.guides_only):
         parser.error("--sequence does not go with --noisy-seeds, --also-spp and --guides-only")
-    for name, folders in (("assets", options.assets), ("blend", [options.blend] if options.blend else [])):
-        for folder in folders:
-            if not os.path.isdir(folder):
-                parser.error(f"{folder}: no such folder (--{name})")
     if options.guides_only and options.denoise_references:
         parser.error("--guides-only keeps no light that --denoise-references could clean")
     try:
@@ -293,8 +289,7 @@ class Crop:
         for frame in self.frames:
             for spp in counts:
                 for n in range(self.seeds):
-                    plain = names.noisy_name(self.name, spp, frame)
-                    yield (plain if n == 0 else plain.replace(".exr", f"_n{n}.exr")), spp, n, frame
+                    yield names.noisy_name(self.name, spp, frame, seed=n), spp, n, frame
             for spp in also + [rendering.DEFAULT_SAMPLES] * self.adaptive:
                 yield names.noisy_name(self.name, spp, frame), spp, 0, frame
 
@@ -325,24 +320,16 @@ class Records:
         self.rejected = {row[0]: row[1] for row in self._rows("rejected.csv")}
 
     def _rows(self, name):
-        path = os.path.join(self.out, name)
-        if not os.path.exists(path):
-            return []
-        with open(path, encoding="utf-8", newline="") as file:
-            return [row for row in csv.reader(file) if len(row) > 1][1:]
-
-    def _append(self, name, header, rows):
-        path = os.path.join(self.out, name)
-        fresh = not os.path.exists(path)
-        with open(path, "a", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(([header] if fresh else []) + rows)
+        rows = csv.reader(whole_lines(os.path.join(self.out, name)))
+        return [row for row in rows if len(row) > 1][1:]
 
     def add_crop(self, crop):
-        self._append("manifest.csv", ["scene", "noisy", "reference", "spp"], [list(pair) for pair in crop.pairs()])
+        path = os.path.join(self.out, "manifest.csv")
+        append(path, ("scene", "noisy", "reference", "spp"), crop.pairs())
         self.done.add(crop.name)
 
     def reject(self, scene_name, reason):
-        self._append("rejected.csv", ["scene", "reason"], [[scene_name, reason]])
+        append(os.path.join(self.out, "rejected.csv"), ("scene", "reason"), [(scene_name, reason)])
         self.rejected[scene_name] = reason
 
     def begin(self, scene_name):
@@ -354,7 +341,7 @@ class Records:
                 name, _, count = file.read().rpartition(" ")  # a .blend's name may hold spaces
             tries = int(count or 0) if name == scene_name else 0
         if tries >= 2:
-            self.reject(scene_name, "Blender crashed")
+            self.reject(scene_name, "Blender ended on it twice without a word (a crash, or a kill)")
             return False
         with open(self.mark, "w", encoding="utf-8") as file:
             file.write(f"{scene_name} {tries + 1}")
@@ -441,13 +428,8 @@ def render_reference(options, ledger, scene, layers, crop, frame, facts):
 def render_compact(scene, path):
     """Renders, drops what no network reads, stores the rest as half in one part; returns processor
     seconds."""
-    partial = f"{path}.render.tmp"
-    start = time.process_time()
-    rendering.render_to(scene, partial)
-    seconds = time.process_time() - start
-    channels = {name: plane for name, plane in exr.read(partial).items() if not name.endswith(_DROPPED)}
-    exr.write_half(path, channels)
-    os.remove(partial)
+    channels, seconds = rendering.render_channels(scene, f"{path}.render.tmp")
+    exr.write_half(path, {name: plane for name, plane in channels.items() if not name.endswith(_DROPPED)})
     return seconds
 
 
@@ -516,7 +498,7 @@ def main():
             print(f"{scene_name}: is there" if scene_name not in records.rejected else f"{scene_name}: rejected before, {records.rejected[scene_name]}")
             continue
         if not records.begin(scene_name):
-            print(f"{scene_name}: rejected, Blender crashed on it twice")
+            print(f"{scene_name}: rejected, {records.rejected[scene_name]}")
             continue
         try:
             print(f"{scene_name}: {render_scene(options, library, records, ledger, seed, kind, scene_name)}")

@@ -49,8 +49,7 @@ class Pair:
 
     def noisy(self, spp, seed):
         """The file of a noisy frame."""
-        plain = names.noisy_name(self.name, spp)
-        return plain if seed == 0 else plain.replace(".exr", f"_n{seed}.exr")
+        return names.noisy_name(self.name, spp, seed=seed)
 
     def part(self, which):
         """The file of a part of the reference."""

@@ -27,7 +27,7 @@ sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 from demc_blender import exr, names
 
 _SEED = 1  # of the pixels that become NaN
-_BRIGHTEST = np.float32(65504.0)  # the largest finite half, which formats and screens agree on
+_BRIGHTEST = np.float32(exr.MOST_HALF)  # the largest finite half, which formats and screens agree on
 _LIGHT = (".Combined.R", ".Combined.G", ".Combined.B")
 _GUIDES = (".Denoising Albedo", ".Denoising Normal")
 

@@ -162,7 +162,10 @@ fn a_report_goes_by_the_last_try_of_a_log_and_finds_what_was_never_rendered() {
     report("one.jsonl --of shot --frames 1-2").success();
     report("one.jsonl --of shot --frames 1-4")
         .code(1)
-        .stdout(contains("frames 3-4").and(contains("1 missing")));
+        .stdout(contains("frames 3-4").and(contains("2 missing")));
+    report("one.jsonl --of shot --frames 2,4-8:2")
+        .code(1)
+        .stdout(contains("frames 4,6,8").and(contains("3 missing")));
     // What a farm's engine puts before each line, an editor before the first, and a killed task before the next.
     let lines = fs::read_to_string(path("one.jsonl")).unwrap();
     let prefixed =

@@ -485,7 +485,8 @@ fn renders_views_of_the_development_set_once() {
     let said = render("--views dev08_embossed,dev12_cutout --spp 1,2");
     assert!(said.lines().count() == 1 && said.starts_with("dev12_cutout: 1 frames, 0 parts"), "{said}");
     let again = fs::read_to_string(out.join("views.csv")).unwrap();
-    let hash = |row: &str| row.rsplit_once(',').unwrap().1.to_owned();
+    let hash = |row: &str| row.split(',').nth(11).unwrap().to_owned();
+    assert_eq!(hash(last).len(), 64, "{last}");
     assert_eq!(hash(again.trim_end().lines().last().unwrap()), hash(last), "the same pixels");
     assert!(render("--check").contains("4 of 4 files are as listed"));
     let assets = folder.path().join("assets");
@@ -524,6 +525,7 @@ fn references_of_the_development_set_share_no_sample_with_what_they_judge() {
         ("abcd", "40.0", 0.01 / 4.0),
     ]) {
         assert_eq!((row[1], row[2]), (sources, seconds), "{said}");
+        assert_eq!(row[5], "1000000.0", "what the defaults cut off is not averaged: {said}");
         for figure in &row[3..5] {
             let relmse: f64 = figure.parse().unwrap();
             assert!(

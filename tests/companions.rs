@@ -9,7 +9,10 @@ use std::{
     sync::LazyLock,
 };
 
-use common::python::{self, run};
+use common::{
+    files::{read_exr, values, write_render},
+    python::{self, run},
+};
 use demc::passes::{self, Pass, PassSet};
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
@@ -109,6 +112,8 @@ fn light_passes_and_light_groups_add_up_to_the_denoised_beauty() {
             let alone = denoise(name, alone.path(), &format!("--model {model}"));
             assert_eq!(beauty, layer(&alone, "Denoised"), "{what}");
             if name == "film.exr" {
+                let [kept, sky] = ["Environment.Denoised", "Environment"].map(|name| layer(&done, name));
+                assert_eq!(kept, sky, "the film does not show the sky: nothing is known of it, {what}");
                 continue; // the world's group holds the sky, which the film does not show
             }
             let [mut groups, rest] = ["Key", "Rest"].map(|g| layer(&done, &format!("Combined_{g}.Denoised")));
@@ -318,4 +323,26 @@ fn opaque_frames_keep_their_alpha_to_the_bit() {
     let out = tempfile::tempdir().unwrap();
     let done = passes::load(denoise("sky.exr", out.path(), "--model demc-s --replace"), None).unwrap();
     assert!(done.get(Pass::Alpha).unwrap().data.iter().all(|v| *v == 1.0));
+}
+
+#[test]
+fn a_thing_that_fills_a_rectangle_leaves_the_alpha_beside_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (width, height, path) = (96, 64, folder.path().join("card.exr"));
+    let is_card = |i: usize| (20..60).contains(&(i % width)) && (10..50).contains(&(i / width));
+    write_render(&path, width, height, |name, i| match name {
+        // Half a shadow lies on the right of the card, black as what it is caught by.
+        "Combined.A" if !is_card(i) => 0.6 * f32::from(u8::from(i % width >= 60)),
+        "Combined.A" => 1.0,
+        name if name.starts_with("Combined") && is_card(i) => 0.3 + 0.1 * (i * 7 % 5) as f32,
+        _ => 0.0,
+    });
+    for model in ["demc-s", "demc-l"] {
+        let mut command = common::demc();
+        let out = folder.path().join(model);
+        command.arg("denoise").arg(&path).arg("--out").arg(&out).args(["--model", model]).assert().success();
+        let alpha = values(&read_exr(out.join("card.exr")), "ViewLayer.Denoised.A");
+        let shadow = (0..width * height).filter(|i| i % width >= 66).map(|i| alpha[i]);
+        assert!(shadow.clone().all(|v| (v - 0.6).abs() < 0.1), "{model}: {:?}", shadow.reduce(f32::min));
+    }
 }

@@ -62,6 +62,32 @@ fn a_view_layer_is_held_against_its_namesake() {
 }
 
 #[test]
+fn of_several_results_that_of_the_most_passes_is_judged() {
+    let dir = tempfile::tempdir().unwrap();
+    let [a, b] = ["a.exr", "b.exr"].map(|f| dir.path().join(f));
+    let results = [("Background.Denoised", 5.0), ("Foreground.Denoised", 2.0), ("Foreground.Other", 2.0)];
+    let renders = [("Background.Combined", 4.0), ("Foreground.Combined", 2.0)];
+    let guide = ("Foreground.Denoising Albedo", 1.0);
+    write(&a, (0, 0), &[&results[..], &renders, &[guide]].concat());
+    write(&b, (0, 0), &renders);
+    let told = contains("'Denoised' of view layer 'Foreground'; others hold one too");
+    compare(&a, &b).assert().success().stdout(contains("rmse 0\n")).stderr(told);
+    // By the name of the layer, and as the reference, as well.
+    let named = compare(&a, &b).args(["--layer", "Denoised"]).assert().success();
+    named.stdout(contains("rmse 0\n")).stderr(contains("view layer 'Foreground'"));
+    let [plain, reference] = ["plain.exr", "reference.exr"].map(|f| dir.path().join(f));
+    write(&plain, (0, 0), &[("Combined", 2.0)]);
+    write(&reference, (0, 0), &[&results[..2], &renders, &[guide]].concat());
+    let against = compare(&plain, &reference).args(["--reference-layer", "Denoised"]).assert().success();
+    against.stdout(contains("rmse 0\n")).stderr(contains("'Denoised' of view layer 'Foreground'"));
+    // One that is named, or holds such a layer alone, needs no note.
+    let background = compare(&a, &b).args(["--view-layer", "Background"]).assert().success();
+    background.stdout(contains("rmse 1\n")).stderr(contains("others hold").not());
+    let other = compare(&a, &b).args(["--layer", "Other"]).assert().success();
+    other.stdout(contains("rmse 0\n")).stderr(contains("others hold").not());
+}
+
+#[test]
 fn other_pixels_are_not_compared() {
     let dir = tempfile::tempdir().unwrap();
     let [a, b] = ["a.exr", "b.exr"].map(|f| dir.path().join(f));

@@ -95,6 +95,37 @@ fn a_result_denoised_again_stays() {
 }
 
 #[test]
+fn what_is_nearly_black_brings_no_noise_back_beside_it() {
+    let [noisy, reference] =
+        ["s0000_room_0004spp.exr", "s0000_room_ref.exr"].map(|name| passes::load(data(name), None).unwrap());
+    // Beyond the reach of what is darkened.
+    let lit = |image: &Planes| image.window((80, 0), (image.width - 80, image.height));
+    let truth = lit(combined(&reference));
+    for name in MODELS {
+        let [plain, beside] = [1.0, 1e-6].map(|factor| {
+            let mut frame = noisy.clone();
+            let mut light = combined(&frame).clone();
+            let width = light.width;
+            light.data.iter_mut().enumerate().filter(|(i, _)| i % width < 64).for_each(|(_, v)| *v *= factor);
+            frame.insert(Pass::Combined, light);
+            relmse(&lit(&model(name).denoise(&Shot::new(frame)).unwrap()), &truth)
+        });
+        assert!(beside < 1.6 * plain, "{name}: {beside} beside black, {plain} as rendered");
+    }
+}
+
+#[test]
+fn light_too_dark_for_a_reciprocal_stays() {
+    let mut frame = part(40, 30);
+    let mut light = combined(&frame).clone();
+    light.data.iter_mut().for_each(|v| *v *= 1e-41);
+    frame.insert(Pass::Combined, light.clone());
+    for name in MODELS {
+        assert_eq!(model(name).denoise(&Shot::new(frame.clone())).unwrap(), light, "{name}");
+    }
+}
+
+#[test]
 fn a_region_is_denoised_as_a_frame_of_its_own() {
     let region = part(61, 47);
     let (size, place) = ((100, 80), (21, 9));

@@ -116,6 +116,36 @@ fn warns_of_the_aliased_position_and_of_windows_that_differ() {
 }
 
 #[test]
+fn copies_of_the_picture_beside_a_view_layer_miss_no_pass() {
+    use exr::prelude::*;
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("in.exr");
+    let missing = |layers: &[&str]| -> Vec<String> {
+        let named = layers.iter().flat_map(|layer| {
+            let components = if layer.ends_with("Normal") { ["X", "Y", "Z"] } else { ["R", "G", "B"] };
+            components.map(|c| if layer.is_empty() { c.to_owned() } else { format!("{layer}.{c}") })
+        });
+        let list = named.map(|name| AnyChannel::new(name.as_str(), FlatSamples::F32(vec![0.5; 12])));
+        let channels = AnyChannels::sort(list.collect());
+        let layer = Layer::new((4, 3), LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
+        Image::from_layer(layer).write().to_file(&path).unwrap();
+        let report = json(inspect().arg(&path)).remove(0);
+        let is_warned = |layer: &&serde_json::Value| {
+            let findings = layer["findings"].as_array().unwrap();
+            findings.iter().any(|finding| finding["code"] == "missing-pass")
+        };
+        let warned = report["layers"].as_array().unwrap().iter().filter(is_warned);
+        warned.map(|layer| layer["name"].as_str().unwrap().to_owned()).collect()
+    };
+    let whole = ["V.Combined", "V.Denoising Albedo", "V.Denoising Normal"];
+    assert_eq!(missing(&[&whole[..], &["Composite.Combined", ""]].concat()), [""; 0]);
+    // What is denoised, and another view layer, are no copies.
+    assert_eq!(missing(&["Composite.Combined"]), ["Composite"]);
+    assert_eq!(missing(&[""]), [""]);
+    assert_eq!(missing(&[&whole[..], &["Other.Combined"]].concat()), ["Other"]);
+}
+
+#[test]
 fn lists_every_view_layer_and_eye() {
     inspect()
         .args([data("blender4_two_layers.exr"), data("blender5_stereo.exr")])

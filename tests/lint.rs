@@ -197,6 +197,61 @@ fn guides_that_are_blank_or_one_value() {
 }
 
 #[test]
+fn a_plain_wall_is_noted_and_nan_is_no_value() {
+    let found = |pass: Pass, values: [f32; 3]| {
+        let mut set = SOUND.passes();
+        change(&mut set, pass, |planes| (0..3).for_each(|c| planes.channel_mut(c).fill(values[c])));
+        let found = lint::frame(&set, &About::default()).into_iter();
+        found.filter(|finding| finding.code == "constant-guide").map(|f| f.harms).collect::<Vec<_>>()
+    };
+    assert_eq!(found(Pass::DenoisingNormal, [0.0, 0.6, 0.8]), [false]);
+    assert_eq!(found(Pass::DenoisingNormal, [0.2; 3]), [true], "no direction");
+    assert_eq!(found(Pass::DenoisingAlbedo, [0.0, 0.6, 0.8]), [true]);
+    assert_eq!(found(Pass::DenoisingAlbedo, [f32::NAN; 3]), [false; 0]);
+}
+
+/// Passes of a frame in which no surface is seen, whose albedo is the light.
+fn of_sky(light: impl Fn(f32, f32) -> f32 + Sync) -> PassSet {
+    let mut set = SOUND.passes();
+    let (w, h) = SIZE;
+    let sky = Planes::from_rows(3, SIZE, |c, y, row| {
+        let colour = [0.6, 0.8, 1.0][c];
+        for (x, v) in row.iter_mut().enumerate() {
+            *v = colour * light(x as f32 / w as f32, y as f32 / h as f32);
+        }
+    });
+    set.insert(Pass::Combined, to_half(sky.clone()));
+    set.insert(Pass::DenoisingAlbedo, to_half(sky));
+    for pass in [Pass::DenoisingNormal, Pass::Normal] {
+        set.insert(pass, Planes::new(3, w, h));
+    }
+    set
+}
+
+#[test]
+fn a_frame_in_which_nothing_is_met_lacks_no_pass() {
+    // Clouds, a sky of one colour, and nothing at all before a transparent film.
+    let clouds = of_sky(|x, y| 0.4 + 0.1 * (20.0 * x).sin() * (15.0 * y).cos());
+    assert_eq!(codes(&clouds, &About::default()), [""; 0]);
+    let mut plain = of_sky(|_, _| 0.0);
+    for pass in [Pass::Combined, Pass::DenoisingAlbedo] {
+        // Blender's default world, which is nearly 13/255.
+        each(&mut plain, pass, |_| 0.050_876_09);
+    }
+    assert_eq!(codes(&plain, &About::default()), [""; 0]);
+    let mut empty = of_sky(|_, _| 0.0);
+    empty.insert(Pass::Alpha, Planes::new(1, SIZE.0, SIZE.1));
+    assert_eq!(codes(&empty, &About::default()), [""; 0]);
+    let dark = of_sky(|_, _| 0.0);
+    assert_eq!(codes(&dark, &About::default()), [""; 0], "a fade from black");
+    // A beauty that is lost, and normals that are.
+    assert_found(SOUND, |set| each(set, Pass::Combined, |_| 0.0), &["empty-pass"]);
+    let mut blank = SOUND.passes();
+    each(&mut blank, Pass::DenoisingNormal, |_| 0.0);
+    assert!(codes(&blank, &About::default()).contains(&"empty-pass"));
+}
+
+#[test]
 fn guides_of_another_frame() {
     for moved in [(7.0, -4.0), (0.0, 5.0), (-9.0, 0.0)] {
         for passes in [&[Pass::DenoisingAlbedo][..], &[Pass::DenoisingAlbedo, Pass::DenoisingNormal]] {
@@ -288,6 +343,10 @@ fn values_that_are_no_light() {
         |value: f32| move |set: &mut PassSet| change(set, Pass::Combined, |planes| planes.data[777] = value);
     assert_found(SOUND, put(f32::NAN), &["not-finite"]);
     assert_found(SOUND, put(-0.5), &["negative-light"]);
+    // One value that rounding left is none to warn of, many are.
+    assert_found(SOUND, put(-1e-7), &[]);
+    let many = |set: &mut PassSet| change(set, Pass::Combined, |planes| planes.data[700..710].fill(-1e-7));
+    assert_found(SOUND, many, &["negative-light"]);
     let about = About { half: BTreeSet::from([Pass::Combined]), ..About::default() };
     let mut set = SOUND.passes();
     put(HALF_MAX)(&mut set);
@@ -349,6 +408,12 @@ fn noise_that_was_spread_over_pixels() {
 fn a_pixel_filter_that_is_too_wide() {
     assert_found(Render { filter: 6.0, ..SOUND }, |_| {}, &["wide-filter"]);
     assert_found(Render { filter: 8.0, ..SOUND }, |_| {}, &["wide-filter"]);
+    // A camera out of focus blurs as much.
+    let found = lint::frame(&Render { filter: 8.0, ..SOUND }.passes(), &About::default());
+    assert!(
+        found[0].message.contains("pixel filter") && found[0].message.contains("out of focus"),
+        "{found:?}"
+    );
 }
 
 #[test]
@@ -360,6 +425,11 @@ fn motion_blur_in_the_beauty_alone() {
 fn pixels_encoded_for_a_display() {
     let srgb = |set: &mut PassSet| each(set, Pass::Combined, curve);
     assert_found(SOUND, srgb, &["display-pixels"]);
+    let with_a_lamp = |set: &mut PassSet| {
+        srgb(set);
+        change(set, Pass::Combined, |planes| planes.data[777..780].fill(2.0));
+    };
+    assert_found(SOUND, with_a_lamp, &["display-pixels"]);
     // Brighter, so that lamps' light is cut off: that is no clamp of samples.
     let clipped = |set: &mut PassSet| each(set, Pass::Combined, |v| (4.0 * v).min(1.0));
     assert_found(SOUND, clipped, &["display-pixels"]);

@@ -305,3 +305,26 @@ fn methods_that_a_variable_leaves_out_are_no_evaluation() {
         run.assert().code(2).stderr(contains("--models names no method"));
     }
 }
+
+#[test]
+fn weights_that_are_not_where_demc_runs_are_not_called_untrained() {
+    let folder = tempfile::tempdir().unwrap();
+    let listed = |command: &mut assert_cmd::Command| {
+        let run = command.env_remove("DEMC_WEIGHTS").arg("models").assert().success();
+        String::from_utf8(run.get_output().stdout.clone()).unwrap()
+    };
+    let weights_of = |list: &str| -> String {
+        let row = list.lines().find(|line| line.starts_with("lbf ")).unwrap();
+        row.split_whitespace()
+            .skip(1)
+            .take_while(|word| word.parse::<u32>().is_err())
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    let elsewhere = listed(demc().current_dir(folder.path()));
+    assert_eq!(weights_of(&elsewhere), "not found");
+    assert!(elsewhere.contains("DEMC_WEIGHTS=FOLDER"), "{elsewhere}");
+    let here = listed(demc().current_dir(env!("CARGO_MANIFEST_DIR")));
+    assert_eq!(weights_of(&here), "file");
+    assert!(!here.contains("DEMC_WEIGHTS"), "{here}");
+}

@@ -327,6 +327,19 @@ fn light_that_flickers_stays_as_it_is() {
 }
 
 #[test]
+fn narrow_light_that_moves_by_its_width_leaves_no_ghost() {
+    for spread in [0.4, 0.1, 0.02] {
+        let shot = Shot { speed: 0.0, bars: true, spread, ..SHOT };
+        let dir = sequence(shot, 1..=5);
+        let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+        demc(&alone).arg(dir.path()).assert().success();
+        demc(&out).arg(dir.path()).arg("--temporal").assert().success();
+        let [with, without] = [&out, &alone].map(|dir| shot.error(&result(dir, 3), "ViewLayer.Denoised", 3));
+        assert!(with < 1.2 * without, "{spread}: {with} beside {without}");
+    }
+}
+
+#[test]
 fn a_lamp_leaves_nothing_where_it_was_nor_where_it_will_be() {
     let shot = Shot { speed: 0.0, lamp: 1e5, ..SHOT };
     let dir = sequence(shot, 0..=3);

@@ -17,6 +17,7 @@ _TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 _LINES = {0: 1, 2: 1, 3: 16}
 _ZIP = 3
 _LEVEL = 6  # of zlib, its own default
+MOST_HALF = float(np.finfo(np.float16).max)  # larger values are cut to it where half floats are written
 
 
 def read(path):
@@ -90,8 +91,7 @@ def write_half(path, channels, spp=None):
     """Writes name -> (height, width) arrays as one part of half floats, ZIP, scan lines; whole or not at all.
     `spp` is told as Blender tells it, `cycles.<view layer>.samples`: denoisers treat final frames with more
     care."""
-    limit = float(np.finfo(np.float16).max)
-    halves = {name: np.clip(plane, -limit, limit).astype("<f2") for name, plane in channels.items()}
+    halves = {name: np.clip(plane, -MOST_HALF, MOST_HALF).astype("<f2") for name, plane in channels.items()}
     layers = {name.split(".")[0] for name in channels} if spp else ()
     _write(path, halves, 1, texts={f"cycles.{layer}.samples": str(spp) for layer in sorted(layers)})
 

@@ -4,8 +4,10 @@ A file counts as done once its row is there, which is written last: a killed run
 without a row, and the next run makes it again.
 """
 
+import contextlib
 import csv
 import hashlib
+import io
 import os
 
 NAME = "views.csv"
@@ -26,6 +28,29 @@ COLUMNS = (
 )
 
 
+def whole_lines(path):
+    """The lines of a table, none where there is no table. One that a kill or a full disk cut off is left out."""
+    with contextlib.suppress(FileNotFoundError), open(path, encoding="utf-8", newline="") as file:
+        return [line for line in file if line.endswith("\n")]
+    return []
+
+
+def append(path, header, rows):
+    """Adds rows to a table, all or none, in place of a line that was cut off; begins it with its header."""
+    with open(path, "a+b") as file:
+        file.seek(0)
+        end = file.read().rfind(b"\n") + 1
+        file.truncate(end)
+        text = io.StringIO(newline="")
+        csv.writer(text, lineterminator="\n").writerows([*([] if end else [header]), *rows])
+        try:
+            file.write(text.getvalue().encode())
+            file.flush()
+        except OSError:
+            file.truncate(end)
+            raise
+
+
 class Ledger:
     """The folder's table. `seconds` are those of all processors together, `noise` is a reference's own, `pattern` that of
     samples where it is not Cycles' classic one."""
@@ -35,10 +60,7 @@ class Ledger:
 
     def rows(self):
         """File name -> its latest row."""
-        if not os.path.exists(self.path):
-            return {}
-        with open(self.path, encoding="utf-8", newline="") as file:
-            return {row["file"]: row for row in csv.DictReader(file)}
+        return {row["file"]: row for row in csv.DictReader(whole_lines(self.path))}
 
     def missing(self, name):
         """Whether a file is still to be rendered: not there, or without its row."""
@@ -47,11 +69,7 @@ class Ledger:
     def add(self, **row):
         """Adds a row for a file that is there; columns that are not named stay empty."""
         row["sha256"] = _sha256(os.path.join(self.folder, row["file"]))
-        with open(self.path, "a", encoding="utf-8", newline="") as file:
-            table = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
-            if not file.tell():
-                table.writeheader()
-            table.writerow(row)
+        append(self.path, COLUMNS, [[row.get(column, "") for column in COLUMNS]])
 
     def write_manifest(self, pairs):
         """Replaces manifest.csv by these pairs: scene, noisy file, reference, samples."""

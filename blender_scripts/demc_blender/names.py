@@ -9,9 +9,9 @@ def _with_frame(stem, frame):
     return f"{stem}.exr" if frame is None else f"{stem}.{frame:04d}.exr"
 
 
-def noisy_name(scene, spp, frame=None, half=""):
-    """Name of a noisy frame; `half` is "", "a" or "b"."""
-    suffix = f"_{half}" if half else ""
+def noisy_name(scene, spp, frame=None, half="", seed=0):
+    """Name of a noisy frame; `half` is "", "a" or "b", `seed` that of its noise, where there are several."""
+    suffix = (f"_{half}" if half else "") + (f"_n{seed}" if seed else "")
     return _with_frame(f"{scene}_{spp:04d}spp{suffix}", frame)
 
 

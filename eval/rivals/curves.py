@@ -2,7 +2,7 @@
 
     python curves.py OUT [NAME...]
 
-reads OUT/NAME/log.csv of each method, and OUT/NAME.seconds, the processor time of the whole run, over which the log's
+reads OUT/NAME/log.csv of each method (of those that are there, if none is named), and OUT/NAME.seconds, the processor time of the whole run, over which the log's
 seconds are spread where it is there (a run may have waited for others); and writes, beside this script, curves.csv (run, step, seconds, lr,
 train_loss, val_relmse, val_ssim) and curves.svg: RelMSE of the scenes that were held out, over steps and over
 minutes of one thread. Needs matplotlib.
@@ -19,7 +19,7 @@ matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "demc"})
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-METHODS = ("demc", "demc-nofusion", "semc", "kpcn", "lbf")
+METHODS = ("demc", "demc-nofusion", "semc", "kpcn", "kpcn-combined", "lbf")
 COLUMNS = ("step", "seconds", "lr", "train_loss", "val_relmse", "val_ssim")
 
 
@@ -58,7 +58,8 @@ def main():
     """Entry point of the script."""
     if len(sys.argv) < 2:
         sys.exit("usage: python curves.py OUT [NAME...]")
-    out, names = sys.argv[1], sys.argv[2:] or METHODS
+    out, names = sys.argv[1], sys.argv[2:]
+    names = names or [name for name in METHODS if os.path.exists(os.path.join(out, name, "log.csv"))]
     logs = {name: read(out, name) for name in names}
     here = os.path.dirname(os.path.abspath(__file__))
     with open(os.path.join(here, "curves.csv"), "w", encoding="utf-8", newline="") as file:

@@ -5,8 +5,8 @@
 # steps as fit nine tenths of the time on one thread with AVX512-BF16 beside a busy one; the environment variable SPEED
 # corrects that for another processor (0.5 for one of half the speed), SEED takes another seed than 1, RAW=1 has errors taken
 # against what clean_references.py cleaned as it was rendered. One thread each, one after another. A run that is cut by the
-# budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where it was stopped,
-# also with more SECONDS: OUT/NAME.seconds holds the time used so far. Of a run that goes astray, OUT/NAME/at-*.safetensors
+# budget keeps the best weights so far in OUT/NAME/best.safetensors. Given again, the command goes on where it was stopped;
+# more SECONDS give a run that was cut the steps that it lacks, not more. OUT/NAME.seconds holds the time used so far. Of a run that goes astray, OUT/NAME/at-*.safetensors
 # are checkpoints to go back to.
 set -eu
 data=$1 held_out=$2 out=$3 seconds=$4
@@ -34,6 +34,7 @@ for name in "$@"; do
     if [ -e "$out/$name/checkpoint.safetensors" ]; then
         spent=$(cat "$out/$name.seconds")
         if [ "$spent" -ge "$seconds" ]; then continue; fi
+        steps=$(sed -n 's/.*"steps": *\([0-9]*\).*/\1/p' "$out/$name/config.json" | head -n 1)
         run "$name" --resume &
     else
         every=$((steps / 30 > 0 ? steps / 30 : 1))
@@ -49,9 +50,10 @@ for name in "$@"; do
         # Processor time, so that a busy machine takes nothing from any of them.
         time=$(ps -o cputimes= -p $pid | tr -d ' ')
         if [ -n "$time" ]; then used=$((spent + time)); fi
-        echo "$used" >"$out/$name.seconds"
+        echo "$used" >"$out/$name.seconds.tmp"
+        mv "$out/$name.seconds.tmp" "$out/$name.seconds"
         # The checkpoint is of the last minute, so one is kept for every five validations.
-        rows=$(wc -l <"$out/$name/log.csv" 2>/dev/null || echo 0)
+        rows=$(cat "$out/$name/log.csv" 2>/dev/null | wc -l)
         if [ "$rows" -ge $((kept + 5)) ] && [ -e "$out/$name/checkpoint.safetensors" ]; then
             cp "$out/$name/checkpoint.safetensors" "$out/$name/at-$rows.safetensors"
             kept=$rows
@@ -60,10 +62,11 @@ for name in "$@"; do
     done
     status=0
     wait $pid 2>/dev/null || status=$?
-    # 130: it was interrupted when its time was over.
-    if [ $status -eq 130 ]; then echo "$name: cut before its $steps steps, at a rate that had not fallen to the end" >&2; fi
-    if [ $status -ne 0 ] && [ $status -ne 130 ]; then
-        echo "$name failed: $(grep -m 1 -E '^(error|demc):' "$out/$name.log")" >&2
+    # 130: it was interrupted, as it is when its time is over.
+    if [ $status -eq 130 ] && [ "$used" -ge "$seconds" ]; then
+        echo "$name: cut before its $steps steps, at a rate that had not fallen to the end" >&2
+    elif [ $status -ne 0 ]; then
+        echo "$name failed (exit status $status): $(grep -E '^(error|demc):' "$out/$name.log" | tail -n 1)" >&2
         failed=1
         continue
     fi

@@ -4,7 +4,7 @@
 # DATA and HELD_OUT are folders or manifests of pairs. The settings are the recipe as it is; a learning rate 2.5
 # times as large, or as small; twice or half as many crops a step; crops of half the size, as many pixels of them;
 # no coloured light. Steps are as many as the recipe makes in SECONDS (SPEED as in train.sh), half as many of
-# twice the crops. Writes OUT/trials.csv; trials that are in it already are not made again.
+# twice the crops. Writes OUT/trials.csv; trials that are in it already are not made again (another SEED wants another OUT).
 set -eu
 data=$1 held_out=$2 out=$3 seconds=$4
 shift 4

@@ -99,6 +99,15 @@ def joined(noisy, samples):
     return [path for path in noisy if not is_joined(path)], [path for path in noisy if is_joined(path)]
 
 
+def copy(files, folder):
+    """Copies files into a folder, but for those that are there."""
+    for path in files:
+        target = os.path.join(folder, os.path.basename(path))
+        if not os.path.exists(target):
+            shutil.copy(path, f"{target}.tmp")
+            os.replace(f"{target}.tmp", target)
+
+
 def main():
     """Entry point of the script."""
     parser = argparse.ArgumentParser(prog="clean_references.py", description="Denoises the references of a folder of pairs.")
@@ -112,13 +121,17 @@ def main():
     if options.join is None and os.path.exists(manifest):
         shutil.copy(manifest, options.out)
     with tempfile.TemporaryDirectory() as folder:
+        if options.join is None:
+            # Frames of a sequence that have no reference are what others take as neighbours.
+            copy(glob.glob(os.path.join(glob.escape(options.pairs), "*_[0-9]*spp*.exr")), options.out)
+        elif glob.glob(os.path.join(glob.escape(options.pairs), "*_mean.exr")):
+            sys.exit(f"{options.pairs}: holds means of renders (*_mean.exr), which share noise with what --join averages")
         for scene, source, noisy in pairs(options.pairs):
             target = os.path.join(options.out, os.path.basename(source))
             if os.path.exists(target) or not joined(noisy, options.join)[0]:
                 continue
             noisy, others = joined(noisy, options.join)
-            for path in noisy:
-                shutil.copy(path, options.out)
+            copy(noisy, options.out)
             channels = exr.read(source)
             reference, names = planes(channels, "Combined", "RGB")
             renders = [reference, *(planes(exr.read(path), "Combined", "RGB")[0] for path in others)]

@@ -10,14 +10,18 @@ import weights
 from weights import PREFILTER
 
 
+def of_prefilter(entries):
+    """What a network knows of its prefilter's layers, by the names that they have in a prefilter alone."""
+    return {name.removeprefix(PREFILTER): entry for name, entry in entries.items() if name.startswith(PREFILTER)}
+
+
 def main():
     """Entry point of the script."""
     source, target = sys.argv[1:]
     facts, tensors = weights.read(source)
     facts["network"] = {"architecture": "prefilter", "widths": facts["network"]["prefilter"]}
-    facts.pop("ranges", None)
-    own = {name.removeprefix(PREFILTER): tensor for name, tensor in tensors.items() if name.startswith(PREFILTER)}
-    weights.write(target, facts, own)
+    facts["ranges"] = of_prefilter(facts.get("ranges", {}))
+    weights.write(target, facts, of_prefilter(tensors))
 
 
 if __name__ == "__main__":

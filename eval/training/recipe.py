@@ -15,6 +15,8 @@ import argparse
 import csv
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
 
@@ -33,7 +35,7 @@ NETWORK = (
     "--loss ssim --raw-references --optimizer muon --lr 3e-3:1e-6 --weight-decay 0.2 --guide-dropout 0.15 --seed 1"
 )
 
-# docs/data.md, Training set.
+# docs/data.md, Training set, as it was before plain crops, blue noise and light passes: the bounds are of this one.
 TRAINING = (
     "--crops 2 --spp 2,8,16,32,64 --draw-spp 2 --noisy-seeds 2 --means --also-spp 1 --also-share 0.5 "
     "--adaptive-share 0.05 --filter-share 0.25 --ref-spp 256 --ref-noise 0.01 --denoise-references "
@@ -53,8 +55,44 @@ def render(options, sets):
         command = [sys.executable, GENERATE, "--out", os.path.join(options.out, name), "--seeds", f"{begin}:{end}"]
         command += ["--size", "128", "--threads", "1", *settings]
         running.append(subprocess.Popen(command))
-    if any([process.wait() for process in running]):
-        sys.exit("recipe.py: not everything could be rendered")
+    for process in running:
+        ended(process, running)
+    for name, begin, end, _ in sets:
+        wanted, there = end - begin, len(settled_seeds(os.path.join(options.out, name)))
+        if wanted - there > max(wanted // 50, 1):
+            sys.exit(f"recipe.py: {there} of {wanted} scenes of {name} are there; the lines above with \"failed\" say why")
+        if there < wanted:
+            print(f"recipe.py: goes on without {wanted - there} of {wanted} scenes of {name}, which failed", file=sys.stderr)
+
+
+def ended(process, started):
+    """The exit status of a process, once it has ended. If this script is stopped before that, so is all that it started."""
+    try:
+        return process.wait()
+    except BaseException:
+        for one in started:
+            one.terminate()
+        for one in started:
+            one.wait()
+        raise
+
+
+def run(*command):
+    """Runs a command, and goes on only if it ends well."""
+    process = subprocess.Popen(command)
+    if ended(process, [process]):
+        sys.exit(f"recipe.py: {command[0]} {command[1]} failed")
+
+
+def settled_seeds(folder):
+    """The seeds whose scene is rendered, or has nothing to see."""
+    seeds = set()
+    for name in ("manifest.csv", "rejected.csv"):
+        path = os.path.join(folder, name)
+        if os.path.exists(path):
+            with open(path, encoding="utf-8") as file:
+                seeds |= {seed.group() for seed in map(re.compile(r"s\d+").match, file) if seed}
+    return seeds
 
 
 def rendered(options):
@@ -88,7 +126,7 @@ def train(options, name, data, steps, settings):
     else:
         command = [options.demc, "train", "--data", data, "--out", out, "--patch", "128", "--batch", "4", *settings]
         command += ["--steps", str(steps), "--every", str(max(steps // 20, 100)), "--average", f"{1 - 20 / steps:.6f}"]
-    subprocess.run(command, check=True)
+    run(*command)
     return os.path.join(out, "last.safetensors")
 
 
@@ -96,7 +134,7 @@ def score(options, test, weights):
     """{samples: geometric mean of RelMSE over that of the noisy frames}; prints the built-in model's beside it."""
     out = os.path.join(options.out, "scores")
     command = [options.demc, "eval", "--test-set", test, "--models", f"{weights},{options.model}", "--baseline", "noisy"]
-    subprocess.run([*command, "--no-sheets", "--out", out], check=True)
+    run(*command, "--no-sheets", "--out", out)
     scores = {}
     with open(os.path.join(out, "summary.csv"), encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -119,6 +157,7 @@ def main():
     parser.add_argument("--blend", metavar="DIR", help="as generate_scenes.py has it; must not hold scenes to be scored on")
     parser.add_argument("--demc", default="demc", help="the program demc")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what it started ends with it
     training, test = rendered(options)
     settings = [*PREFILTER.split(), "--widths", PREFILTER_WIDTHS[options.model]]
     prefilter = train(options, f"prefilter-of-{options.model}", training, PREFILTER_STEPS, settings)

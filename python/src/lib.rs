@@ -162,8 +162,7 @@ fn leave(py: Python<'_>) {
 /// change, so others are opened anew.
 fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
     static OPENED: LazyLock<Mutex<HashMap<String, Arc<dyn Denoiser>>>> = LazyLock::new(Mutex::default);
-    let plain = models::split_precision(name.strip_suffix(models::UNRESTRAINED).unwrap_or(name)).0;
-    if models::catalogue::find(plain).is_none_or(|method| method.built_in().is_none()) {
+    if models::catalogue::find(models::without_variant(name)).is_none_or(|method| method.built_in().is_none()) {
         return Ok(models::open(name)?.into());
     }
     if let Some(model) = OPENED.lock().unwrap_or_else(PoisonError::into_inner).get(name) {

@@ -90,7 +90,7 @@ const SAME_PRIMARIES: f32 = 1e-3;
 /// As [`run`].
 pub fn scores(args: &Args, say: &dyn Fn(&str)) -> Result<(Scores, Planes)> {
     let image = judged(args, say)?;
-    let reference = reference(args, &image)?;
+    let reference = reference(args, &image, say)?;
     if image.view_layer != reference.view_layer {
         let [a, b] = [&image.view_layer, &reference.view_layer];
         say(&format!("note: compares view layer '{a}' of A with '{b}' of B"));
@@ -126,7 +126,7 @@ fn judged(args: &Args, say: &dyn Fn(&str)) -> Result<PassSet> {
     let (frame, view_layer) = (Frame::read(&args.image)?, args.view_layer.as_deref());
     let layer = match args.layer.as_deref() {
         None => {
-            let denoised = passes::rgb_layers(&frame, view_layer, DENOISED).into_iter().next();
+            let denoised = held(&frame, view_layer, DENOISED, say);
             if denoised.is_some() {
                 let path = args.image.display();
                 say(&format!("{path}: its layer '{DENOISED}' is judged (or say --layer {COMBINED})"));
@@ -134,7 +134,7 @@ fn judged(args: &Args, say: &dyn Fn(&str)) -> Result<PassSet> {
             denoised
         }
         Some(COMBINED) => None,
-        Some(name) => Some(named(&frame, view_layer, name)?),
+        Some(name) => Some(named(&frame, view_layer, name, say)?),
     };
     let layer = match layer {
         Some(layer) => layer,
@@ -144,25 +144,41 @@ fn judged(args: &Args, say: &dyn Fn(&str)) -> Result<PassSet> {
 }
 
 /// The reference, of the view layer and view that the image is of if there is one.
-fn reference(args: &Args, image: &PassSet) -> Result<PassSet> {
+fn reference(args: &Args, image: &PassSet, say: &dyn Fn(&str)) -> Result<PassSet> {
     let frame = Frame::read(&args.reference)?;
     let layers = passes::layers(&frame);
     let layer = match args.reference_layer.as_str() {
         COMBINED => passes::choose_like(&frame, &layers, &image.view_layer, image.view.as_deref())?.clone(),
         name => {
             let namesake = layers.iter().any(|l| l.name == image.view_layer).then_some(&*image.view_layer);
-            let found = named(&frame, namesake, name)?;
-            let of_view =
-                passes::rgb_layers(&frame, namesake, name).into_iter().find(|l| l.view == image.view);
-            of_view.unwrap_or(found)
+            let found = named(&frame, namesake, name, say)?;
+            let mut views = passes::rgb_layers(&frame, Some(found.name.as_str()), name).into_iter();
+            views.find(|l| l.view == image.view).unwrap_or(found)
         }
     };
     combined(&frame, &layer)
 }
 
-/// The first view layer that holds a layer of that name, with this layer as its Combined.
-fn named(frame: &Frame, view_layer: Option<&str>, name: &str) -> Result<Layer> {
-    passes::rgb_layers(frame, view_layer, name).into_iter().next().ok_or_else(|| {
+/// Of the view layers that hold a layer of that name the one with the most passes, or else the first, with this layer
+/// as its Combined. `say` is told which it is where there are several.
+fn held(frame: &Frame, view_layer: Option<&str>, name: &str, say: &dyn Fn(&str)) -> Option<Layer> {
+    let (found, layers) = (passes::rgb_layers(frame, view_layer, name), passes::layers(frame));
+    let chosen = passes::choose(frame, &layers, view_layer).ok();
+    let is_chosen = |layer: &&Layer| chosen.is_some_and(|chosen| chosen.name == layer.name);
+    let layer = found.iter().find(is_chosen).or_else(|| found.first())?;
+    if found.iter().any(|other| other.name != layer.name) {
+        let (path, own) = (frame.path().display(), &layer.name);
+        say(&format!("note: {path}: compares '{name}' of view layer '{own}'; others hold one too"));
+    }
+    Some(layer.clone())
+}
+
+/// As [`held`].
+///
+/// # Errors
+/// None holds one.
+fn named(frame: &Frame, view_layer: Option<&str>, name: &str, say: &dyn Fn(&str)) -> Result<Layer> {
+    held(frame, view_layer, name, say).ok_or_else(|| {
         let why = format!("has no layer '{name}' with R, G and B; `demc inspect` lists those there are");
         Error::invalid(frame.path(), why)
     })

@@ -8,8 +8,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::lines::{ExitCode, print_line, warn_line};
 use super::methods;
 use crate::{
-    Error, Result,
-    report::{self, Contender, EvalEvent, EvalOptions, Row},
+    Result,
+    report::{self, EvalEvent, EvalOptions, Row},
 };
 
 /// Arguments of `demc eval`.
@@ -57,7 +57,10 @@ pub fn run(args: Args) -> Result<ExitCode> {
     if let Some(reach) = args.temporal {
         methods.extend(args.asked.temporal(&methods, reach.into())?);
     }
-    let baseline = baseline(&args, &methods)?;
+    let baseline = match &args.baseline {
+        Some(wanted) => args.asked.baseline(wanted, &methods)?,
+        None => methods.get(1).unwrap_or(&methods[0]).name.clone(),
+    };
     let options = EvalOptions {
         out: args.out,
         repeats: args.repeats.into(),
@@ -77,22 +80,6 @@ pub fn run(args: Args) -> Result<ExitCode> {
         print_line(&options.out.join(file).display().to_string());
     }
     Ok(methods::finish(failed, &options.out.join("scores.csv")))
-}
-
-fn baseline(args: &Args, methods: &[Contender]) -> Result<String> {
-    let Some(wanted) = &args.baseline else {
-        return Ok(methods.get(1).unwrap_or(&methods[0]).name.clone());
-    };
-    let names: Vec<&str> = methods.iter().map(|m| m.name.as_str()).collect();
-    let wanted =
-        methods::short_name(wanted, &args.asked.models.iter().map(String::as_str).collect::<Vec<_>>());
-    if !names.contains(&wanted.as_str()) {
-        return Err(Error::Usage(format!(
-            "--baseline {wanted} is not among the methods: {}; add it to --models",
-            names.join(", ")
-        )));
-    }
-    Ok(wanted)
 }
 
 /// A bar on a terminal, a line for each row otherwise.

@@ -17,8 +17,8 @@ Examples:
   demc completions zsh > _demc
   demc completions fish > demc.fish
 
-In ~/.local/share/bash-completion/completions/demc, a folder of zsh's $fpath, or ~/.config/fish/completions they
-are found by themselves.")]
+In ~/.local/share/bash-completion/completions/demc, a folder of zsh's $fpath, or
+~/.config/fish/completions they are found by themselves.")]
 pub struct CompletionsArgs {
     /// The shell
     shell: Shell,

@@ -92,6 +92,22 @@ impl Args {
         Ok(methods)
     }
 
+    /// The name in tables of the method that others are held against.
+    ///
+    /// # Errors
+    /// It is none of `methods`, those asked for.
+    pub fn baseline(&self, wanted: &str, methods: &[Contender]) -> Result<String> {
+        let wanted = short_name(wanted, &self.asked());
+        if methods.iter().any(|method| method.name == wanted) {
+            return Ok(wanted);
+        }
+        let names: Vec<&str> = methods.iter().map(|method| method.name.as_str()).collect();
+        Err(Error::Usage(format!(
+            "--baseline {wanted} is not among the methods: {}; add it to --models",
+            names.join(", ")
+        )))
+    }
+
     /// Those of the methods asked for that are this project's own, each with `reach` frames before a frame
     /// and after it.
     ///

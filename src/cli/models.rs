@@ -5,7 +5,7 @@ use crate::{
     Result,
     models::{
         self,
-        catalogue::{Kind, METHODS, Method},
+        catalogue::{IN_REPOSITORY, Kind, METHODS, Method, WEIGHTS_FOLDER, Weights},
         network::Network,
     },
 };
@@ -18,11 +18,15 @@ pub struct Args {
     json: bool,
 }
 
+/// What the list says of weights that lie in a file which was not found.
+const NOT_FOUND: &str = "not found";
+
 /// One line of the list.
 #[derive(serde::Serialize)]
 struct Listed {
     model: String,
-    /// "built in", "untrained", or "file" where a file next to the program holds them.
+    /// "built in"; of the paper's networks and the rivals "file" where a file holds them, otherwise "not found";
+    /// "untrained" of those that no file is known for.
     weights: &'static str,
     parameters: usize,
     kmac_per_pixel: f64,
@@ -35,6 +39,7 @@ fn row(method: &Method, network: &mut dyn Network, macs: f64, trained: Option<St
     Listed {
         model: method.name.into(),
         weights: match trained {
+            None if matches!(method.kind, Kind::Learned { weights: Weights::File, .. }) => NOT_FOUND,
             None => "untrained",
             Some(_) if method.built_in().is_some() => "built in",
             Some(_) => "file",
@@ -101,6 +106,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         if let Some(trained) = &r.trained {
             super::lines::print_line(&format!("{}: trained for {trained}", r.model));
         }
+    }
+    if rows.iter().any(|r| r.weights == NOT_FOUND) {
+        super::lines::print_line(&format!(
+            "{NOT_FOUND}: run demc where {IN_REPOSITORY} lies, or name that folder by {WEIGHTS_FOLDER}=FOLDER"
+        ));
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -3,7 +3,10 @@
 use std::collections::BTreeSet;
 
 use super::lines::print_line;
-use crate::{Error, Result, report::plural};
+use crate::{
+    Error, Result,
+    report::{number, plural},
+};
 
 /// The RelMSE of a result falls as this power of the number of samples of its render. It is the median of
 /// what the built-in models reach on 41 generated views of 1 to 256 samples.
@@ -79,7 +82,7 @@ impl Ranking {
         let times = (frame.error / wish).powf(1.0 / POWER);
         let is_known = times <= MOST_TIMES;
         match frame.samples.filter(|samples| *samples > 0) {
-            None if is_known => format!("  wants about {} times its samples", digits(times)),
+            None if is_known => format!("  wants about {} times its samples", factor(times)),
             None => format!("  wants more than {MOST_TIMES} times its samples"),
             Some(samples) => {
                 let has = format!("  {samples} sample{}, wants", plural(samples as usize));
@@ -92,10 +95,15 @@ impl Ranking {
     }
 }
 
-/// A number rounded up to two digits, since more of it is not known.
+/// A whole number, rounded up to two digits, since more of it is not known.
 fn digits(number: f64) -> String {
     let unit = 10f64.powf((number.log10().floor() - 1.0).max(0.0));
     format!("{:.0}", (number / unit).ceil() * unit)
+}
+
+/// A factor, rounded up as [`digits`] are: 1.04 is 1.1 and not 2.
+fn factor(times: f64) -> String {
+    if times < 10.0 { number((10.0 * times).ceil() / 10.0) } else { digits(times) }
 }
 
 #[cfg(test)]
@@ -108,6 +116,9 @@ mod tests {
         let wanted = |error, samples| ranking.wanted(&Ranked { error, input: String::new(), samples });
         assert_eq!(wanted(0.02, Some(16)), "  16 samples, wants about 64");
         assert_eq!(wanted(0.02, None), "  wants about 4 times its samples");
+        assert_eq!(wanted(0.0102, None), "  wants about 1.1 times its samples", "1.0404 times");
+        assert_eq!(wanted(0.0353, None), "  wants about 13 times its samples");
+        assert_eq!(wanted(0.0102, Some(16)), "  16 samples, wants about 17", "samples are whole");
         assert_eq!(wanted(0.01, Some(16)), "");
         assert_eq!(wanted(0.0353, Some(100)), "  100 samples, wants about 1300");
         assert_eq!(wanted(0.02, Some(1)), "  1 sample, wants about 4");

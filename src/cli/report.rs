@@ -116,6 +116,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     forgive_folders(&mut frames);
     let missing = missing(args, |place| frames.contains_key(place) || results.contains(place))?;
+    let lost: usize = missing.iter().map(|(inputs, _)| inputs).sum();
     let count = |status| frames.values().filter(|frame| frame.status == status).count();
     for frame in frames.values().filter(|frame| frame.status == Status::Failed) {
         // Errors name their file already.
@@ -127,14 +128,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             format!("failed: {}: {error}", input.display())
         });
     }
-    for line in &missing {
+    for (_, line) in &missing {
         print_line(&format!("missing: {line}"));
     }
     let failed = count(Status::Failed);
     let mut totals = format!("{} denoised in {seconds:.1} s of model time", count(Status::Done));
-    for (count, what) in
-        [(count(Status::Skipped), "already there"), (failed, "failed"), (missing.len(), "missing")]
-    {
+    for (count, what) in [(count(Status::Skipped), "already there"), (failed, "failed"), (lost, "missing")] {
         if count > 0 {
             totals += &format!(", {count} {what}");
         }
@@ -151,7 +150,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if is_silent {
         warn_line("demc: the logs hold no line of `demc denoise --json`; see there why no task wrote one");
     }
-    Ok(if is_silent || failed + missing.len() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
+    Ok(if is_silent || failed + lost > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS })
 }
 
 /// Where the object of a line begins. A farm's engine may put words of its own before it (`pid=1234 > `), as an editor
@@ -181,19 +180,19 @@ fn add(frames: &mut BTreeMap<PathBuf, Fate>, line: Line, log: usize) {
     }
 }
 
-/// Says of which inputs no task tells, which of them cannot be looked at, and which frames asked for are not there.
-/// `is_told` of the [place](place_of) of an input or a result.
-fn missing(args: &Args, is_told: impl Fn(&PathBuf) -> bool) -> Result<Vec<String>> {
+/// Says of which inputs no task tells, which of them cannot be looked at, and which frames asked for are not there;
+/// with each sentence, of how many inputs it is. `is_told` of the [place](place_of) of an input or a result.
+fn missing(args: &Args, is_told: impl Fn(&PathBuf) -> bool) -> Result<Vec<(usize, String)>> {
     if args.of.is_empty() {
         return Ok(Vec::new());
     }
     let search = Search { recursive: args.recursive, ..Search::default() };
     let Inputs { mut files, unusable, .. } = inputs::expand(&args.of, &search)?;
     files.retain(|input| args.frames.as_ref().is_none_or(|frames| frames.has(input)));
-    let unseen = unusable.into_iter().map(|(_, error)| error.to_string());
+    let unseen = unusable.into_iter().map(|(_, error)| (1, error.to_string()));
     let lacking = args.frames.as_ref().and_then(|frames| frames.lacking(&files));
     let untold = files.iter().map(|input| &input.file).filter(|file| !is_told(&place_of(file)));
-    let untold = untold.map(|file| format!("{}: no task tells of it", file.display()));
+    let untold = untold.map(|file| (1, format!("{}: no task tells of it", file.display())));
     Ok(unseen.chain(lacking).chain(untold).collect())
 }
 

@@ -7,7 +7,7 @@ use clap::Args as ClapArgs;
 use super::lines::{ExitCode, print_line, warn_line};
 use super::methods;
 use crate::{
-    Error, Result,
+    Result,
     report::{NOISY, number},
     stability::{self, StabilityOptions, Trial, TrialRow, content::Case},
 };
@@ -60,12 +60,7 @@ fn trials() -> String {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let pairs = methods::noisy_renders(&args.asked.test_set)?;
     let methods = args.asked.methods()?;
-    let asked: Vec<&str> = args.asked.models.iter().map(String::as_str).collect();
-    let baseline = methods::short_name(&args.baseline, &asked);
-    if methods.iter().all(|method| method.name != baseline) {
-        let names: Vec<&str> = methods.iter().map(|method| method.name.as_str()).collect();
-        return Err(Error::Usage(format!("--baseline {baseline}: none of the methods {}", names.join(", "))));
-    }
+    let baseline = args.asked.baseline(&args.baseline, &methods)?;
     let options = StabilityOptions {
         out: args.out.clone(),
         view_layer: args.asked.view_layer.clone(),

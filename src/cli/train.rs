@@ -62,7 +62,7 @@ pub struct Args {
     lr: (f64, f64),
     /// What is minimised: relmse, smape, both summed, edges, which adds the error of differences, geomean,
     /// the logarithm of each crop's relmse, or ssim, which adds ten times 1 - SSIM to that
-    #[arg(long, default_value = "relmse", value_parser = parse_loss)]
+    #[arg(long, default_value = "relmse", value_parser = |text: &str| one_of(&Loss::ALL, text))]
     loss: Loss,
     /// Take squared errors, not their denominators, against what references were before Blender denoised
     /// them, where they hold that (generate_scenes.py --denoise-references)
@@ -81,7 +81,7 @@ pub struct Args {
     #[arg(long, default_value_t = 0.0, value_parser = parse_share)]
     leak: f64,
     /// How gradients become updates: adam, or muon, which needs fewer steps
-    #[arg(long, default_value = "adam", value_parser = parse_rule)]
+    #[arg(long, default_value = "adam", value_parser = |text: &str| one_of(&Rule::ALL, text))]
     optimizer: Rule,
     /// Share of the hidden convolutions' weights that a step takes away, times the learning rate
     #[arg(long, default_value_t = 0.0)]
@@ -146,14 +146,6 @@ fn one_of<T: Copy + ToString>(all: &[T], text: &str) -> Result<T, String> {
     let names: Vec<String> = all.iter().map(T::to_string).collect();
     let found = names.iter().position(|name| name == text);
     found.map(|at| all[at]).ok_or_else(|| format!("expected {}", names.join(" or ")))
-}
-
-fn parse_loss(text: &str) -> Result<Loss, String> {
-    one_of(&Loss::ALL, text)
-}
-
-fn parse_rule(text: &str) -> Result<Rule, String> {
-    one_of(&Rule::ALL, text)
 }
 
 fn parse_precision(text: &str) -> Result<Precision, String> {

@@ -99,6 +99,9 @@ pub struct Along {
     sources: Vec<Source>,
     /// One for each source, for the model.
     pub companions: Vec<Companion>,
+    /// The environment, where a transparent film does not show it: it is no part of the beauty, so that what is found
+    /// of that says nothing of it, and it stays as rendered.
+    unseen: Option<Planes>,
 }
 
 impl Along {
@@ -177,6 +180,10 @@ impl Along {
                 self.push(Source::Pass(colour), Kind::Colour, colours);
             }
         }
+        if self.is_unseen(shot, Pass::Environment) {
+            self.unseen = shot.passes.remove(Pass::Environment);
+            notes.push("a transparent film does not show Environment, which is no part of Combined: it stays as rendered".into());
+        }
         for pass in ADDED {
             if let Some(planes) = shot.passes.remove(pass) {
                 self.push(Source::Pass(pass), Kind::Light, planes);
@@ -191,7 +198,7 @@ impl Along {
         for companion in self.companions.iter_mut().filter(|companion| companion.kind == Kind::Light) {
             below.iter().for_each(|at| companion.planes.data[*at] = 0.0);
         }
-        if !self.sources.iter().any(|source| *source != Source::Pass(Pass::Alpha)) {
+        if self.unseen.is_none() && self.sources.iter().all(|source| *source == Source::Pass(Pass::Alpha)) {
             let remedy = match shot.passes.renderer.is_blender() {
                 true => "turn on View Layer Properties > Passes > Light, or light groups",
                 false => "--map 'PASS=NAME' tells where they are, if there are any",
@@ -200,10 +207,20 @@ impl Along {
         }
     }
 
-    /// Each source with its companion's planes.
+    /// Whether a light pass has light in a pixel that nothing covers.
+    fn is_unseen(&self, shot: &Shot, pass: Pass) -> bool {
+        let along = self.sources.iter().position(|source| *source == Source::Pass(Pass::Alpha));
+        let alpha = along.map_or(shot.passes.get(Pass::Alpha), |at| Some(&self.companions[at].planes));
+        let (Some(alpha), Some(light)) = (alpha, shot.passes.get(pass)) else { return false };
+        let channels = || light.data.chunks_exact(light.pixels());
+        (0..light.pixels()).any(|at| alpha.data[at] == 0.0 && channels().any(|values| values[at] > 0.0))
+    }
+
+    /// Each source with what became of it.
     fn done(self) -> Vec<(Source, Planes)> {
         let denoised = self.companions.into_iter().map(|companion| companion.planes);
-        self.sources.into_iter().zip(denoised).collect()
+        let unseen = self.unseen.map(|planes| (Source::Pass(Pass::Environment), planes));
+        self.sources.into_iter().zip(denoised).chain(unseen).collect()
     }
 
     /// Alpha, (1, H, W), once the model has denoised it, if it goes along.

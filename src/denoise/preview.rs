@@ -1,15 +1,13 @@
 //! A PNG of the denoised frame, encoded like the display image on which SSIM is measured, and exposed like it by all
 //! that is not black.
 
-use std::{
-    io::{BufWriter, Write},
-    path::Path,
-};
+use std::path::Path;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 
 use crate::{
-    Error, Result, frame,
+    Error, Result,
+    frame::write_file,
     metrics::display::{display, exposure_of_lit},
     planes::Planes,
 };
@@ -24,16 +22,9 @@ pub fn write(path: &Path, radiance: &Planes) -> Result<()> {
     let (r, g, b) = (image.channel(0), image.channel(1), image.channel(2));
     let to_byte = |v: f32| (v * 255.0).round() as u8;
     let pixels: Vec<u8> = (0..image.pixels()).flat_map(|i| [r[i], g[i], b[i]].map(to_byte)).collect();
-    frame::atomically(path, |file| {
-        let mut buffered = BufWriter::new(file);
-        PngEncoder::new(&mut buffered)
-            .write_image(&pixels, radiance.width as u32, radiance.height as u32, ExtendedColorType::Rgb8)
-            .map_err(|e| match e {
-                image::ImageError::IoError(source) => {
-                    Error::Io { path: path.into(), action: "write", source }
-                }
-                other => Error::invalid(path, other),
-            })?;
-        buffered.flush().map_err(Error::io("write", path))
-    })
+    let mut png = Vec::new();
+    PngEncoder::new(&mut png)
+        .write_image(&pixels, radiance.width as u32, radiance.height as u32, ExtendedColorType::Rgb8)
+        .map_err(|e| Error::invalid(path, e))?;
+    write_file(path, &png)
 }

@@ -26,6 +26,7 @@ use crate::{
         agreement::{self, Guides, Look},
         motion::{Direction, Flow},
         shrinkage::Empty,
+        structure::{self, Sight},
         temporal::{self, Link, likeness},
     },
     models::Denoiser,
@@ -67,6 +68,10 @@ const DARK: f32 = 0.02;
 /// A neighbour that is more times as bright, or less than one in so many, is not averaged: not all lights of a scene
 /// change by so much.
 const FLASH: f32 = 1.5;
+
+/// A neighbour is left out that is so many times as bright in a part of the frame. Of less, as of light that wanders, the
+/// noise that neighbours take away is more.
+const PARTLY: f32 = 1.05;
 
 /// Name of a view layer, and the stereo view.
 type ViewKey = (String, Option<String>);
@@ -461,54 +466,12 @@ impl<'a> Window<'a> {
                 "frame {there} holds other passes: albedo, normal or depth is missing in one of them"
             ));
         }
-        // Of fewer samples, light has more of an excess in few pixels, and looks darker where most are.
-        let [samples, others] = [own, other].map(|moment| moment.shot.passes.samples);
-        let has_as_many = samples == others;
-        let brightness = if has_as_many { own.look.brightness(&other.look, &flow) } else { 1.0 };
-        let mut weights = own.look.agreement(&other.look, &flow, brightness, &own.guides(), &other.guides());
-        if let [Some(light), Some(there)] = [own, other].map(|moment| moment.values(Pass::Combined)) {
-            agreement::dim(&mut weights, &flow, light, there, DARK / own.exposure);
-        }
-        let (mut sum, mut inside) = (0.0, 0usize);
-        for y in 0..weights.height {
-            sum += weights.row(0, y).iter().map(|w| f64::from(*w)).sum::<f64>();
-            inside += flow.row(y).0.iter().filter(|x| !x.is_nan()).count();
-        }
-        let share = (sum / inside.max(1) as f64) as f32;
-        // A sky before which the camera moves looks the same; what has edges tells.
-        let of_detail = own.look.mean_at_detail(&weights).unwrap_or(share);
         let are_zero = |nearer: i32| {
             let moment = self.moment(number + i64::from(step * nearer), view);
             let vectors = moment.and_then(|moment| moment.pass(Pass::Vector));
             vectors.is_none_or(|vectors| vectors.data.iter().all(|v| *v == 0.0))
         };
-        if !has_as_many && (of_detail < STILL || share < CUT) {
-            return said(format!(
-                "frame {there} shows another picture (a cut), or one that its other number of samples lets not compare"
-            ));
-        }
-        if of_detail < STILL && (0..offset.abs()).all(are_zero) {
-            return said(format!(
-                "frame {there} shows another picture, and Vector is zero everywhere: a cut, or motion blur was on, with \
-                 which Blender writes no vectors (turn off Render Properties > Motion Blur and blur in the compositor, \
-                 or denoise frame by frame)"
-            ));
-        }
-        if share < CUT {
-            return said(format!("frame {there} shows another picture: a cut"));
-        }
-        if !(1.0 / FLASH..FLASH).contains(&brightness) {
-            let times = 1.0 / brightness;
-            return said(format!(
-                "frame {there} is {times:.2} times as bright, and its noise is that of other light"
-            ));
-        }
-        // The noise of fewer samples would make a frame worse.
-        let share = match (samples, others) {
-            (Some(own), Some(there)) if there < own => there as f32 / own as f32,
-            _ => 1.0,
-        };
-        Ok(Found { weights: HalfFloats::of(&weights), brightness, share })
+        own.judge(other, there, &flow, || (0..offset.abs()).all(are_zero))
     }
 
     /// Says what a frame stays without, where its window is not full.
@@ -577,6 +540,97 @@ impl Moment {
             result: None,
             lacked: BTreeSet::new(),
         }
+    }
+
+    /// How frame `there` belongs together with this one, whose content lies in it where `flow` says; whether it stands
+    /// `still` by all vectors is asked where that matters.
+    fn judge(&self, other: &Self, there: i64, flow: &Flow, still: impl Fn() -> bool) -> Result<Found, Gap> {
+        let said = |text: String| Err(Gap::Said(text));
+        if self.is_copy_of(other) && !still() {
+            return said(format!(
+                "frame {there} holds the same picture to the bit, though Vector tells of motion"
+            ));
+        }
+        // Of fewer samples, light has more of an excess in few pixels, and looks darker where most are.
+        let [samples, others] = [self, other].map(|moment| moment.shot.passes.samples);
+        let has_as_many = samples == others;
+        let found = has_as_many.then(|| self.look.brightness(&other.look, flow));
+        let brightness = found.filter(|found| found.is_everywhere).map_or(1.0, |found| found.times);
+        let mut weights = self.look.agreement(&other.look, flow, brightness, &self.guides(), &other.guides());
+        if let [Some(light), Some(there)] = [self, other].map(|moment| moment.values(Pass::Combined)) {
+            agreement::dim(&mut weights, flow, light, there, DARK / self.exposure);
+        }
+        let (mut sum, mut inside) = (0.0, 0usize);
+        for y in 0..weights.height {
+            sum += weights.row(0, y).iter().map(|w| f64::from(*w)).sum::<f64>();
+            inside += flow.row(y).0.iter().filter(|x| !x.is_nan()).count();
+        }
+        let share = (sum / inside.max(1) as f64) as f32;
+        // A sky before which the camera moves looks the same; what has edges tells.
+        let of_detail = self.look.mean_at_detail(&weights).unwrap_or(share);
+        if !has_as_many && (of_detail < STILL || share < CUT) {
+            return said(format!(
+                "frame {there} shows another picture (a cut), or one that its other number of samples lets not compare"
+            ));
+        }
+        if of_detail < STILL && self.has_other_guides(other) && still() {
+            return said(format!(
+                "frame {there} shows another picture, and Vector is zero everywhere: a cut, or motion blur was on, with \
+                 which Blender writes no vectors (turn off Render Properties > Motion Blur and blur in the compositor, \
+                 or denoise frame by frame)"
+            ));
+        }
+        if share < CUT {
+            return said(format!("frame {there} shows another picture: a cut"));
+        }
+        if !(1.0 / FLASH..FLASH).contains(&brightness) {
+            let times = 1.0 / brightness;
+            return said(format!(
+                "frame {there} is {times:.2} times as bright, and its noise is that of other light"
+            ));
+        }
+        // What is lit as before would change with the rest of the frame, or the rest stay behind.
+        if let Some(found) = found
+            && !found.is_everywhere
+            && !(1.0 / PARTLY..PARTLY).contains(&found.times)
+        {
+            let times = 1.0 / found.times;
+            return said(format!("frame {there} is {times:.2} times as bright in a part of what it shows"));
+        }
+        // The noise of fewer samples would make a frame worse.
+        let share = match (samples, others) {
+            (Some(own), Some(there)) if there < own => there as f32 / own as f32,
+            _ => 1.0,
+        };
+        if let [Some(own), Some(there)] = [self, other].map(Self::sight) {
+            structure::lower(&mut weights, flow, [own, there], brightness, samples);
+        }
+        Ok(Found { weights: HalfFloats::of(&weights), brightness, share })
+    }
+
+    fn sight(&self) -> Option<Sight<'_>> {
+        Some(Sight { light: self.values(Pass::Combined)?, albedo: self.guides().albedo })
+    }
+
+    /// Whether another frame's light is this one's to the bit.
+    fn is_copy_of(&self, other: &Self) -> bool {
+        let [Some(own), Some(there)] = [self, other].map(|moment| moment.values(Pass::Combined)) else {
+            return false;
+        };
+        let (channels, width, height) = own.extent();
+        let mut lines = [vec![0.0; width], vec![0.0; width]];
+        (0..channels * height).all(|row| {
+            let (c, y) = (row / height, row % height);
+            lines.iter_mut().zip([own, there]).for_each(|(line, of)| of.read(c, y * width, line));
+            lines[0] == lines[1]
+        })
+    }
+
+    /// Whether another frame shows other guides at the same places; true of frames that have none.
+    fn has_other_guides(&self, other: &Self) -> bool {
+        let Guides { albedo, normal, depth } = self.guides();
+        let has_none = albedo.is_none() && normal.is_none() && depth.is_none();
+        has_none || self.look.has_other_guides(&other.look)
     }
 
     fn values(&self, pass: Pass) -> Option<&dyn Values> {

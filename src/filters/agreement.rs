@@ -84,6 +84,14 @@ const UNSEEN: f32 = 5e-5;
 const CERTAIN: f32 = 4.0;
 const FEWEST: usize = 30;
 
+/// A frame is brighter as a whole only if no more than this share of its places lies in tiles (of at most so many rows and
+/// columns of them) that say otherwise.
+const MOST_OTHERWISE: f32 = 0.2;
+const MOST_TILES: usize = 4;
+
+/// Depth of what nothing is before.
+const FAR: f32 = 1e6;
+
 /// How many times as bright as all around it a pixel of a neighbour may be before it counts for less. Fireflies are
 /// rarely as much brighter than noise.
 const OUTSHINES: f32 = 16.0;
@@ -135,6 +143,15 @@ pub struct Guides<'a> {
 pub struct Look {
     size: (usize, usize),
     squares: Planes,
+}
+
+/// How many times as bright a frame is as another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Brightness {
+    /// In most of what both show.
+    pub times: f32,
+    /// Whether the rest is so, too: an exposure is, a lamp that lights half of the frame is not.
+    pub is_everywhere: bool,
 }
 
 impl Look {
@@ -199,13 +216,13 @@ impl Look {
         Self { size: (width, height), squares }
     }
 
-    /// How many times as bright a frame is as another, as a whole: the median over what both show, as far as guides
+    /// How many times as bright a frame is as another: the median over what both show, as far as guides
     /// agree; 1 where that is no more than noise may be. Lamps that flicker, a sun behind clouds and an exposure that
     /// changes leave such a difference, which single places hide in their noise.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn brightness(&self, other: &Self, flow: &Flow) -> f32 {
+    pub fn brightness(&self, other: &Self, flow: &Flow) -> Brightness {
         assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
         let (columns, rows) = (self.squares.width, self.squares.height);
         let mut differences = Vec::new();
@@ -225,12 +242,58 @@ impl Look {
                     && let [here, there] = [here, there].map(|of| of[LIGHT..VARIANCE].iter().sum::<f32>())
                     && here.min(there) > 0.0
                 {
-                    differences.push(4.0 * ln(here / there));
+                    differences.push((4.0 * ln(here / there), (column, row)));
                 }
             }
         }
-        let Some((middle, error)) = median(&mut differences) else { return 1.0 };
-        if middle.abs() > CERTAIN * error { exp(middle) } else { 1.0 }
+        let same = Brightness { times: 1.0, is_everywhere: true };
+        let Some((middle, error)) = median_of(&differences) else { return same };
+        if middle.abs() <= CERTAIN * error {
+            return same;
+        }
+        let tiles = (differences.len() / FEWEST).isqrt().clamp(1, MOST_TILES);
+        let tile = |(column, row): (usize, usize)| (column * tiles / columns, row * tiles / rows);
+        let mut of_tiles = vec![Vec::new(); tiles * tiles];
+        for (difference, place) in &differences {
+            let (column, row) = tile(*place);
+            of_tiles[row * tiles + column].push((*difference, *place));
+        }
+        let contradicts = |of_tile: &&Vec<(f32, (usize, usize))>| {
+            median_of(of_tile).is_some_and(|(own, of_own)| {
+                let apart = (own - middle).abs();
+                apart > middle.abs() / 2.0 && apart > CERTAIN * of_own.hypot(error)
+            })
+        };
+        let otherwise: usize = of_tiles.iter().filter(contradicts).map(Vec::len).sum();
+        let is_everywhere = otherwise as f32 <= MOST_OTHERWISE * differences.len() as f32;
+        Brightness { times: exp(middle), is_everywhere }
+    }
+
+    /// Whether the guides of another frame differ from those at the same place of this one, in most of what has edges: the
+    /// camera or things moved. So it is said of frames without guides, too. Before nothing, where depth is a mean with
+    /// that of the far end, guides are a matter of samples.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn has_other_guides(&self, other: &Self) -> bool {
+        assert_eq!(self.size, other.size, "frames of one size");
+        let (mut different, mut counted) = (0.0, 0.0);
+        for square in 0..self.squares.pixels() {
+            let (here, there) = (self.at(square), other.at(square));
+            if here[DEPTH].max(there[DEPTH]) < FAR {
+                let detail = self.detail(square);
+                counted += detail;
+                different += if alike(&here, &there) { 0.0 } else { detail };
+            }
+        }
+        different >= 0.5 * counted
+    }
+
+    /// How much normals and relative albedo differ in and around a square: their standard deviation.
+    fn detail(&self, square: usize) -> f64 {
+        let value = |line: usize| self.squares.channel(line)[square];
+        let squared: f32 = (ALBEDO..ALBEDO + 3).map(|line| value(line).powi(2)).sum();
+        f64::from((value(SPREAD_OF_NORMAL) + value(SPREAD_OF_ALBEDO) / (squared + DARK)).sqrt())
     }
 
     /// The means of a square, all but the spreads.
@@ -287,8 +350,8 @@ impl Look {
         })
     }
 
-    /// The mean of weights, (1, H, W), where each square of pixels counts by how much normals and relative
-    /// albedo differ in it and around it (their standard deviation). None where nothing does.
+    /// The mean of weights, (1, H, W), where each square of pixels counts by its detail: how much normals and relative
+    /// albedo differ in it and around it. None where nothing does.
     ///
     /// # Panics
     /// If the size of the weights differs.
@@ -296,12 +359,9 @@ impl Look {
         assert!(self.size == (weights.width, weights.height), "weights of the frame's size");
         let (mut sum, mut counted) = (0.0, 0.0);
         for row in 0..self.squares.height {
-            let line = |line: usize| self.squares.row(line, row);
             let weights = weights.row(0, row * SQUARE);
             for column in 0..self.squares.width {
-                let squared: f32 = (ALBEDO..ALBEDO + 3).map(|c| line(c)[column].powi(2)).sum();
-                let of_albedo = line(SPREAD_OF_ALBEDO)[column] / (squared + DARK);
-                let detail = f64::from((line(SPREAD_OF_NORMAL)[column] + of_albedo).sqrt());
+                let detail = self.detail(row * self.squares.width + column);
                 sum += detail * f64::from(weights[column * SQUARE]);
                 counted += detail;
             }
@@ -342,13 +402,19 @@ impl Look {
         assert!(self.size == other.size && self.size == flow.size(), "frames of one size");
         let size = (self.squares.width, self.squares.height);
         Planes::from_rows(1, (OF_SQUARES * size.0, size.1), |_, row, out| {
-            let from = flow.row((row * SQUARE + 1).min(self.size.1 - 1));
-            // The lower right pixel is half a pixel beside the middle of the square.
-            let pixel = |x: usize| (x * SQUARE + 1).min(self.size.0 - 1);
-            let columns: Vec<f32> = (0..size.0).map(|x| from.0[pixel(x)]).collect();
+            // The lower right pixel is half a pixel beside the middle of the square; the last square of an odd size has none.
+            let pixel = |square: usize, pixels: usize| (square * SQUARE + 1).min(pixels - 1);
+            let y = pixel(row, self.size.1);
+            let from = flow.row(y);
+            let columns: Vec<f32> = (0..size.0).map(|x| from.0[pixel(x, self.size.0)]).collect();
             let places: Vec<motion::Between> = (0..size.0)
-                .map(|x| [from.0, from.1].map(|places| (places[pixel(x)] - 1.0) / SQUARE as f32))
-                .map(|[x, y]| motion::Between::new((x, y), size))
+                .map(|column| {
+                    let x = pixel(column, self.size.0);
+                    let square = |place: f32, beside: usize| (place - beside as f32) / SQUARE as f32;
+                    let (to_x, to_y) = (from.0[x], from.1[x]);
+                    (square(to_x, x - column * SQUARE), square(to_y, y - row * SQUARE))
+                })
+                .map(|place| motion::Between::new(place, size))
                 .collect();
             let mut there = vec![0.0; SPREAD_OF_ALBEDO * size.0];
             for (line, out) in there.chunks_exact_mut(size.0).enumerate() {
@@ -421,11 +487,12 @@ fn alike(here: &[f32; SPREAD_OF_ALBEDO], there: &[f32; SPREAD_OF_ALBEDO]) -> boo
     differences.iter().zip(most).all(|([difference], most)| *difference < most)
 }
 
-/// The median of values and its standard error, by their median distance from it; none of few.
-fn median(values: &mut [f32]) -> Option<(f32, f32)> {
-    if values.len() < FEWEST {
+/// The median of differences and its standard error, by their median distance from it; none of few.
+fn median_of<P>(differences: &[(f32, P)]) -> Option<(f32, f32)> {
+    if differences.len() < FEWEST {
         return None;
     }
+    let mut values: Vec<f32> = differences.iter().map(|(difference, _)| *difference).collect();
     let middle = values.len() / 2;
     let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
     values.iter_mut().for_each(|v| *v = (*v - median).abs());
@@ -715,7 +782,7 @@ mod tests {
             let guides = guides(frame);
             (Look::of(&frame[0], &guides), guides)
         });
-        look.agreement(&other, flow, look.brightness(&other, flow), &own, &there)
+        look.agreement(&other, flow, look.brightness(&other, flow).times, &own, &there)
     }
 
     fn mean(weights: &Planes, columns: std::ops::Range<usize>) -> f32 {
@@ -738,13 +805,31 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_agrees_with_itself_to_its_last_column_and_row() {
+        // Of odd sizes the last squares are of one pixel.
+        for (columns, rows) in [(61, 46), (46, 61), (61, 61)] {
+            let mut rng = Rng::new(5, 0);
+            let radiance =
+                Planes::from_vec(3, columns, rows, (0..3 * columns * rows).map(|_| rng.uniform()).collect());
+            let look = Look::of(&radiance, &Guides::default());
+            let of_squares = look.features_of_squares(&look, &Flow::still(columns, rows), 1.0);
+            let squares = columns.div_ceil(SQUARE);
+            for row in 0..rows.div_ceil(SQUARE) {
+                let noise = &of_squares.data[(row * OF_SQUARES + NOISE) * squares..][..squares];
+                let none = TINY_OF_SQUARES[NOISE].ln();
+                assert!(noise.iter().all(|v| (v - none).abs() < 1e-3), "{columns}x{rows}, {row}: {noise:?}");
+            }
+        }
+    }
+
+    #[test]
     fn light_that_changes_as_a_whole_is_told_from_noise_and_agrees() {
         let still = Flow::still(SIZE.0, SIZE.1);
         let look = |frame: &[Planes; 4]| Look::of(&frame[0], &guides(frame));
         let lit = frame(1, |_| 1.0);
         for (factor, expected) in [(1.0, 1.0), (0.98, 1.0), (0.8, 1.25), (0.5, 2.0), (4.0, 0.25)] {
             let other = frame(2, |_| factor);
-            let found = look(&lit).brightness(&look(&other), &still);
+            let found = look(&lit).brightness(&look(&other), &still).times;
             assert!((found / expected - 1.0).abs() < 0.05, "{factor}: {found}");
             assert_eq!(found == 1.0, expected == 1.0, "what may be noise is none: {factor}: {found}");
             let weights = agreement(&lit, &other, &still);
@@ -752,10 +837,29 @@ mod tests {
         }
         // A shadow over less than half of a frame is none of it, nor is what other surfaces show.
         let shadow = frame(3, |x| if x < 40 { 1.0 } else { 0.4 });
-        assert_eq!(look(&lit).brightness(&look(&shadow), &still), 1.0);
+        assert_eq!(look(&lit).brightness(&look(&shadow), &still).times, 1.0);
         let mut elsewhere = frame(4, |_| 0.5);
         elsewhere[3].data.fill(6.0);
-        assert_eq!(look(&lit).brightness(&look(&elsewhere), &still), 1.0);
+        assert_eq!(look(&lit).brightness(&look(&elsewhere), &still).times, 1.0);
+    }
+
+    #[test]
+    fn a_lamp_that_lights_a_part_of_a_frame_is_told_from_an_exposure() {
+        let size = (400, 300);
+        let mut rng = Rng::new(6, 0);
+        let mut look = |light: &dyn Fn(usize) -> f32| {
+            let row = |i: usize| (0.3 + 1.4 * rng.uniform()) * light(i % size.0);
+            let noisy: Vec<f32> = (0..size.0 * size.1).map(row).collect();
+            Look::of(&Planes::from_vec(3, size.0, size.1, noisy.repeat(3)), &Guides::default())
+        };
+        let lit = look(&|_| 1.0);
+        let still = Flow::still(size.0, size.1);
+        let mut found = |light: &dyn Fn(usize) -> f32| lit.brightness(&look(light), &still);
+        let half = found(&|x| if x < 240 { 0.9 } else { 1.0 });
+        assert!(!half.is_everywhere && half.times > 1.05, "{half:?}");
+        for even in [found(&|_| 0.9), found(&|x| 0.95 - 0.00015 * x as f32), found(&|_| 1.0)] {
+            assert!(even.is_everywhere, "{even:?}");
+        }
     }
 
     #[test]
@@ -832,7 +936,7 @@ mod tests {
             let none = Guides::default();
             let look = Look::of(&Planes::new(3, w, h), &none);
             let still = Flow::still(w, h);
-            assert_eq!(look.brightness(&look, &still), 1.0, "{w}x{h}");
+            assert_eq!(look.brightness(&look, &still).times, 1.0, "{w}x{h}");
             let weights = look.agreement(&look, &still, 1.0, &none, &none);
             assert!(weights.data.iter().all(|v| *v > 0.5), "{w}x{h}: {:?}", weights.data.to_vec());
         }

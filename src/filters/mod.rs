@@ -8,7 +8,7 @@
 //! Results do not depend on the number of threads.
 //!
 //! For sequences, [`motion`] follows what moves from frame to frame, [`agreement`] tells where two frames
-//! show the same, and [`temporal`] averages them there.
+//! show the same, [`structure`] where they differ by more than noise, and [`temporal`] averages them there.
 
 pub mod agreement;
 pub mod blocks;
@@ -23,6 +23,7 @@ pub mod regression;
 pub mod shrinkage;
 pub mod solve;
 pub mod squares;
+pub mod structure;
 pub mod temporal;
 pub mod variance;
 

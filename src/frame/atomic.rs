@@ -7,6 +7,7 @@
 
 use std::{
     fs::{self, File, TryLockError},
+    io::Write,
     path::{Path, PathBuf},
     sync::LazyLock,
     time::Duration,
@@ -47,6 +48,14 @@ pub fn atomically(path: &Path, write: impl FnOnce(&File) -> Result<()>) -> Resul
     file.as_file().sync_all().map_err(Error::io("write", path))?;
     file.persist(path).map_err(|e| Error::io("write", path)(e.error))?;
     Ok(())
+}
+
+/// As [`atomically`], of a file all of whose bytes are there.
+///
+/// # Errors
+/// The file cannot be written, or something else has its name.
+pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
+    atomically(path, |mut file| file.write_all(bytes).map_err(Error::io("write", path)))
 }
 
 /// The folder that a file is in; that of a bare name is the present one.
@@ -143,7 +152,7 @@ fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
 
 #[cfg(test)]
 mod tests {
-    use std::{io::Write, time::SystemTime};
+    use std::time::SystemTime;
 
     use super::*;
 

@@ -27,7 +27,7 @@ use exr::{
     meta::{BlockDescription, attribute::SampleType, header::Header},
 };
 
-pub use atomic::{alone_in, atomically, folder_of, ignores_case, place_of, prepare_folder};
+pub use atomic::{alone_in, atomically, folder_of, ignores_case, place_of, prepare_folder, write_file};
 pub use chroma::to_rgb;
 pub use edit::{HALF_MAX, NewChannel, Recoded, UNSTORABLE};
 

@@ -96,8 +96,8 @@ const SOFT_SQUARES: usize = 12;
 /// median at or below it too (0.5 with a filter of 6 pixels).
 const SHARP: f32 = 0.56;
 
-/// Finds soft guides, which tell of a wide pixel filter. The noise does not tell of it where a renderer keeps
-/// it independent from pixel to pixel, as Cycles does.
+/// Finds soft guides, which tell of a wide pixel filter, or of a camera that is out of focus everywhere. The noise does
+/// not tell of it where a renderer keeps it independent from pixel to pixel, as Cycles does.
 fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
     // So many differences between neighbours on each side of the largest belong to the step; beyond them the
     // sides are plain.
@@ -136,8 +136,9 @@ fn soft(guides: &[&Planes], findings: &mut Vec<Finding>) {
     }
     findings.push(Finding::new(
         "wide-filter",
-        "no edge of the guides is sharp: the pixel filter is several pixels wide, and what it blurred stays blurred",
-        "set Render Properties > Film > Pixel Filter > Width to 1.5 px (the default)",
+        "no edge of the guides is sharp: the pixel filter is several pixels wide, and what it blurred stays blurred, or all is \
+         out of focus",
+        "set Render Properties > Film > Pixel Filter > Width to 1.5 px (the default), if the camera's focus is as it should be",
     ));
 }
 
@@ -255,11 +256,15 @@ const ALBEDO_STEP: f32 = 0.5;
 /// 0.76 to 1.3 in linear renders, and 0.38 to 0.61 in the same renders with the curve of sRGB.
 const ENCODED: std::ops::Range<f32> = 0.3..0.66;
 
-/// Finds pixels that were encoded for a display: none is above one, and light is not proportional to the
+/// The share of the values of encoded pixels that may lie outside 0 to 1, as a lamp's or what a filter left do.
+const OUTSIDE: f64 = 0.001;
+
+/// Finds pixels that were encoded for a display: hardly any is above one, and light is not proportional to the
 /// albedo.
 fn encoded(render: &Planes, guides: (&Planes, &Planes), light: &[f32], findings: &mut Vec<Finding>) {
     let (albedo, normal) = guides;
-    if !render.data.iter().all(|v| (0.0..=1.0).contains(v)) {
+    let outside = render.data.iter().filter(|v| !(0.0..=1.0).contains(*v)).count();
+    if outside as f64 > OUTSIDE * render.data.len() as f64 {
         return;
     }
     let shown = |at: usize| (0..3).map(|c| albedo.channel(c)[at].max(0.0)).sum::<f32>();
@@ -285,8 +290,8 @@ fn encoded(render: &Planes, guides: (&Planes, &Planes), light: &[f32], findings:
     }
     findings.push(Finding::new(
         "display-pixels",
-        "no light is above 1, and steps of the albedo show in the beauty at half their size, as the curve of sRGB makes them: the \
-         pixels seem to be encoded for a display",
+        "hardly any light is above 1, and steps of the albedo show in the beauty at half their size, as the curve of sRGB makes \
+         them: the pixels seem to be encoded for a display",
         LINEAR,
     ));
 }

@@ -9,10 +9,6 @@ use crate::{
 /// Where neighbouring pixels of the guides differ by less than this, they show one plain surface.
 const FLAT: f32 = 0.05;
 
-/// What is added to light before its logarithm is taken, relative to the median, since black has no
-/// logarithm.
-const FLOOR: f32 = 0.01;
-
 /// The sum of a render's channels, finite and not negative.
 pub fn sums(render: &Planes) -> Vec<f32> {
     let clean = |v: f32| if v.is_nan() { 0.0 } else { v.clamp(0.0, HALF_MAX) };
@@ -21,16 +17,11 @@ pub fn sums(render: &Planes) -> Vec<f32> {
     pixels.map(|((r, g), b)| clean(*r) + clean(*g) + clean(*b)).collect()
 }
 
-/// The logarithm of each sum plus `floor` times the median of the sums that are not black.
+/// The logarithm of each sum plus `floor` times the median of the sums that are not black, as black has no logarithm.
 pub fn logarithms(sums: &[f32], floor: f32) -> Vec<f32> {
     let mut positive: Vec<f32> = sums.iter().copied().filter(|v| *v > 0.0).collect();
     let floor = (floor * median(&mut positive).unwrap_or(1.0)).max(f32::MIN_POSITIVE);
     sums.iter().map(|v| (v + floor).ln()).collect()
-}
-
-/// As [`logarithms`], with the floor that most rules use.
-pub fn usual_logarithms(sums: &[f32]) -> Vec<f32> {
-    logarithms(sums, FLOOR)
 }
 
 /// The middle value, or the upper of the two middle values; none for no values.

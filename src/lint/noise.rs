@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::{
     About, Finding,
-    light::{lit_surfaces, median, quantile, usual_logarithms},
+    light::{lit_surfaces, logarithms, median, quantile},
     values::LINEAR,
 };
 use crate::{passes::PassSet, planes::Planes};
@@ -74,7 +74,7 @@ pub fn check(set: &PassSet, about: &About, render: &Planes, light: &[f32], findi
 fn likeness(set: &PassSet, render: &Planes, light: &[f32]) -> Option<(f32, f32)> {
     let surfaces = lit_surfaces(set, render)?;
     let (w, h) = (set.width, set.height);
-    let logs = usual_logarithms(light);
+    let logs = logarithms(light, 0.01);
     let around = |at: usize, n: usize| [at - n * w, at - n, at + n, at + n * w];
     let is_of_use = |at: usize| {
         let others = || around(at, 1).into_iter().chain(around(at, 2));

@@ -1,9 +1,9 @@
 //! What single values tell: NaN, overflow, blank guides, albedo above one, pixels encoded for a display.
 
-use super::{About, Finding, GUIDES, render};
+use super::{About, Finding, GUIDES, light::median, render};
 use crate::{
     frame::HALF_MAX,
-    passes::{Pass, PassSet, Renderer},
+    passes::{Pass, PassSet},
     planes::Planes,
 };
 
@@ -17,6 +17,16 @@ const NEVER_ZERO: [Pass; 6] = [
     Pass::DenoisingAlbedo,
     Pass::NoisyImage,
 ];
+
+/// How far the albedo may be from the light, as a share of itself, where it is that of the sky or of lamps.
+const SAME: f32 = 0.05;
+
+/// Where fewer values than this share are below zero, and none by more than [`TRACE`] of the median light, they are a
+/// trace that rounding left.
+const NEGATIVE_SHARE: f64 = 1e-5;
+
+/// See [`NEGATIVE_SHARE`].
+const TRACE: f32 = 1e-3;
 
 /// A guide whose values differ by no more than this counts as constant; half floats near 1 are 0.0005 apart.
 const CONSTANT: f32 = 0.001;
@@ -43,10 +53,13 @@ const NEAR_STEP: f32 = 0.07;
 /// The fewest values other than 0 and 1 to judge by.
 const STEPS: usize = 1000;
 
+/// The fewest different steps among them: a few plain colours may lie near steps by chance.
+const LEVELS: usize = 16;
+
 pub fn check(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
     for (pass, planes) in set.iter() {
-        single_values(set.renderer, pass, planes, about, findings);
-        if GUIDES.contains(&pass) {
+        single_values(set, pass, planes, about, findings);
+        if GUIDES.contains(&pass) && !shows_light_alone(set) {
             constant(pass, planes, findings);
         }
     }
@@ -57,13 +70,29 @@ pub fn check(set: &PassSet, about: &About, findings: &mut Vec<Finding>) {
     }
 }
 
-fn single_values(
-    renderer: &Renderer,
-    pass: Pass,
-    planes: &Planes,
-    about: &About,
-    findings: &mut Vec<Finding>,
-) {
+/// Whether the albedo equals the light in every pixel, as that of the sky and of lamps does in Cycles: no surface is seen.
+fn shows_light_alone(set: &PassSet) -> bool {
+    let (Some(albedo), Some(render)) = (set.get(Pass::DenoisingAlbedo), render(set)) else { return false };
+    albedo.data.iter().zip(&render.data).all(|(shown, light)| (shown - light).abs() <= SAME * shown.abs())
+}
+
+/// Whether a pass may be zero everywhere because there is nothing to be seen: on a transparent film, in the dark, and
+/// where the sky alone is in view, which has neither normal nor position.
+fn may_be_empty(set: &PassSet, pass: Pass) -> bool {
+    let is_zero = |pass: Pass| set.get(pass).is_some_and(|planes| planes.data.iter().all(|v| *v == 0.0));
+    if is_zero(Pass::Alpha) {
+        return true;
+    }
+    match pass {
+        // Guides that show something tell of a beauty that is lost.
+        Pass::Combined => NEVER_ZERO.iter().all(|pass| set.get(*pass).is_none() || is_zero(*pass)),
+        _ if is_zero(Pass::Combined) => true,
+        Pass::Normal | Pass::DenoisingNormal | Pass::Position => shows_light_alone(set),
+        _ => false,
+    }
+}
+
+fn single_values(set: &PassSet, pass: Pass, planes: &Planes, about: &About, findings: &mut Vec<Finding>) {
     let count = |is: &dyn Fn(f32) -> bool| planes.data.iter().filter(|v| is(**v)).count();
     // Where nothing is hit there is no depth, which is infinite as a half float.
     let may_be_infinite = matches!(pass, Pass::Depth | Pass::DenoisingDepth);
@@ -87,15 +116,20 @@ fn single_values(
             "set Output Properties > Output > Color Depth to Float (Full)",
         ));
     }
-    if NEVER_ZERO.contains(&pass) && count(&|v| v != 0.0) == 0 {
+    if NEVER_ZERO.contains(&pass) && count(&|v| v != 0.0) == 0 && !may_be_empty(set, pass) {
         findings.push(Finding::new(
             "empty-pass",
             format!("{pass} is zero everywhere: an empty render, or a pass that was not written"),
-            renderer.setting(pass),
+            set.renderer.setting(pass),
         ));
     }
     let negative = count(&|v| v < 0.0);
-    if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) {
+    let is_trace = || {
+        let mut lit: Vec<f32> = planes.data.iter().copied().filter(|v| *v > 0.0).collect();
+        let least = -TRACE * median(&mut lit).unwrap_or(0.0);
+        (negative as f64) < NEGATIVE_SHARE * of as f64 && count(&|v| v < least) == 0
+    };
+    if negative > 0 && matches!(pass, Pass::Combined | Pass::NoisyImage) && !is_trace() {
         let message =
             format!("{pass}: {negative} negative values, which no light makes; models read them as 0");
         findings.push(match about.lossy {
@@ -119,15 +153,27 @@ fn constant(pass: Pass, planes: &Planes, findings: &mut Vec<Finding>) {
             .channel(c)
             .iter()
             .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
-        high - low <= CONSTANT
+        // Where all are NaN, there is neither.
+        low <= high && high - low <= CONSTANT
     };
     let is_blank = planes.data.iter().all(|v| *v == 0.0);
     if planes.pixels() > 1 && !is_blank && (0..planes.channels).all(is_constant) {
-        findings.push(Finding::new(
-            "constant-guide",
-            format!("{pass} is the same everywhere: it guides nothing, and edges that it hides are blurred"),
-            "render without a material override, and store the pass as the renderer wrote it",
-        ));
+        let length = (0..planes.channels).map(|c| planes.channel(c)[0].powi(2)).sum::<f32>().sqrt();
+        findings.push(if pass == Pass::DenoisingNormal && UNIT.contains(&length) {
+            Finding::harmless(
+                "constant-guide",
+                format!("{pass} is the same everywhere, as of one flat surface: it guides nothing"),
+                "",
+            )
+        } else {
+            Finding::new(
+                "constant-guide",
+                format!(
+                    "{pass} is the same everywhere: it guides nothing, and edges that it hides are blurred"
+                ),
+                "render without a material override, and store the pass as the renderer wrote it",
+            )
+        });
     }
 }
 
@@ -226,16 +272,19 @@ pub(super) const LINEAR: &str = "save the render as OpenEXR MultiLayer with Outp
 /// Pixels that were stored in 8 bits before.
 fn eight_bits(set: &PassSet, findings: &mut Vec<Finding>) {
     let Some(render) = render(set) else { return };
-    let mut steps = 0;
+    let (mut steps, mut seen) = (0, [false; 256]);
     for v in render.data.iter().filter(|v| **v != 0.0 && **v != 1.0) {
         let scaled = v * 255.0;
         if !(0.0..255.5).contains(&scaled) || (scaled - scaled.round()).abs() > NEAR_STEP.max(scaled * 3e-4) {
             return;
         }
         // In a dark frame all values may lie near the step 0.
-        steps += usize::from(scaled >= 0.5);
+        if scaled >= 0.5 {
+            steps += 1;
+            seen[scaled.round() as usize] = true;
+        }
     }
-    if steps >= STEPS {
+    if steps >= STEPS && seen.iter().filter(|seen| **seen).count() >= LEVELS {
         findings.push(Finding::new(
             "eight-bit-pixels",
             "all values of the beauty are multiples of 1/255: they went through an 8-bit file, which is not linear",

@@ -153,8 +153,36 @@ fn mean(image: &Planes, reference: &Planes, value: impl Fn(f64, f64) -> f64 + Sy
 /// Why a score is none against this reference, for a message.
 pub fn why_undefined(reference: &Planes) -> String {
     match display::exposure(reference) {
-        None if reference.data.iter().all(|&value| value <= 0.0) => "the reference is black".into(),
+        None if reference.data.iter().all(|&value| value == 0.0) => "the reference is black".into(),
+        None if reference.data.iter().any(|&value| value < 0.0) => {
+            "values of the reference below zero leave no positive mean luminance, by which its exposure is told".into()
+        }
         None => "98% of the reference is black, by which its exposure is told".into(),
         Some(_) => format!("the images are smaller than its window of {0}x{0}", ssim::WINDOW),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_black_is_not_called_so() {
+        let mut reference = Planes::new(3, 20, 20);
+        assert_eq!(why_undefined(&reference), "the reference is black");
+        reference.data[7] = 1.0;
+        assert!(why_undefined(&reference).starts_with("98% of the reference is black"));
+        reference
+            .data
+            .iter_mut()
+            .enumerate()
+            .for_each(|(at, v)| *v = if at.is_multiple_of(2) { -3.0 } else { 1.0 });
+        assert!(why_undefined(&reference).starts_with("values of the reference below zero"));
+        reference.data.fill(-1.0);
+        assert!(why_undefined(&reference).starts_with("values of the reference below zero"));
+        assert_eq!(
+            why_undefined(&Planes::from_vec(3, 2, 2, vec![0.5; 12])),
+            "the images are smaller than its window of 11x11"
+        );
     }
 }

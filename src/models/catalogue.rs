@@ -110,7 +110,7 @@ pub fn find(name: &str) -> Option<&'static Method> {
 pub const WEIGHTS_FOLDER: &str = "DEMC_WEIGHTS";
 
 /// Where that folder lies in this repository.
-const IN_REPOSITORY: &str = "eval/rivals/weights";
+pub const IN_REPOSITORY: &str = "eval/rivals/weights";
 
 impl Method {
     /// The weights in the program.

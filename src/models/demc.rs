@@ -285,7 +285,8 @@ impl Demc {
         (shape.c, shape.h, shape.w)
     }
 
-    fn convolutions(&self) -> impl Iterator<Item = (&Conv, usize)> {
+    /// The convolutions, each with the level at which it works.
+    fn by_level(&self) -> impl Iterator<Item = (&Conv, usize)> {
         let fusion = self.fusion.iter().flat_map(|f| {
             [&f.first].into_iter().chain(f.middle.iter().map(|m| &m.0)).chain([&f.last]).map(|c| (c, 0))
         });
@@ -384,7 +385,7 @@ impl Network for Demc {
     }
 
     fn macs_per_pixel(&self) -> f64 {
-        self.convolutions().map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32)).sum()
+        self.by_level().map(|(c, level)| c.macs_per_output_pixel() as f64 / 4f64.powi(level as i32)).sum()
     }
 
     fn reach(&self) -> usize {

@@ -18,7 +18,7 @@ use dfdx::{
     tensor_ops::exp,
 };
 
-use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate};
+use super::network::{Architecture, Batch, Config, Design, Network, Stacked, Taped, duplicate, field};
 use crate::{
     Result,
     features::{
@@ -110,10 +110,6 @@ impl Stream {
         let logits = Field::from_activation(x, 0, KERNEL * KERNEL, 1);
         field(image).filter(logits, None)
     }
-}
-
-fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &Stacked) -> Field<T> {
-    Field::input((shape.n, shape.c, shape.h, shape.w), values)
 }
 
 impl Kpcn {

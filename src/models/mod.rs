@@ -76,7 +76,7 @@ pub fn open(name_or_file: &str) -> Result<Box<dyn Denoiser>> {
 pub const UNRESTRAINED: &str = ":unrestrained";
 
 /// A method's name or weights file, and the arithmetic asked for: `demc-m:f32`.
-pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
+fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
     match name_or_file.rsplit_once(':') {
         Some((plain, "f32")) => (plain, Some(Precision::F32)),
         Some((plain, "bf16")) => (plain, Some(Precision::Bf16)),
@@ -87,8 +87,7 @@ pub fn split_precision(name_or_file: &str) -> (&str, Option<Precision>) {
 
 /// What names a method or a weights file, without the variant asked for behind it.
 pub fn without_variant(name_or_file: &str) -> &str {
-    let name = split_precision(name_or_file).0;
-    split_precision(name.strip_suffix(UNRESTRAINED).unwrap_or(name)).0
+    split_precision(name_or_file.strip_suffix(UNRESTRAINED).unwrap_or(name_or_file)).0
 }
 
 /// The widths of a network when the widths `asked` are wanted. `semc` gets those at which it is as large as a

@@ -1,6 +1,6 @@
 //! What every learned method has in common: a configuration, inputs, parameters, a forward pass.
 
-use dfdx::tensor::{Cpu, OwnedTape};
+use dfdx::tensor::{Cpu, Merge, OwnedTape, Tape};
 use serde::{Deserialize, Serialize};
 
 use super::{demc, kpcn, lbf, pyramid};
@@ -10,7 +10,7 @@ use crate::{
     companion::Companion,
     features::Inputs,
     kernels::{Shape, memory::PlaneBuffer},
-    nn::{BatchNorm, Conv, Images, Param, Stats, clear_buffers, values_of},
+    nn::{BatchNorm, Conv, Field, Images, Param, Stats, clear_buffers, values_of},
     passes::{Pass, PassSet},
     planes::Planes,
 };
@@ -116,6 +116,11 @@ pub fn convolution_weights(convolutions: usize, widths: &[usize]) -> usize {
 
 /// A network input of several samples, (N, C, H, W).
 pub type Stacked = (Shape, PlaneBuffer);
+
+/// A network input, as planes.
+pub(super) fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &Stacked) -> Field<T> {
+    Field::input((shape.n, shape.c, shape.h, shape.w), values)
+}
 
 /// Inputs of several samples of one size.
 pub type Batch = Vec<Stacked>;

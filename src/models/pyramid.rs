@@ -32,7 +32,7 @@ mod trunk;
 use dfdx::tensor::{Cpu, Merge, NoneTape, Tape};
 
 use super::network::{
-    Architecture, Batch, Config, Design, Network, Stacked, Taped, convolution_weights, duplicate,
+    Architecture, Batch, Config, Design, Network, Stacked, Taped, convolution_weights, duplicate, field,
 };
 use crate::{
     Result,
@@ -43,7 +43,7 @@ use crate::{
     },
     filters::refit::{Guides, Refit, Samples},
     kernels::memory::PlaneBuffer,
-    nn::{Conv, Field, Images, Stats},
+    nn::{Conv, Images, Stats},
     passes::{Pass, PassSet},
     planes::Planes,
     rng::Rng,
@@ -136,11 +136,6 @@ impl Pyramid {
 /// The inputs of a batch.
 fn named(batch: &Batch) -> LightInputs<&Stacked> {
     LightInputs::from_list(batch.first_chunk().expect("`inputs` makes as many").each_ref())
-}
-
-/// A network input, as planes.
-fn field<T: Tape<f32, Cpu> + Merge<T>>((shape, values): &Stacked) -> Field<T> {
-    Field::input((shape.n, shape.c, shape.h, shape.w), values)
 }
 
 /// The factors by which a refit multiplies denoised images, (N, 3, H, W).

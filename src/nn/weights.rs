@@ -3,12 +3,12 @@
 //! A weights file alone is enough to run: the metadata says which network it is and how it was
 //! trained. Checkpoints use the same format with f32 values; shipped weights are stored as f16.
 
-use std::{collections::HashMap, io::Write, path::Path};
+use std::{collections::HashMap, path::Path};
 
 use half::{f16, slice::HalfFloatSliceExt};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
-use crate::{Error, Result, frame::atomically};
+use crate::{Error, Result, frame::write_file};
 
 /// The metadata key that holds demc's JSON.
 const KEY: &str = "demc";
@@ -52,7 +52,7 @@ pub fn write(path: &Path, metadata: &str, tensors: &[Tensor], storage: Storage) 
     });
     let metadata = HashMap::from([(KEY.to_string(), metadata.to_string())]);
     let data = safetensors::serialize(views, &Some(metadata)).map_err(|e| Error::invalid(path, e))?;
-    atomically(path, |mut file| file.write_all(&data).map_err(Error::io("write", path)))
+    write_file(path, &data)
 }
 
 /// No network that could be trained has so many bytes of weights.

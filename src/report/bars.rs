@@ -17,7 +17,7 @@ use super::{
     figure::Figure,
     palette::{FAINT, GRID, INK, colours},
     rows::Row,
-    summary::MethodSummary,
+    summary::{self, MethodSummary, Statistics},
 };
 use crate::Result;
 
@@ -63,37 +63,25 @@ pub struct Bars {
 impl Bars {
     /// RelMSE of all `rows`, with the means of `summaries`.
     pub fn relmse(rows: &[Row], summaries: &[MethodSummary]) -> Self {
-        let means = [("mean", mean as Mean), ("geometric mean", geomean as Mean)];
-        Self::new("RelMSE by scene (logarithmic; lower is better)", "relmse", rows, summaries, &means)
+        Self::new("RelMSE by scene (logarithmic; lower is better)", "relmse", rows, summaries)
     }
 
     /// SSIM of all `rows`, with the mean of `summaries`.
     pub fn ssim(rows: &[Row], summaries: &[MethodSummary]) -> Self {
-        Self::new("SSIM by scene (higher is better)", "ssim", rows, summaries, &[("mean", mean as Mean)])
+        Self::new("SSIM by scene (higher is better)", "ssim", rows, summaries)
     }
 
     /// Flicker of all `rows`, with the means of `summaries`.
     pub fn flicker(rows: &[Row], summaries: &[MethodSummary]) -> Self {
         let followed: Vec<Row> = rows.iter().filter(|row| row.flicker.is_some()).cloned().collect();
-        let means = [("mean", mean as Mean), ("geometric mean", geomean as Mean)];
-        Self::new("Flicker by frame (logarithmic; lower is better)", "flicker", &followed, summaries, &means)
+        Self::new("Flicker by frame (logarithmic; lower is better)", "flicker", &followed, summaries)
     }
 
-    fn new(
-        title: &str,
-        metric: &str,
-        rows: &[Row],
-        summaries: &[MethodSummary],
-        means: &[(&str, Mean)],
-    ) -> Self {
+    fn new(title: &str, metric: &str, rows: &[Row], summaries: &[MethodSummary]) -> Self {
         let overall: Vec<&MethodSummary> = summaries.iter().filter(|s| s.spp.is_none()).collect();
         let names: Vec<&str> = overall.iter().map(|s| s.model.as_str()).collect();
         let is_error = metric != "ssim";
-        let value: fn(&Row) -> Option<f64> = match metric {
-            "relmse" => |row| row.relmse,
-            "flicker" => |row| row.flicker,
-            _ => |row| row.ssim,
-        };
+        let value = summary::metric(metric);
         let several_spp = rows.iter().any(|r| r.spp != rows[0].spp);
         let mut groups: Vec<Group> = Vec::new();
         let mut by_pair = HashMap::new();
@@ -111,9 +99,10 @@ impl Bars {
         }
         let scenes = groups.len();
         groups.truncate(MOST_SCENES);
-        for (label, value) in means {
-            let values = overall.iter().map(|s| value(s, metric));
-            groups.push(Group { label: (*label).into(), is_mean: true, values: values.collect() });
+        let means: [(&str, Mean); 2] = [("mean", |s| s.mean), ("geometric mean", |s| s.geomean)];
+        for (label, mean) in means.into_iter().take(if is_error { 2 } else { 1 }) {
+            let values = overall.iter().map(|s| mean(s.of(metric)));
+            groups.push(Group { label: label.into(), is_mean: true, values: values.collect() });
         }
         let left_out = scenes.saturating_sub(MOST_SCENES);
         let more = if left_out > 0 { format!("; {left_out} more in the means") } else { String::new() };
@@ -233,16 +222,8 @@ impl Bars {
     }
 }
 
-/// How a summary gives a mean of a metric.
-type Mean = fn(&MethodSummary, &str) -> Option<f64>;
-
-fn mean(method: &MethodSummary, metric: &str) -> Option<f64> {
-    method.of(metric).mean
-}
-
-fn geomean(method: &MethodSummary, metric: &str) -> Option<f64> {
-    method.of(metric).geomean
-}
+/// Takes a mean out of a method's statistics.
+type Mean = fn(Statistics) -> Option<f64>;
 
 fn is_dark(colour: RGBColor) -> bool {
     u32::from(colour.0) * 3 + u32::from(colour.1) * 6 + u32::from(colour.2) < 1450

@@ -10,8 +10,7 @@ use plotters::{
     style::{FontStyle, register_font},
 };
 
-use super::rows::write_file;
-use crate::{Error, Result};
+use crate::{Error, Result, frame::write_file};
 
 /// Family under which the font is registered; SVG viewers use their own font of this family.
 const FAMILY: &str = "sans-serif";

@@ -119,7 +119,9 @@ impl Panel {
             let time = s.of("ms_per_mpx").geomean.filter(|t| *t > 0.0)?;
             Some(Point { name: s.model.clone(), time, score: score(s)?, colour })
         });
-        let noisy = summaries.iter().find(|s| s.model == NOISY).and_then(|s| score(s));
+        // Of fewer renders, such as the easy ones, its score is none to hold the others against.
+        let most = summaries.iter().map(|s| s.scenes).max().unwrap_or(0);
+        let noisy = summaries.iter().find(|s| s.model == NOISY && s.scenes == most).and_then(|s| score(s));
         Self { title, axis, is_error, points: points.collect(), noisy }
     }
 
@@ -257,6 +259,7 @@ impl Panel {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::{rows::Row, summary::summarise};
 
     fn panel(is_error: bool, points: &[(&str, f64, f64)]) -> Panel {
         let point = |(name, time, score): &(&str, f64, f64)| Point {
@@ -270,6 +273,26 @@ mod tests {
 
     fn names(points: Vec<&Point>) -> Vec<&str> {
         points.into_iter().map(|p| p.name.as_str()).collect()
+    }
+
+    #[test]
+    fn an_input_that_was_scored_on_fewer_renders_has_no_line() {
+        let line = |hard: Option<f64>| {
+            let row = |(model, scene, relmse): (&str, &str, Option<f64>)| Row {
+                model: model.into(),
+                noisy: scene.into(),
+                relmse,
+                ..Row::default()
+            };
+            let scores = [(NOISY, "easy", Some(0.25)), (NOISY, "hard", hard)];
+            let of_method = [("m", "easy", Some(0.1)), ("m", "hard", Some(0.1))];
+            let rows: Vec<Row> = scores.into_iter().chain(of_method).map(row).collect();
+            let summaries = summarise(&rows, &[NOISY, "m"].map(String::from), "m");
+            let all: Vec<&MethodSummary> = summaries.iter().collect();
+            Panel::new(&all, "", "", true, |s| s.of("relmse").geomean).noisy
+        };
+        assert_eq!(line(None), None);
+        assert!((line(Some(1.0)).unwrap() - 0.5).abs() < 1e-9);
     }
 
     #[test]

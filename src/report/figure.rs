@@ -5,11 +5,8 @@ use std::path::Path;
 use image::RgbImage;
 use plotters::prelude::*;
 
-use super::{
-    canvas::{Canvas, draw_on, draw_svg, write_png},
-    rows::write_file,
-};
-use crate::Result;
+use super::canvas::{Canvas, draw_on, draw_svg, write_png};
+use crate::{Result, frame::write_file};
 
 /// Something that can be drawn on a bitmap and as SVG alike.
 pub trait Figure {

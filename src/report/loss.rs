@@ -8,12 +8,12 @@ use plotters::prelude::*;
 use super::{
     axis::{Area, Scale, tick_label},
     canvas::{Anchor, Canvas, Style, draw_on, write_png},
+    palette::GRID,
 };
 use crate::{Result, train::LogRow};
 
 const SIZE: (u32, u32) = (1200, 560);
 const AREA: Area = Area { left: 90, right: 1176, top: 64, bottom: 500 };
-const GRID: RGBColor = RGBColor(228, 228, 232);
 const TRAINING: RGBColor = RGBColor(0, 114, 178);
 const VALIDATION: RGBColor = RGBColor(213, 94, 0);
 

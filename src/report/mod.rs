@@ -42,7 +42,7 @@ pub(crate) use page::{document, picture_of, sheet_text};
 pub use pair::{Loaded, load, load_listed};
 pub use palette::is_own;
 pub use provenance::Provenance;
-pub use rows::{COLUMNS, Column, Row, append_row, read_rows, to_csv, write_file, write_json};
+pub use rows::{COLUMNS, Column, Row, append_row, read_rows, to_csv, write_json};
 pub use run::{EvalEvent, evaluate, remove_chart, sheet_name};
 pub use settings::file_stamp;
 pub use summary::{MethodSummary, geometric_mean, mean, summarise};

@@ -7,7 +7,10 @@
 
 use plotters::prelude::RGBColor;
 
-use crate::models::catalogue::{self, Family};
+use crate::models::{
+    catalogue::{self, Family},
+    without_variant,
+};
 
 /// Text and axes.
 pub const INK: RGBColor = RGBColor(35, 35, 40);
@@ -26,8 +29,7 @@ pub fn is_own(name: &str) -> bool {
 /// The family of a method by its name, whatever its variant (`kpcn:f32`). A name that is not in the catalogue is a weights
 /// file and counts as own.
 fn family(name: &str) -> Family {
-    let plain = name.split(':').next().unwrap_or(name);
-    catalogue::find(plain).map_or(Family::Own, |method| method.family)
+    catalogue::find(without_variant(name)).map_or(Family::Own, |method| method.family)
 }
 
 fn hue(family: Family) -> RGBColor {

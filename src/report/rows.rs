@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::{cell, summary::median};
 use crate::{
     Error, Result,
-    frame::{atomically, place_of},
+    frame::{place_of, write_file},
     metrics::Scores,
     testset::Pair,
 };
@@ -217,14 +217,6 @@ pub fn csv_lines(lines: impl IntoIterator<Item = Vec<String>>) -> String {
     let invariant = "writing to memory does not fail";
     lines.into_iter().for_each(|cells| writer.write_record(cells).expect(invariant));
     String::from_utf8(writer.into_inner().expect(invariant)).expect("cells are UTF-8")
-}
-
-/// Replaces a file by `text` in one step.
-///
-/// # Errors
-/// It cannot be written.
-pub fn write_file(path: &Path, text: &[u8]) -> Result<()> {
-    atomically(path, |mut file| file.write_all(text).map_err(Error::io("write", path)))
 }
 
 /// Replaces a file by a value as JSON, in one step.

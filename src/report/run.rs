@@ -14,7 +14,7 @@ use super::{
     page::Page,
     pair::{Carried, PairRun},
     provenance::Provenance,
-    rows::{Key, Row, Table, read_rows, write_file},
+    rows::{Key, Row, Table, read_rows},
     samples::Samples,
     sequences,
     settings::{self, Settings},
@@ -23,7 +23,7 @@ use super::{
 };
 use crate::{
     Error, Result,
-    frame::{alone_in, prepare_folder},
+    frame::{alone_in, prepare_folder, write_file},
     testset::Pair,
 };
 

@@ -51,8 +51,8 @@ pub struct MethodSummary {
     pub model: String,
     /// Samples per pixel of the rows summarised; none for all of them.
     pub spp: Option<u32>,
-    /// Pairs that the statistics are taken over: those that this method and every other but the noisy input
-    /// scored.
+    /// Pairs that the statistics are taken over: those that this method and every other scored, but for a noisy
+    /// input that is not the baseline.
     pub scenes: usize,
     /// Pairs on which this method failed.
     pub failed: usize,
@@ -67,13 +67,25 @@ impl MethodSummary {
     /// # Panics
     /// If no summarised metric has that name.
     pub fn of(&self, metric: &str) -> Statistics {
-        let at = METRICS.iter().position(|(name, _)| *name == metric).expect("a summarised metric");
-        self.statistics[at]
+        self.statistics[place(metric)]
     }
 }
 
-/// Every method in `models` over the pairs that all of them but the noisy input scored: first over all sample
-/// counts, then, where there are several, for each. A method that scored nowhere does not limit the others.
+/// How a row gives the metric of that name.
+///
+/// # Panics
+/// If no summarised metric has that name.
+pub fn metric(name: &str) -> fn(&Row) -> Option<f64> {
+    METRICS[place(name)].1
+}
+
+fn place(metric: &str) -> usize {
+    METRICS.iter().position(|(name, _)| *name == metric).expect("a summarised metric")
+}
+
+/// Every method in `models` over the pairs that all of them scored, but for the noisy input unless that is the
+/// baseline: first over all sample counts, then, where there are several, for each. A method that scored nowhere
+/// does not limit the others.
 pub fn summarise(rows: &[Row], models: &[String], baseline: &str) -> Vec<MethodSummary> {
     let counts: BTreeSet<u32> = rows.iter().map(|r| r.spp).collect();
     let mut summaries = over(rows.iter().collect(), models, baseline, None);
@@ -101,8 +113,9 @@ fn over(rows: Vec<&Row>, models: &[String], baseline: &str, spp: Option<u32>) ->
     }
     let mut scoring = by_model.clone();
     scoring.retain(|_, of| of.values().any(|r| r.is_valid()));
-    // A scene whose input has no score, because of a NaN say, still counts for methods that repair it.
-    if scoring.len() > 1 {
+    // A scene whose input has no score, because of a NaN say, still counts for methods that repair it; but not where
+    // there would be no ratio to that input.
+    if scoring.len() > 1 && baseline != NOISY {
         scoring.remove(NOISY);
     }
     let mut common: Vec<Files> =
@@ -306,6 +319,20 @@ mod tests {
         let counts: Vec<_> = found.iter().map(|m| (m.scenes, m.failed)).collect();
         assert_eq!(counts, [(1, 0), (1, 1), (0, 2)]);
         assert_eq!(found[2].of("relmse").mean, None);
+    }
+
+    #[test]
+    fn ratios_to_the_input_are_over_as_many_scenes_as_are_told() {
+        let rows = [
+            row("a", "x", 4, Some(1.0)),
+            row("b", "x", 4, Some(100.0)),
+            row("a", NOISY, 4, None),
+            row("b", NOISY, 4, Some(400.0)),
+        ];
+        let found = summarise(&rows, &models(&["x", NOISY]), NOISY);
+        assert_eq!(found.iter().map(|m| m.scenes).collect::<Vec<_>>(), [1, 1]);
+        close(found[0].of("relmse").mean, 100.0);
+        close(found[0].of("relmse").ratio, 0.25);
     }
 
     #[test]

@@ -6,14 +6,15 @@
 //! better be off; where the input is exact, at most a RelMSE of 0.0001. And the sum of
 //! its light is within 2% of the reference's, about the least difference in brightness that an eye sees
 //! (Weber's fraction). This tolerance grows by as much as the input's own sum is off, since the input may have fireflies or lack light that only few paths find.
+//! Where the input itself has no score, as without a reference, no method is judged.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeSet,
     path::{Path, PathBuf},
 };
 
 use super::{Trial, TrialRow};
-use crate::report::{Column, HeatCell, HeatMap, NOISY, cell, geometric_mean, mean, plural};
+use crate::report::{Column, HeatCell, HeatMap, NOISY, cell, geometric_mean, mean, number, plural};
 
 /// RelMSE that a method may bring to an input that is exact: nothing that an eye sees.
 const HARMLESS: f64 = 1e-4;
@@ -64,7 +65,10 @@ pub struct Case {
     pub ssim: Option<f64>,
     /// Mean over seeds of the ratio of the sum of all values to the reference's.
     pub energy: Option<f64>,
-    /// What is out of bounds; empty where all is well, and for the input itself.
+    /// Whether it is held against the bounds: the input itself is not, nor any method where the input has no score
+    /// either, since that is a fault of the pair.
+    pub is_judged: bool,
+    /// What is out of bounds; empty where all is well, and where it is not judged.
     pub faults: Vec<String>,
 }
 
@@ -74,12 +78,12 @@ impl Case {
         (&self.scene, &self.reference)
     }
 
-    /// Whether it is within the bounds; none for the input itself.
+    /// Whether it is within the bounds; none where it is not judged.
     pub fn passes(&self) -> Option<bool> {
-        (self.model != NOISY).then_some(self.faults.is_empty())
+        self.is_judged.then_some(self.faults.is_empty())
     }
 
-    /// In words: whether it is within the bounds, and else why not; empty for the input itself.
+    /// In words: whether it is within the bounds, and else why not; empty where it is not judged.
     fn verdict(&self) -> String {
         match self.passes() {
             None => String::new(),
@@ -88,13 +92,14 @@ impl Case {
         }
     }
 
-    /// Finds the faults, given the energy of the input, and the largest RelMSE where the input had none.
-    fn judge(&mut self, input_energy: Option<f64>, harm: f64) {
-        if self.failed > 0 {
-            self.faults.push(format!("no result for {} render{}", self.failed, plural(self.failed)));
+    /// Finds the faults, given the number of renders that the method alone failed on, the energy of the input, and the
+    /// largest RelMSE where the input had none.
+    fn judge(&mut self, lost: usize, input_energy: Option<f64>, harm: f64) {
+        if lost > 0 {
+            self.faults.push(format!("no result for {lost} render{}", plural(lost)));
         }
         if let Some(ratio) = self.to_input.filter(|ratio| *ratio > 1.0) {
-            self.faults.push(format!("{ratio:.2} x the input's RelMSE"));
+            self.faults.push(format!("{} x the input's RelMSE", number(ratio)));
         }
         if harm > HARMLESS {
             self.faults.push(format!("RelMSE {harm:.1e} where the input is exact"));
@@ -109,23 +114,22 @@ impl Case {
 
 /// The cases of all frames as they were rendered, in the order of the rows.
 pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
-    let mut groups: BTreeMap<usize, Vec<&TrialRow>> = BTreeMap::new();
-    let mut order: Vec<(&str, &Path, u32, &str)> = Vec::new();
+    type Frame<'a> = (&'a str, &'a Path, u32);
+    let mut groups: Vec<((Frame, &str), Vec<&TrialRow>)> = Vec::new();
     for row in rows.iter().filter(|row| row.trial == Trial::AsRendered.name()) {
-        let key = (row.scene.as_str(), row.reference.as_path(), row.spp, row.model.as_str());
-        let at = order.iter().position(|known| *known == key).unwrap_or_else(|| {
-            order.push(key);
-            order.len() - 1
-        });
-        groups.entry(at).or_default().push(row);
+        let key = ((row.scene.as_str(), row.reference.as_path(), row.spp), row.model.as_str());
+        match groups.iter_mut().find(|(known, _)| *known == key) {
+            Some((_, own)) => own.push(row),
+            None => groups.push((key, vec![row])),
+        }
     }
-    let of = |(scene, reference, spp): (&str, &Path, u32), model: &str| {
-        let at = order.iter().position(|known| *known == (scene, reference, spp, model));
-        at.map(|at| groups[&at].as_slice()).unwrap_or_default()
+    let of = |frame: Frame, model: &str| {
+        let found = groups.iter().find(|(known, _)| *known == (frame, model));
+        found.map(|(_, own)| own.as_slice()).unwrap_or_default()
     };
-    let case = |(at, own): (&usize, &Vec<&TrialRow>)| {
-        let (scene, reference, spp, model) = order[*at];
-        let frame = (scene, reference, spp);
+    let has_input = groups.iter().any(|((_, model), _)| *model == NOISY);
+    let case = |&((frame, model), ref own): &((Frame, &str), Vec<&TrialRow>)| {
+        let (scene, reference, spp) = frame;
         let values = |value: fn(&TrialRow) -> Option<f64>| -> Vec<f64> {
             own.iter().filter_map(|row| value(row)).collect()
         };
@@ -142,6 +146,12 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
             of(frame, NOISY).iter().any(|twin| twin.noisy == row.noisy && twin.relmse == Some(0.0))
         };
         let harm = own.iter().filter(is_exact).filter_map(|row| row.relmse).fold(0.0, f64::max);
+        let is_lost = |row: &&&TrialRow| {
+            let mut twins = of(frame, NOISY).iter().filter(|twin| twin.noisy == row.noisy);
+            !row.reason.is_empty() && twins.all(|twin| twin.reason.is_empty())
+        };
+        let lost = own.iter().filter(is_lost).count();
+        let is_input_scored = of(frame, NOISY).iter().any(|twin| twin.reason.is_empty());
         let input: Vec<f64> = of(frame, NOISY).iter().filter_map(|row| row.energy).collect();
         let mut case = Case {
             scene: scene.into(),
@@ -156,10 +166,11 @@ pub fn cases(rows: &[TrialRow], baseline: &str) -> Vec<Case> {
             to_baseline: against(baseline),
             ssim: mean(&values(|row| row.ssim)),
             energy: mean(&values(|row| row.energy)),
+            is_judged: model != NOISY && (is_input_scored || !has_input),
             faults: Vec::new(),
         };
-        if model != NOISY {
-            case.judge(mean(&input), harm);
+        if case.is_judged {
+            case.judge(lost, mean(&input), harm);
         }
         case
     };
@@ -272,5 +283,28 @@ mod tests {
             TrialRow { relmse: None, ssim: None, energy: None, reason: "no".into(), ..row("m", 0, 0.0, 0.0) };
         let cases = cases(&[row(NOISY, 0, 0.1, 1.0), failed], NOISY);
         assert_eq!((cases[1].passes(), cases[1].relmse, cases[1].to_input), (Some(false), None, None));
+    }
+
+    #[test]
+    fn faults_of_the_pair_are_not_the_method_s() {
+        let failed = |model: &str, seed: usize| TrialRow {
+            relmse: None,
+            ssim: None,
+            energy: None,
+            reason: "no reference".into(),
+            ..row(model, seed, 0.0, 0.0)
+        };
+        let judged = |rows: &[TrialRow]| cases(rows, NOISY).iter().map(Case::passes).collect::<Vec<_>>();
+        assert_eq!(judged(&[failed(NOISY, 0), failed("m", 0)]), [None, None]);
+        // Nor where another noise seed has a reference.
+        let rows = [failed(NOISY, 0), failed("m", 0), row(NOISY, 1, 0.2, 1.0), row("m", 1, 0.1, 1.0)];
+        assert_eq!(judged(&rows), [None, Some(true)]);
+        assert_eq!(judged(&[failed("m", 0)]), [Some(false)], "nothing tells of the pair without the input");
+    }
+
+    #[test]
+    fn a_ratio_barely_above_one_is_told_as_such() {
+        let cases = cases(&[row(NOISY, 0, 1.0, 1.0), row("m", 0, 1.001105, 1.0)], NOISY);
+        assert_eq!(cases[1].verdict(), "fail: 1.001105 x the input's RelMSE");
     }
 }

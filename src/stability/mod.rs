@@ -18,12 +18,12 @@ use std::path::PathBuf;
 use crate::{
     Error, Result,
     error::attempt,
-    frame::{alone_in, prepare_folder},
+    frame::{alone_in, prepare_folder, write_file},
     metrics::{self, display, error, ssim},
     planes::Planes,
     report::{
         self, Column, Contender, EvalEvent, Figure, HeatCell, HeatMap, Loaded, NOISY, Provenance, append_row,
-        cell, geometric_mean, to_csv, write_file, write_json,
+        cell, geometric_mean, to_csv, write_json,
     },
     shot::Shot,
     testset::Pair,

@@ -6,7 +6,8 @@ use maud::{PreEscaped, html};
 use super::{StabilityOptions, content::Case};
 use crate::{
     Result,
-    report::{Provenance, document, picture_of, sheet_name, sheet_text, write_file},
+    frame::write_file,
+    report::{Provenance, document, picture_of, sheet_name, sheet_text},
     testset::Pair,
 };
 

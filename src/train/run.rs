@@ -2,7 +2,6 @@
 
 use std::{
     collections::BTreeSet,
-    io::Write,
     path::{Path, PathBuf},
     sync::atomic::{AtomicBool, Ordering},
     time::Instant,
@@ -20,7 +19,7 @@ use super::{
 use crate::{
     Error, Result,
     features::Inputs,
-    frame::{alone_in, atomically, prepare_folder},
+    frame::{alone_in, prepare_folder, write_file},
     metrics,
     models::{
         self,
@@ -174,9 +173,8 @@ impl<'a> Run<'a> {
     /// of the files that this run began with.
     fn store_config(&mut self) -> Result<()> {
         self.save()?;
-        let config = self.out.join("config.json");
         let text = serde_json::to_string_pretty(self.options).expect("options serialise");
-        atomically(&config, |mut file| file.write_all(text.as_bytes()).map_err(Error::io("write", &config)))
+        write_file(&self.out.join("config.json"), text.as_bytes())
     }
 
     fn save(&mut self) -> Result<()> {

@@ -1,7 +1,7 @@
 """Joins the references of a development set from made-up parts whose noise is known; prints what comes out.
 
 Arguments: the scripts' folder, a folder for the set. Every part is a grey of 0.5 with noise of a standard
-deviation of 0.1, and the render at Blender's defaults of one of 0.05.
+deviation of 0.1, and the render at Blender's defaults of one of 0.05; one pixel is brighter than half floats can be.
 """
 
 import os
@@ -20,15 +20,19 @@ table, view, draw = development.Table(folder), development.VIEWS[0], np.random.d
 
 def render(file, spread, spp, seed):
     planes = {f"ViewLayer.Combined.{c}": draw.normal(0.5, spread, (60, 80)).astype("f4") for c in "RGB"}
-    exr.write_float(os.path.join(folder, file), planes)
+    for plane in planes.values():
+        plane[0, 0] = 1e6
+    write = exr.write_float if spp == development._PART_MOST else exr.write_half
+    write(os.path.join(folder, file), planes)
     table.record(view, file, spp, seed, 10.0)
 
 
 def show(file):
     planes = exr.read(os.path.join(folder, file))
     row = table.rows()[file]
-    spread = np.std([planes[f"ViewLayer.Combined.{c}"] for c in "RGB"])
-    print("REFERENCE", file, row["noise_seed"], row["seconds"], row["noise"], f"{spread ** 2 / 0.251:.3g}")
+    values = np.stack([planes[f"ViewLayer.Combined.{c}"].ravel() for c in "RGB"])
+    spread, sun = np.std(values[:, 1:]), values[0, 0]
+    print("REFERENCE", file, row["noise_seed"], row["seconds"], row["noise"], f"{spread ** 2 / 0.251:.3g}", sun)
 
 
 render(view.noisy(4, 0), 0.3, 4, 0)

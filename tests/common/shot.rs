@@ -31,6 +31,10 @@ pub struct Shot {
     pub shadow: Option<f32>,
     /// By how much the light of frames of odd numbers is more, and that of the others less.
     pub flicker: f32,
+    /// Whether bars of light, three columns wide and twelve apart, move by their width in each frame.
+    pub bars: bool,
+    /// The noise of a pixel: at most so much of its light, more or less.
+    pub spread: f32,
     /// The light of a lamp that guides and vectors do not know, twelve columns further in each frame.
     pub lamp: f32,
 }
@@ -47,6 +51,8 @@ pub const SHOT: Shot = Shot {
     seed: 1,
     shadow: None,
     flicker: 0.0,
+    bars: false,
+    spread: 0.8,
     lamp: 0.0,
 };
 
@@ -80,6 +86,7 @@ impl Shot {
     pub fn light(&self, x: f32, frame: i64) -> f32 {
         let light = match self.shadow {
             Some(edge) if x > edge + 3.0 * frame as f32 => 0.3,
+            _ if self.bars && (x as i64 - 3 * frame).rem_euclid(12) < 3 => 3.0,
             _ => 0.9,
         };
         light * if frame % 2 == 0 { 1.0 - self.flicker } else { 1.0 + self.flicker }
@@ -102,7 +109,7 @@ impl Shot {
     }
 
     pub fn noise(&self, i: usize, frame: i64) -> f32 {
-        0.2 + 1.6 * random([self.seed, frame as u32, i as u32])
+        1.0 + self.spread * (2.0 * random([self.seed, frame as u32, i as u32]) - 1.0)
     }
 
     /// The channels of a view layer, or of one stereo view of it.

@@ -93,9 +93,9 @@ impl Frames {
         Ok(picked)
     }
 
-    /// Says which frames are asked for and not among `files`, if there are any. So many that they stand for all that
-    /// there are do not count.
-    pub fn lacking(&self, files: &[Input]) -> Option<String> {
+    /// Counts the frames that are asked for and not among `files`, if there are any, and says which. So many that they
+    /// stand for all that there are do not count.
+    pub fn lacking(&self, files: &[Input]) -> Option<(usize, String)> {
         let there: BTreeSet<i64> = files.iter().filter_map(|input| frame_number(&input.file)).collect();
         let wanted: BTreeSet<i64> = self.0.iter().flat_map(|span| span.frames()).take(MOST + 1).collect();
         let lacking: Vec<i64> = wanted.difference(&there).copied().collect();
@@ -108,8 +108,9 @@ impl Frames {
         if spans.next().is_some() {
             named += ",...";
         }
-        (!lacking.is_empty() && wanted.len() <= MOST)
-            .then(|| format!("--frames: no input is of frame{} {named}", plural(lacking.len())))
+        let count = lacking.len();
+        let said = format!("--frames: no input is of frame{} {named}", plural(count));
+        (count > 0 && wanted.len() <= MOST).then_some((count, said))
     }
 }
 
@@ -133,16 +134,17 @@ mod tests {
         let there =
             [3, 4, 5, 9].map(|n| Input { file: format!("shot.{n:04}.exr").into(), below: PathBuf::new() });
         let lacking = |frames: &str| frames.parse::<Frames>().unwrap().lacking(&there);
-        let says = |frames: &str| Some(format!("--frames: no input is of frame{frames}"));
+        let says =
+            |count: usize, frames: &str| Some((count, format!("--frames: no input is of frame{frames}")));
         assert_eq!(lacking("3-5,9"), None);
-        assert_eq!(lacking("7,7"), says(" 7"));
-        assert_eq!(lacking("3-7,6-9:2,1-9:4"), says("s 1,6-8"));
-        assert_eq!(lacking("11-40:2"), says("s 11,13,15,17,19,21,23,25,..."));
+        assert_eq!(lacking("7,7"), says(1, " 7"));
+        assert_eq!(lacking("3-7,6-9:2,1-9:4"), says(4, "s 1,6-8"));
+        assert_eq!(lacking("11-40:2"), says(15, "s 11,13,15,17,19,21,23,25,..."));
         let all = "-9223372036854775808-9223372036854775807";
         assert_eq!(lacking(all), None, "they stand for all");
         assert_eq!(
             lacking(&format!("{all}:9223372036854775807")),
-            says("s -9223372036854775808,-1,9223372036854775806")
+            says(3, "s -9223372036854775808,-1,9223372036854775806")
         );
         let third: Frames = format!("{all}:3").parse().unwrap();
         assert!(third.contains(i64::MIN + 3) && third.contains(4) && !third.contains(5));

@@ -104,7 +104,7 @@ pub struct Args {
 
     /// Take frames of a sequence (names that end in a number) together with N before and N after each, found
     /// beside them and followed by the Vector pass: steadier and cleaner [default: frame by frame; 2 without
-    /// a number]
+    /// a number; 8 at most]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "2",
           value_parser = super::methods::parse_reach)]
     temporal: Option<u8>,
@@ -261,7 +261,7 @@ pub fn run(args: Args) -> Result<ExitCode> {
         ranking.print();
     }
     if let (Some(frames), End::Complete) = (watched, end) {
-        if let Some(note) = frames.lacking(&came).filter(|_| !args.quiet) {
+        if let Some((_, note)) = frames.lacking(&came).filter(|_| !args.quiet) {
             warn_line(&format!("demc: note: {note}"));
         }
         if came.is_empty() {
@@ -309,7 +309,7 @@ impl Work {
         let files = match &args.frames {
             Some(frames) => {
                 let picked = frames.pick(files, &args.inputs, unusable.is_empty())?;
-                if let Some(note) = frames.lacking(&picked).filter(|_| !args.quiet) {
+                if let Some((_, note)) = frames.lacking(&picked).filter(|_| !args.quiet) {
                     warn_line(&format!("demc: note: {note}"));
                 }
                 picked

@@ -12,7 +12,7 @@ use crate::{
         Denoiser,
         catalogue::{self, Family, Kind, METHODS},
     },
-    passes::{self, BLENDER, Layer, Mapping, Pass},
+    passes::{self, BLENDER, COMPOSITE, Layer, Mapping, Pass},
 };
 
 /// What `inspect` says about one file.
@@ -169,7 +169,7 @@ pub fn examine(path: &Path, methods: &[Needs], mapping: &Mapping, is_compared: b
         report.findings.push(Finding::new("no-beauty", message, BLENDER.setting(Pass::Combined)));
     }
     for layer in &layers {
-        let (layer, trace) = examine_layer(&frame, layer, methods, is_compared)?;
+        let (layer, trace) = examine_layer(&frame, (layer, &layers), methods, is_compared)?;
         report.layers.push(layer);
         report.trace = report.trace.or(trace);
     }
@@ -212,7 +212,7 @@ fn undecodable(frame: &Frame) -> Vec<Finding> {
 
 fn examine_layer(
     frame: &Frame,
-    layer: &Layer,
+    (layer, all): (&Layer, &[Layer]),
     methods: &[Needs],
     is_compared: bool,
 ) -> Result<(LayerReport, Option<Trace>)> {
@@ -243,7 +243,7 @@ fn examine_layer(
                 ..describe(pass)
             });
         }
-        findings = lint::frame(&set, &about(frame, layer, methods));
+        findings = lint::frame(&set, &about(frame, (layer, all), methods));
         unjudged = lint::unjudged(&set).filter(|_| set.get(Pass::Combined).is_some());
     }
     passes.extend(others.into_iter().map(describe));
@@ -275,14 +275,22 @@ fn examine_layer(
 /// Compressions that lose something of half floats.
 const LOSSY: [&str; 4] = ["b44", "b44a", "dwaa", "dwab"];
 
+/// Whether a layer is the picture once more, beside the view layer that is denoised: what the compositor made of it, or
+/// bare channels for programs that know no layers.
+fn is_copy(frame: &Frame, layer: &Layer, all: &[Layer]) -> bool {
+    let is_no_view_layer = layer.name.is_empty() || layer.name == COMPOSITE;
+    is_no_view_layer && passes::choose(frame, all, None).is_ok_and(|chosen| chosen.name != layer.name)
+}
+
 /// What the file says of a view layer's passes.
-fn about(frame: &Frame, layer: &Layer, methods: &[Needs]) -> About {
+fn about(frame: &Frame, (layer, all): (&Layer, &[Layer]), methods: &[Needs]) -> About {
     let is_half = |pass: &Pass| {
         let at = &layer.passes[pass];
         frame.parts()[at.part].channels[at.channels[0]].kind == SampleKind::Half
     };
     let model = methods.iter().find(|method| method.name == DEFAULT_MODEL);
-    let needs = model.filter(|_| layer.passes.contains_key(&Pass::Combined));
+    let is_denoised = layer.passes.contains_key(&Pass::Combined) && !is_copy(frame, layer, all);
+    let needs = model.filter(|_| is_denoised);
     let needs = needs.map_or(&[][..], |model| &model.passes);
     About {
         half: layer.passes.keys().copied().filter(is_half).collect(),

@@ -32,6 +32,10 @@ pub const TINY: f32 = 1e-8;
 /// Exposed radiance that is added before the brightness's logarithm.
 const BLACK: f32 = 0.02;
 
+/// Exposed radiance that brighter places count as: one square in a thousand of generated views is brighter, and nothing
+/// was learned of the thousands that lit places come to in a frame that is nearly black elsewhere.
+const BRIGHT: f32 = 8.0;
+
 /// What `make` writes for every row of squares, `lines` lines each. It is given the row's number, its
 /// features as [`FEATURES`] lines, and where to write.
 pub fn each_row(
@@ -56,7 +60,8 @@ pub fn each_row(
                 vectorised::run(Describe { sums: around, features, squares });
                 if place == 0 {
                     let light = around[LIGHT * squares..].iter().zip(&around[COUNT * squares..]);
-                    let brightness = |(sum, count): (&f32, &f32)| ln(sum / count * render.exposure + BLACK);
+                    let brightness =
+                        |(sum, count): (&f32, &f32)| ln((sum / count * render.exposure).min(BRIGHT) + BLACK);
                     of_frame.iter_mut().zip(light).take(squares).for_each(|(v, of)| *v = brightness(of));
                 }
             }

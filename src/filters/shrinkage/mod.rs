@@ -124,7 +124,8 @@ impl<'a> Shrinkage<'a> {
     /// Whether the frame is nothing but light that the camera sees directly, or black: all of it is kept,
     /// whatever was denoised.
     pub fn keeps_whole(&self) -> bool {
-        self.render.radiance.data.iter().all(|v| *v <= 0.0) || self.seen.is_all()
+        // Light of denormal numbers has no reciprocal.
+        self.render.radiance.data.iter().all(|v| *v < f32::MIN_POSITIVE) || self.seen.is_all()
     }
 
     /// Mixes a denoised `image`, (3, H, W), with the render that it was made of, as far as it differs by more
@@ -202,7 +203,11 @@ pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
     let channels = denoised.data.par_chunks_mut(pixels).zip(rendered.data.par_chunks(pixels));
     channels.for_each(|(denoised, rendered)| {
         let values = denoised.iter_mut().zip(rendered).zip(&shares.data);
-        values.for_each(|((denoised, rendered), share)| *denoised += (rendered - *denoised) * share);
+        values.for_each(|((denoised, rendered), share)| {
+            let mixed = *denoised + (rendered - *denoised) * share;
+            // As [`Blend`] has it: where all of the render is taken, rounding leaves none of the denoised value.
+            *denoised = if *share == 1.0 { *rendered } else { mixed };
+        });
     });
 }
 
@@ -580,10 +585,40 @@ mod tests {
             let same = exposed.data.iter().zip(&image.data).filter(|pair| near(*pair)).count();
             assert!(same == image.data.len(), "{film}: {same} of {}", image.data.len());
         }
+        // Of a large frame some pixels are counted, of all columns: a sign of three is found wherever it stands.
+        let (width, height) = (1024, 512);
+        for first in 509..515 {
+            let mut rng = Rng::new(4, 0);
+            let mut light = |film: f32| {
+                let sign = |i: usize| film * (1 + i / width % 7) as f32;
+                let is_sign = |i: usize| (first..first + 3).contains(&(i % width));
+                let pixels = (0..3 * width * height)
+                    .map(|i| if is_sign(i) { sign(i) } else { 0.01 + rng.uniform() })
+                    .collect();
+                Planes::from_vec(3, width, height, pixels)
+            };
+            let (albedo, radiance) = (light(1.0), light(1.5));
+            let render = Render {
+                radiance: &radiance,
+                albedo: &albedo,
+                exposure: 1.0,
+                samples: Some(64),
+                empty: None,
+            };
+            assert!((film_exposure(&render) / 1.5 - 1.0).abs() < 0.003, "columns from {first} on");
+        }
         // A wall alone has no such light, whatever its noise.
         let albedo = &planes(|_, _, _| 0.5);
         let render = Render { radiance: &wall, albedo, exposure: 1.0, samples: None, empty: None };
         assert_eq!(film_exposure(&render), 1.0);
+    }
+
+    #[test]
+    fn where_all_of_the_render_is_taken_nothing_of_the_denoised_light_is_left() {
+        let one = |v: f32| Planes::from_vec(1, 2, 1, vec![v; 2]);
+        let mut light = one(1e4);
+        take_back(&mut light, &one(1e-4), &Planes::from_vec(1, 2, 1, vec![1.0, 0.5]));
+        assert_eq!(light.data[..], [1e-4, 5000.0]);
     }
 
     #[test]

@@ -52,7 +52,7 @@ pub fn film_exposure(render: &Render) -> f32 {
     let per_octave = STEPS as f32 / std::f32::consts::LN_2;
     let middle = STEPS * OCTAVES;
     let mut counts = vec![0u32; 2 * middle + 1];
-    for at in (0..pixels).step_by(pixels.div_ceil(COUNTED)) {
+    for at in (0..pixels).step_by(step_through(pixels, radiance.width)) {
         let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
         let sums = [light, white].map(|colours| colours.iter().sum::<f32>());
         if sums.into_iter().all(|sum| sum > f32::MIN_POSITIVE) && equals(light, white, sums[0] / sums[1]) {
@@ -76,6 +76,20 @@ pub fn film_exposure(render: &Render) -> f32 {
     let steps = highest as i32 - middle as i32;
     let (octave, rest) = (steps.div_euclid(STEPS as i32), steps.rem_euclid(STEPS as i32));
     (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
+}
+
+/// The distance of the pixels that are counted of a frame. It has no factor in common with the frame's width: otherwise only
+/// some columns would ever be looked at, and what stands between them would not count.
+fn step_through(pixels: usize, width: usize) -> usize {
+    let divisor = |a: usize, b: usize| {
+        let (mut a, mut b) = (a, b);
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a
+    };
+    let least = pixels.div_ceil(COUNTED);
+    (least..).find(|step| divisor(*step, width) == 1).expect("some prime is no factor of the width")
 }
 
 /// Whether `light` equals `white` times `film`, up to rounding.

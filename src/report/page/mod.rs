@@ -21,10 +21,10 @@ use super::{
     picture::{self, Picture},
     plural,
     provenance::Provenance,
-    rows::{Row, write_file},
+    rows::Row,
     summary::{MethodSummary, Statistics},
 };
-use crate::{Result, testset::Pair};
+use crate::{Result, frame::write_file, testset::Pair};
 
 /// What the page shows.
 pub struct Page<'a> {
@@ -119,8 +119,8 @@ impl Page<'_> {
                     (self.failures())
                     h2 #summary { "Summary" }
                     p.faint {
-                        "Over the renders that every method scored, the input itself aside. A ratio is the geometric mean, scene by \
-                         scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
+                        "Over the renders that every method scored, the input itself aside unless it is the baseline. A ratio is the \
+                         geometric mean, scene by scene, of the ratio to " b { (self.options.baseline) } ". Click a heading to sort."
                     }
                     (self.summary())
                     (self.notes())
@@ -314,14 +314,17 @@ impl Page<'_> {
 }
 
 /// The name and value of the method whose `sign * value` is lowest. The input takes part: where every method makes
-/// frames worse, none of them is the best. Of equals there is no best, nor of one alone.
+/// frames worse, none of them is the best. Of equals there is no best, nor of one alone. A method that was scored on
+/// fewer renders than others, as an input with NaN in it is, does not take part.
 fn winner<'a>(
     methods: &[&'a MethodSummary],
     value: fn(&MethodSummary) -> Option<f64>,
     sign: f64,
 ) -> Option<(&'a str, f64)> {
+    let most = methods.iter().map(|method| method.scenes).max()?;
+    let all = methods.iter().filter(|method| method.scenes == most);
     let scored: Vec<(&str, f64)> =
-        methods.iter().filter_map(|method| Some((method.model.as_str(), value(method)?))).collect();
+        all.filter_map(|method| Some((method.model.as_str(), value(method)?))).collect();
     let best = *scored.iter().min_by(|a, b| (sign * a.1).total_cmp(&(sign * b.1)))?;
     let has_equal = scored.iter().filter(|other| other.1 == best.1).count() > 1;
     (scored.len() > 1 && !has_equal).then_some(best)
@@ -393,7 +396,7 @@ const SUMMARY: [Column<MethodSummary>; 14] = [
     },
     Column {
         heading: "renders",
-        hint: "scored, of those that every method but the input scored",
+        hint: "scored, of those that methods are compared on",
         better: Better::Neither,
         show: whole,
         value: |m| Some(m.scenes as f64),
@@ -463,6 +466,29 @@ mod tests {
         assert_eq!(best(&[(NOISY, 1e-6), ("m", 0.01)]).as_deref(), Some(NOISY));
         assert_eq!(best(&[("m", 0.01)]), None);
         assert_eq!(best(&[(NOISY, 0.1), ("m", 0.01), ("n", 0.01)]), None);
+    }
+
+    #[test]
+    fn what_was_scored_on_the_easy_renders_alone_is_not_the_best() {
+        let row = |(model, scene, relmse): (&str, &str, Option<f64>)| Row {
+            model: model.into(),
+            noisy: scene.into(),
+            relmse,
+            ..Row::default()
+        };
+        let rows = [
+            (NOISY, "easy", Some(1e-3)),
+            (NOISY, "hard", None),
+            ("m", "easy", Some(1e-3)),
+            ("m", "hard", Some(0.1)),
+            ("n", "easy", Some(2e-3)),
+            ("n", "hard", Some(0.1)),
+        ]
+        .map(row);
+        let summaries = summarise(&rows, &[NOISY, "m", "n"].map(String::from), "m");
+        let all: Vec<&MethodSummary> = summaries.iter().collect();
+        let best = winner(&all, |s| s.of("relmse").geomean, 1.0);
+        assert_eq!(best.map(|(name, _)| name), Some("m"));
     }
 
     #[test]
