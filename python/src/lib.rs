@@ -162,7 +162,8 @@ fn leave(py: Python<'_>) {
 /// change, so others are opened anew.
 fn open(name: &str) -> demc::Result<Arc<dyn Denoiser>> {
     static OPENED: LazyLock<Mutex<HashMap<String, Arc<dyn Denoiser>>>> = LazyLock::new(Mutex::default);
-    if models::catalogue::find(models::without_variant(name)).is_none_or(|method| method.built_in().is_none()) {
+    if models::catalogue::find(models::without_variant(name)).is_none_or(|method| method.built_in().is_none())
+    {
         return Ok(models::open(name)?.into());
     }
     if let Some(model) = OPENED.lock().unwrap_or_else(PoisonError::into_inner).get(name) {
