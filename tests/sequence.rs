@@ -340,6 +340,22 @@ fn narrow_light_that_moves_by_its_width_leaves_no_ghost() {
 }
 
 #[test]
+fn a_copy_of_a_frame_that_vectors_say_moved_is_told_and_left_out() {
+    let dir = sequence(SHOT, 1..=3);
+    fs::copy(named(&dir, 2), named(&dir, 3)).unwrap();
+    let [out, alone] = ["out", "alone"].map(|name| dir.path().join(name));
+    demc(&alone).arg(named(&dir, 3)).assert().success();
+    let run = demc(&out).arg(named(&dir, 3)).args(["--temporal", "1"]).assert().success();
+    run.stderr(contains("frame 2 holds the same picture to the bit, though Vector tells of motion"));
+    assert_eq!(denoised(&out, 3), denoised(&alone, 3));
+    // Of a still camera, copies do no harm.
+    let dir = sequence(Shot { speed: 0.0, ..SHOT }, 1..=2);
+    fs::copy(named(&dir, 1), named(&dir, 2)).unwrap();
+    let run = demc(&out).arg(named(&dir, 2)).args(["--temporal", "1", "--overwrite"]).assert().success();
+    run.stderr(contains("to the bit").not());
+}
+
+#[test]
 fn a_lamp_leaves_nothing_where_it_was_nor_where_it_will_be() {
     let shot = Shot { speed: 0.0, lamp: 1e5, ..SHOT };
     let dir = sequence(shot, 0..=3);

@@ -612,18 +612,20 @@ impl Moment {
         Some(Sight { light: self.values(Pass::Combined)?, albedo: self.guides().albedo })
     }
 
-    /// Whether another frame's light is this one's to the bit.
+    /// Whether another frame's light is this one's to the bit. Of black frames there is nothing to tell.
     fn is_copy_of(&self, other: &Self) -> bool {
         let [Some(own), Some(there)] = [self, other].map(|moment| moment.values(Pass::Combined)) else {
             return false;
         };
         let (channels, width, height) = own.extent();
-        let mut lines = [vec![0.0; width], vec![0.0; width]];
-        (0..channels * height).all(|row| {
+        let (mut lines, mut is_black) = ([vec![0.0; width], vec![0.0; width]], true);
+        let is_same = (0..channels * height).all(|row| {
             let (c, y) = (row / height, row % height);
             lines.iter_mut().zip([own, there]).for_each(|(line, of)| of.read(c, y * width, line));
+            is_black &= lines[0].iter().all(|v| *v == 0.0);
             lines[0] == lines[1]
-        })
+        });
+        is_same && !is_black
     }
 
     /// Whether another frame shows other guides at the same places; true of frames that have none.
