@@ -8,7 +8,10 @@ use std::{
     process::Command,
 };
 
-use common::python::{self, run};
+use common::{
+    files::names_in,
+    python::{interpreter as blender, run},
+};
 use demc::{
     filters::motion::{Direction, Flow},
     frame::Frame,
@@ -22,14 +25,6 @@ fn script(name: &str) -> PathBuf {
 
 fn snippet(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/blender_data").join(name)
-}
-
-/// The interpreter with bpy. Old byte code must not hide a change of the scripts, nor new byte code
-/// litter the source tree.
-fn blender() -> Command {
-    let mut command = Command::new(python::python());
-    command.env("PYTHONDONTWRITEBYTECODE", "1");
-    command
 }
 
 /// What a script says that leaves something out: it goes on, and ends with 1.
@@ -50,15 +45,6 @@ fn export(blend: &Path, out: &Path, arguments: &str) -> String {
     let mut command = blender();
     command.arg(script("export_passes.py")).arg(blend).arg("--out").arg(out);
     run(command.args(arguments.split_whitespace()))
-}
-
-fn files(folder: &Path) -> Vec<String> {
-    let mut names: Vec<_> = fs::read_dir(folder)
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    names.sort();
-    names
 }
 
 /// The three channels of a pass at a place of the test scene's floor, in world units.
@@ -86,7 +72,7 @@ fn exports_every_pass_with_the_averaged_position_and_resumes() {
     let said = export(&blend, &out, "--spp 4,8 --ref-spp 64 --half-buffers");
     assert_eq!(said.lines().count(), 1, "one line a frame: {said}");
     assert_eq!(
-        files(&out),
+        names_in(&out),
         [
             "shot_0004spp.exr",
             "shot_0004spp_a.exr",
@@ -176,7 +162,7 @@ fn exports_a_region_of_a_frame_range_and_puts_the_scene_back() {
     );
     assert_eq!(said.lines().count(), 2, "{said}");
     assert_eq!(
-        files(&out),
+        names_in(&out),
         ["crop_0001spp.0007.exr", "crop_0001spp.0008.exr", "crop_ref.0007.exr", "crop_ref.0008.exr"]
     );
     let crop = passes::load(out.join("crop_0001spp.0007.exr"), None).unwrap();
@@ -218,7 +204,7 @@ fn names_what_is_wrong_in_one_line_and_fails() {
         let errors: Vec<_> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
         assert!(errors.len() == 1 && errors[0].contains(expected), "{stderr}");
     }
-    assert!(!files(folder.path()).iter().any(|name| name.ends_with(".exr")));
+    assert!(!names_in(folder.path()).iter().any(|name| name.ends_with(".exr")));
 }
 
 fn generate(out: &Path, arguments: &str) -> String {
@@ -235,8 +221,8 @@ fn generates_the_same_pixels_for_the_same_seed() {
     let said = generate(&first, arguments);
     assert_eq!(said.lines().count(), 2, "a line a scene: {said}");
     generate(&second, arguments);
-    let names = files(&first);
-    assert_eq!(names, files(&second));
+    let names = names_in(&first);
+    assert_eq!(names, names_in(&second));
     let images: Vec<_> = names.iter().filter(|name| name.ends_with(".exr")).collect();
     assert_eq!(images.len(), 2 * 2 * 3, "{names:?}");
     for name in images {

@@ -10,7 +10,7 @@ use std::{
 };
 
 use assert_cmd::Command;
-use common::files::{bits, data, read_exr, samples, values, write_bare_parts, write_render};
+use common::files::{bits, data, names_in, read_exr, samples, values, write_bare_parts, write_render};
 use demc::frame::{Frame, NewChannel, SampleKind};
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
@@ -317,10 +317,7 @@ fn takes_files_directories_and_globs_and_does_each_file_once() {
         .assert()
         .success()
         .stdout(contains("3 denoised"));
-    let mut names: Vec<String> =
-        fs::read_dir(&out).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    assert_eq!(names, ["a.0001.exr", "a.0002.exr", "b.EXR"]);
+    assert_eq!(names_in(&out), ["a.0001.exr", "a.0002.exr", "b.EXR"]);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::{
     time::Duration,
 };
 
-use common::python;
+use common::{files::names_in, python};
 use demc::{
     frame::Frame,
     passes::{self, Pass, PassSet},
@@ -87,10 +87,7 @@ impl Shot {
     }
 
     fn files(&self) -> Vec<String> {
-        let entries = fs::read_dir(self.out()).unwrap();
-        let mut names: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
+        names_in(self.out())
     }
 
     fn passes(&self, name: &str) -> PassSet {

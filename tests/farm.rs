@@ -333,8 +333,8 @@ fn training_data_of_two_tasks_is_joined_into_one_set() {
     let set = folder.path().join("set");
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("blender_scripts");
     let python = |script: PathBuf| {
-        let mut command = Command::new(python::python());
-        command.env("PYTHONDONTWRITEBYTECODE", "1").arg(script);
+        let mut command = python::interpreter();
+        command.arg(script);
         command
     };
     let task = |part: &str, seeds: &str| {

@@ -12,7 +12,7 @@ use std::{
 use assert_cmd::cargo::cargo_bin;
 use common::{
     demc,
-    files::{data, write_render},
+    files::{data, names_in, write_render},
 };
 use predicates::{prelude::*, str::contains};
 
@@ -172,12 +172,7 @@ fn frames_are_picked_by_number() {
     let run = |arguments: &str| {
         shell(folder.path(), &format!("demc denoise --model noisy --overwrite {arguments}")).assert()
     };
-    let names = |out: &str| {
-        let entries = fs::read_dir(folder.path().join(out)).unwrap();
-        let mut names: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-    };
+    let names = |out: &str| names_in(folder.path().join(out));
     run("renders --out steps --frames 1-12:4").success();
     assert_eq!(names("steps"), ["shot_0004spp.0001.exr", "shot_0004spp.0005.exr"]);
     run("renders pairs --out listed --frames 12,7")
@@ -223,10 +218,7 @@ fn tasks_that_meet_do_not_harm_each_other() {
         }
     }
     tasks.iter_mut().for_each(|task| assert!(task.wait().unwrap().success()));
-    let mut found: Vec<_> =
-        fs::read_dir(&out).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-    found.sort();
-    assert_eq!(found, names);
+    assert_eq!(names_in(&out), names);
 }
 
 #[test]

@@ -13,28 +13,25 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{files::data, python};
+use common::{
+    files::{data, names_in},
+    python,
+};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-fn interpreter() -> Command {
-    let mut command = Command::new(python::python());
-    command.env("PYTHONDONTWRITEBYTECODE", "1");
-    command
-}
-
 /// A script of `eval`, ready to run in a folder.
 fn script(name: &str, folder: &Path) -> Command {
-    let mut command = interpreter();
+    let mut command = python::interpreter();
     command.arg(root().join("eval").join(name)).current_dir(folder);
     command
 }
 
 /// Python that may import the modules of a folder of this repository.
 fn snippet(modules: &str, text: &str) -> Command {
-    let mut command = interpreter();
+    let mut command = python::interpreter();
     command.env("PYTHONPATH", root().join(modules)).args(["-c", text]);
     command
 }
@@ -246,14 +243,9 @@ fn cleaned_sequences_keep_the_neighbours_of_their_references() {
     };
     let output = clean(&[]);
     assert!(output.status.success(), "{}", stderr(&output));
-    let mut names: Vec<_> = fs::read_dir(folder.path().join("clean"))
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    names.sort();
     let expected =
         ["pan_0004spp.0001.exr", "pan_0004spp.0002.exr", "pan_0004spp.0003.exr", "pan_ref.0002.exr"];
-    assert_eq!(names, expected);
+    assert_eq!(names_in(folder.path().join("clean")), expected);
     // A mean holds the render that --join would put into the reference.
     fs::write(shot.join("pan_0008spp_mean.exr"), "").unwrap();
     let output = clean(&["--join", "4"]);

@@ -97,10 +97,10 @@ const FAR: f32 = 1e6;
 const OUTSHINES: f32 = 16.0;
 
 /// Rows and columns of a square.
-const SQUARE: usize = 2;
+pub(super) const SQUARE: usize = 2;
 
 /// Added to the albedo before light is divided by it.
-const ALBEDO_FLOOR: f32 = 0.02;
+pub(super) const ALBEDO_FLOOR: f32 = 0.02;
 
 /// Added to the squared light, to squared albedos, and to depths, before differences are divided by them.
 const DIM: f32 = 1e-4;
@@ -547,10 +547,10 @@ impl Vectorised for Roots<'_> {
 }
 
 /// Adds a row of values, or their squares, to the sums of the squares of pixels that they lie in.
-struct Add<'a> {
-    values: &'a [f32],
-    is_squared: bool,
-    sums: &'a mut [f32],
+pub(super) struct Add<'a> {
+    pub values: &'a [f32],
+    pub is_squared: bool,
+    pub sums: &'a mut [f32],
 }
 
 impl Vectorised for Add<'_> {

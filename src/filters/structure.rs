@@ -12,7 +12,11 @@
 
 use rayon::prelude::*;
 
-use super::{box_mean, motion::Flow};
+use super::{
+    agreement::{ALBEDO_FLOOR, Add, SQUARE},
+    box_mean,
+    motion::Flow,
+};
 use crate::{
     kernels::{
         exponential::exp,
@@ -30,10 +34,7 @@ pub struct Sight<'a> {
     pub albedo: Option<&'a dyn Values>,
 }
 
-/// Rows and columns of the squares in which squared differences are summed up.
-const SQUARE: usize = 2;
-
-/// They are compared over so many squares in each direction: 10x10 pixels.
+/// Squared differences are summed up in squares of 2x2 pixels, and compared over so many of them in each direction: 10x10 pixels.
 const REACH: usize = 2;
 
 /// Lines of sums: squared differences of pixels, and of means over 3x1, 1x3 and 3x3 of them.
@@ -57,9 +58,6 @@ const HERE: (f32, f32) = (1.0, 2.0);
 
 /// Squared relative difference of fourth roots of light that nobody sees.
 const UNSEEN: f32 = 3e-6;
-
-/// Added to the albedo before light is divided by it.
-const ALBEDO_FLOOR: f32 = 0.02;
 
 /// Lowers the weights of pixels of another frame, (1, H, W), where it differs from this one by more than noise.
 /// `brightness` is how many times as bright this frame is, `samples` those of its pixels.
@@ -93,7 +91,7 @@ pub fn lower(
             vectorised::run(Means { above, here, below, means: &mut means });
             let of_means = means.iter().map(|mean| &mean[..]);
             for (sums, values) in lines.iter_mut().zip([here].into_iter().chain(of_means)) {
-                vectorised::run(AddSquares { values, sums });
+                vectorised::run(Add { values, is_squared: true, sums });
             }
         }
     });
@@ -201,24 +199,6 @@ fn beside(values: &[f32], means: &mut [f32]) {
     means.iter_mut().zip(values.iter().skip(1)).for_each(|(mean, next)| *mean += next);
     means.iter_mut().skip(1).zip(values).for_each(|(mean, before)| *mean += before);
     means.iter_mut().for_each(|mean| *mean *= 1.0 / 3.0);
-}
-
-/// Adds the squares of a row of values to the sums of the squares of pixels that they lie in.
-struct AddSquares<'a> {
-    values: &'a [f32],
-    sums: &'a mut [f32],
-}
-
-impl Vectorised for AddSquares<'_> {
-    #[inline(always)]
-    fn run(self) {
-        let Self { values, sums } = self;
-        let pairs = values.chunks_exact(SQUARE);
-        if let ([last], Some(sum)) = (pairs.remainder(), sums.last_mut()) {
-            *sum += last * last;
-        }
-        sums.iter_mut().zip(pairs).for_each(|(sum, pair)| *sum += pair[0] * pair[0] + pair[1] * pair[1]);
-    }
 }
 
 #[cfg(test)]

@@ -56,6 +56,13 @@ pub fn python() -> PathBuf {
     environment().python()
 }
 
+/// It, ready to run. Old byte code must not hide a change of the scripts, nor new byte code litter the source tree.
+pub fn interpreter() -> Command {
+    let mut command = Command::new(python());
+    command.env("PYTHONDONTWRITEBYTECODE", "1");
+    command
+}
+
 /// The Pythons with the versions of bpy on which the scripts must work.
 pub fn blenders() -> Vec<PathBuf> {
     let older = std::env::var_os("DEMC_BPY45").map(PathBuf::from);
