@@ -485,6 +485,16 @@ proptest! {
     }
 }
 
+#[test]
+fn planes_of_few_rows_are_cut_into_parts() {
+    for geometry in [Geometry::Same(1), Geometry::Same(3), Geometry::Transposed] {
+        check_layer(geometry, Shape::new(1, 40, 3, 150), 24, 36, 11);
+        for engine in Engine::available() {
+            check_int8(engine, geometry, Shape::new(1, 40, 3, 150), 24, 36, 12);
+        }
+    }
+}
+
 /// The same once more on each tier: what rounds to 8 bits chooses the fastest itself.
 #[test]
 fn all_tiers_round_to_eight_bits() {

@@ -31,15 +31,16 @@ impl<T: Clone> Pool<T> {
         Pooled { len, data, pool: Some(self) }
     }
 
-    /// As [`Pool::take`]; none where the system has no room for new memory.
-    pub fn try_take(&'static self, len: usize, value: T) -> Option<Pooled<T>> {
-        let data = self.take_free(len).or_else(|| {
-            let mut data = Vec::new();
+    /// Memory as [`Pool::take`] gives it, all of it `value`; none where the system has no room for new memory.
+    pub fn try_filled(&'static self, len: usize, value: T) -> Option<Pooled<T>> {
+        let mut data = self.take_free(len).unwrap_or_default();
+        if data.is_empty() {
             data.try_reserve_exact(len).ok()?;
             data.resize(len, value);
-            Some(data)
-        });
-        Some(Pooled { len, data: data?, pool: Some(self) })
+        } else {
+            data[..len].fill(value);
+        }
+        Some(Pooled { len, data, pool: Some(self) })
     }
 
     /// Free memory that fits. Where there is none, as much that is free and too small goes back to the system
@@ -163,6 +164,19 @@ impl<T> Drop for Pooled<T> {
     }
 }
 
+/// Bytes of a copy that are worth a task of their own.
+const COPIED: usize = 64 << 10;
+
+/// Copies values by all threads.
+///
+/// # Panics
+/// If there are not as many.
+pub fn copy<T: Copy + Send + Sync>(into: &mut [T], from: &[T]) {
+    assert_eq!(into.len(), from.len(), "as many values");
+    let piece = COPIED / size_of::<T>();
+    into.par_chunks_mut(piece).zip(from.par_chunks(piece)).for_each(|(into, from)| into.copy_from_slice(from));
+}
+
 /// The values of planar images.
 pub type PlaneBuffer = Pooled<f32>;
 
@@ -185,9 +199,7 @@ pub fn half_buffer(len: usize) -> HalfBuffer {
 
 /// Zeros, as values of planar images; none where the system has no room for them.
 pub fn try_zeros(len: usize) -> Option<PlaneBuffer> {
-    let mut buffer = PLANES.try_take(len, 0.0)?;
-    buffer.fill(0.0);
-    Some(buffer)
+    PLANES.try_filled(len, 0.0)
 }
 
 /// Gives all free memory of planar images back to the system.

@@ -3,6 +3,10 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
+use super::memory;
+
 /// The extent of a plane; its values are blocks of any type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Plane {
@@ -55,7 +59,7 @@ impl Plane {
     ///
     /// # Panics
     /// If widths or borders differ, or some row does not exist.
-    pub fn copy_rows<V: Copy>(
+    pub fn copy_rows<V: Copy + Send + Sync>(
         self,
         (into, to): (&mut [V], isize),
         other: Plane,
@@ -64,9 +68,8 @@ impl Plane {
     ) {
         assert_eq!((self.w, self.pad), (other.w, other.pad), "rows must fit");
         let (to, from) = (self.rows(to, count), other.rows(from, count));
-        for (into, source) in into.chunks_mut(self.positions()).zip(source.chunks(other.positions())) {
-            into[to.clone()].copy_from_slice(&source[from.clone()]);
-        }
+        let planes = into.par_chunks_mut(self.positions()).zip(source.par_chunks(other.positions()));
+        planes.for_each(|(into, source)| memory::copy(&mut into[to.clone()], &source[from.clone()]));
     }
 
     /// Where `count` rows from row `first` on lie, borders included.

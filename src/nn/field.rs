@@ -15,6 +15,7 @@ use crate::kernels::{
     filter::{Filter, FilterGradient, Size, reduce, reduce_gradient},
     gain::{amplify, amplify_gradient},
     layout::{add_blocked_shuffled, from_blocked_shuffled},
+    memory,
     redivide::{redivide, redivide_gradient},
     simd::Tier,
     vectorised::CHUNK,
@@ -100,9 +101,7 @@ impl<T: Tape<f32, Cpu> + Merge<T>> Field<T> {
     /// If the length of `values` is not what `extent` demands.
     pub fn input(extent: Extent, values: &[f32]) -> Self {
         let mut data = plane_buffer(values.len());
-        data.par_chunks_mut(CHUNK)
-            .zip(values.par_chunks(CHUNK))
-            .for_each(|(to, from)| to.copy_from_slice(from));
+        memory::copy(&mut data, values);
         Self::from_buffer(extent, data)
     }
 

@@ -4,13 +4,14 @@
 use std::{collections::VecDeque, ops::Range};
 
 use dfdx::tensor::NoneTape;
+use rayon::prelude::*;
 
 use super::{
     Activation, Field,
     activation::Data,
     pool::{Buffer, plane_buffer},
 };
-use crate::kernels::narrow::Operand;
+use crate::kernels::{memory, narrow::Operand};
 
 /// Consecutive rows of one image: an activation or a field, without a tape.
 pub trait Rows: Sized {
@@ -77,14 +78,13 @@ impl Rows for Field<NoneTape> {
         let (_, channels, _, w) = parts[0].0.extent();
         let h = parts.iter().map(|(_, rows)| rows.len()).sum::<usize>();
         let mut data = plane_buffer(channels * h * w);
-        for (c, plane) in data.chunks_mut((h * w).max(1)).enumerate() {
-            let mut plane = plane;
+        data.par_chunks_mut((h * w).max(1)).enumerate().for_each(|(c, mut plane)| {
             for (part, rows) in parts {
                 let (into, rest) = plane.split_at_mut(rows.len() * w);
-                into.copy_from_slice(&part.plane(c)[rows.start * w..rows.end * w]);
+                memory::copy(into, &part.plane(c)[rows.start * w..rows.end * w]);
                 plane = rest;
             }
-        }
+        });
         Self::from_buffer((1, channels, h, w), data)
     }
 }

@@ -4,6 +4,10 @@
 //! beauty. The film's exposure, which multiplies light alone, is found first, from the quotient that most
 //! such pixels agree on.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+
 use super::Render;
 use crate::{
     filters::FIREFLY,
@@ -37,8 +41,9 @@ const OCTAVES: usize = 20;
 const LEAST_EXPOSED: u32 = 16;
 const PEAK: f32 = 8.0;
 
-/// About how many pixels of a frame are counted.
+/// About how many pixels of a frame are counted, and how many of them a thread counts at once.
 const COUNTED: usize = 1 << 17;
+const COUNTED_AT_ONCE: usize = 1 << 12;
 
 /// For a pixel to be seen directly, this many of the 3x3 around it, itself included, must be as bright as
 /// their albedo, because any pixel may be so by chance.
@@ -49,11 +54,12 @@ const SEEN_TOGETHER: f32 = 6.0;
 pub fn film_exposure(render: &Render) -> f32 {
     let Render { radiance, albedo, .. } = render;
     let pixels = radiance.pixels();
+    let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)));
     let per_octave = STEPS as f32 / std::f32::consts::LN_2;
     let middle = STEPS * OCTAVES;
-    let mut counts = vec![0u32; 2 * middle + 1];
-    for at in (0..pixels).step_by(step_through(pixels, radiance.width)) {
-        let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
+    let none = || vec![0u32; 2 * middle + 1];
+    let count = |mut counts: Vec<u32>, at: usize| {
+        let [light, white] = [light, white].map(|planes| planes.map(|plane| plane[at]));
         let sums = [light, white].map(|colours| colours.iter().sum::<f32>());
         if sums.into_iter().all(|sum| sum > f32::MIN_POSITIVE) && equals(light, white, sums[0] / sums[1]) {
             let step = (ln(sums[0] / sums[1]) * per_octave).round() + middle as f32;
@@ -61,7 +67,14 @@ pub fn film_exposure(render: &Render) -> f32 {
                 *count += 1;
             }
         }
-    }
+        counts
+    };
+    let plus = |mut counts: Vec<u32>, others: Vec<u32>| {
+        counts.iter_mut().zip(others).for_each(|(count, other)| *count += other);
+        counts
+    };
+    let looked_at = (0..pixels).into_par_iter().step_by(step_through(pixels, radiance.width));
+    let counts = looked_at.with_min_len(COUNTED_AT_ONCE).fold(none, count).reduce(none, plus);
     let is_peak = |step: usize| {
         let around = [step - 3, step - 2, step + 2, step + 3].map(|step| counts[step]);
         let usual = around.iter().sum::<u32>() as f32 / around.len() as f32;
@@ -118,18 +131,18 @@ impl<'a> Seen<'a> {
 }
 
 impl Seen<'_> {
-    /// Whether a pixel has the brightness of its albedo.
-    fn equals_albedo(&self, at: usize) -> bool {
-        let [light, white] =
-            [self.radiance, self.albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)[at]));
-        equals(light, white, self.film)
-    }
-
     /// Whether a frame is nothing but light that is seen directly.
     pub fn is_all(&self) -> bool {
-        let pixels = self.radiance.pixels();
-        let most = (UNLIKE * pixels as f64) as usize;
-        (0..pixels).filter(|at| !self.equals_albedo(*at)).take(most + 1).count() <= most
+        let most = (UNLIKE * self.radiance.pixels() as f64) as usize;
+        let unlike = AtomicUsize::new(0);
+        // Most frames are told by their first rows.
+        (0..self.radiance.height).into_par_iter().all(|y| {
+            let [light, white] = [self.radiance, self.albedo].map(|planes| planes.rows(y));
+            let colours = |planes: [&[f32]; 3], x: usize| planes.map(|row| row[x]);
+            let differs = |x: &usize| !equals(colours(light, *x), colours(white, *x), self.film);
+            let found = (0..self.radiance.width).filter(differs).count();
+            unlike.fetch_add(found, Ordering::Relaxed) + found <= most
+        })
     }
 
     /// Finds in which pixels of a row light is seen directly, as that of their neighbours is. Pixels beyond the frame

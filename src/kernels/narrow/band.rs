@@ -8,11 +8,11 @@ use crate::kernels::{
     simd::{Kernel, Simd},
 };
 
-/// A pointer that tasks share to write disjoint rows of one operand.
+/// A pointer that tasks share to write disjoint pixels of one operand.
 #[derive(Clone, Copy)]
 pub struct SharedWide(pub *mut Wide);
 
-// SAFETY: every task writes its own rows, so no two ever touch the same value.
+// SAFETY: every task writes its own pixels, so no two ever touch the same value.
 unsafe impl Send for SharedWide {}
 // SAFETY: as above.
 unsafe impl Sync for SharedWide {}
@@ -25,7 +25,7 @@ pub enum Target {
     Planes(Unpacked),
 }
 
-/// The work of one task: some rows of all output planes of one image.
+/// The work of one task: some rows, or a part of each, of all output planes of one image.
 pub struct Band<'a> {
     pub engine: Engine,
     pub grid: Grid,
@@ -48,13 +48,12 @@ pub struct Band<'a> {
     pub target: Target,
     pub n: usize,
     pub rows: (usize, usize),
+    pub columns: (usize, usize),
 }
 
 impl Kernel for Band<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let grid = self.grid;
-        let (first, end) = (grid.row(self.rows.0), grid.row(self.rows.1 - 1) + grid.w);
         let phase_rows = self.phases[0].len() * LANES;
         let plane_rows = self.phases.len() * phase_rows;
         let mut sums = Sums::default();
@@ -62,9 +61,10 @@ impl Kernel for Band<'_> {
             let outputs = (self.out.planes() - plane).min(2);
             for (phase, terms) in self.phases.iter().enumerate() {
                 let weights = self.weights[plane * plane_rows + phase * phase_rows..].as_ptr();
-                for position in (first..end).step_by(CHUNK) {
+                let chunks = |(first, end): (usize, usize)| (first..end).step_by(CHUNK).map(move |at| (at, end));
+                for (position, end) in self.runs().flat_map(chunks) {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
-                    // reach, and runs this inside `ready`; tasks own disjoint rows.
+                    // reach, and runs this inside `ready`; tasks own disjoint pixels.
                     unsafe {
                         let product = Product {
                             terms,
@@ -90,10 +90,17 @@ impl Kernel for Band<'_> {
 }
 
 impl Band<'_> {
+    /// The positions of the pixels: those of whole rows as one run with the borders between them, others row by row.
+    fn runs(&self) -> impl Iterator<Item = (usize, usize)> {
+        let (grid, (top, bottom), (left, right)) = (self.grid, self.rows, self.columns);
+        let rows = if right - left == grid.w { bottom - top } else { 1 };
+        (top..bottom).step_by(rows).map(move |y| (grid.row(y) + left, grid.row(y + rows - 1) + right))
+    }
+
     /// Finishes the sums of positions `from..end` and stores those that are pixels.
     ///
     /// # Safety
-    /// No other task writes these rows.
+    /// No other task writes these pixels.
     #[inline(always)]
     pub unsafe fn store<S: Simd>(
         &self,
@@ -125,7 +132,7 @@ impl Band<'_> {
                     for o in 0..outputs {
                         let row = self.out.row(self.n, plane + o, row) + phase % spread;
                         for (i, sum) in sums[o].iter().enumerate() {
-                            // SAFETY: the pixels lie inside the row, which is this task's.
+                            // SAFETY: the pixels lie inside the row, and are this task's.
                             unsafe {
                                 let block = blocks.at(row + (column + i) * spread);
                                 let add = if accumulate { simd.load(block) } else { finish[o].bias };

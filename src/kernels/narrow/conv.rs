@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use super::{
     Engine, FITTING_STEPS, Format, GROUP, LANES, Operand, Steps, Term, WEIGHT_STEPS, WORD, Wide,
     band::{Band, SharedWide, Target},
+    engine::CELLS,
     winograd::{self, Cells, FITTING_SUM, Part},
 };
 use crate::kernels::{
@@ -384,10 +385,14 @@ pub fn convolve(
         if by_cells { vec![places(n)] } else { (0..spread * spread).map(|phase| terms(n, phase)).collect() }
     };
     let phases: Vec<Vec<Vec<Term>>> = (0..out.n).map(phases_of).collect();
-    // Bands of rows keep every thread busy and their input in the second-level cache.
-    let bands = (16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
+    // Bands of rows keep their input in the second-level cache. Where an image has too few rows to keep every thread
+    // busy, they are cut into parts.
+    let tasks = (2 * rayon::current_num_threads()).max(16).div_ceil(out.n.max(1));
+    let bands = tasks.max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands).next_multiple_of(if by_cells { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
+    let part = grid.w.div_ceil(tasks.div_ceil(bands)).next_multiple_of(SIDE * CELLS);
+    let parts = grid.w.div_ceil(part);
     let (target, step) = match output {
         Output::F32(view) => (Target::F32(Shared(view.data.as_mut_ptr())), 1.0),
         Output::Narrow(operand) => {
@@ -415,10 +420,8 @@ pub fn convolve(
         .collect();
     let (scale, bias) = (in_steps(&weights.scale), in_steps(&bias));
     let tier = Tier::detect();
-    (0..out.n * bands).into_par_iter().for_each(|task| {
-        let y0 = task % bands * band;
-        let rows = (y0, grid.h.min(y0 + band));
-        let n = task / bands;
+    (0..out.n * bands * parts).into_par_iter().for_each(|task| {
+        let (x0, y0, n) = (task % parts * part, task / parts % bands * band, task / (parts * bands));
         let band = Band {
             engine,
             grid,
@@ -433,7 +436,8 @@ pub fn convolve(
             out,
             target,
             n,
-            rows,
+            rows: (y0, grid.h.min(y0 + band)),
+            columns: (x0, grid.w.min(x0 + part)),
         };
         engine.ready(|| {
             if by_cells {

@@ -76,7 +76,7 @@ pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i1
     rows
 }
 
-/// The work of one task by cells: some rows of all output planes of one image.
+/// The work of one task by cells: some rows, or a part of each, of all output planes of one image.
 pub struct Cells<'a> {
     pub band: Band<'a>,
     pub parts: &'a [Part],
@@ -99,8 +99,8 @@ impl Kernel for Cells<'_> {
             // anything, so the border's row is read in their place.
             let starts: [usize; PATCH] =
                 std::array::from_fn(|i| grid.row((y + i).min(grid.h + 1)) - grid.stride() - 1);
-            for x in (0..grid.w).step_by(SIDE * CELLS) {
-                let cells = (grid.w - x).div_ceil(SIDE).min(CELLS);
+            for x in (band.columns.0..band.columns.1).step_by(SIDE * CELLS) {
+                let cells = (band.columns.1 - x).div_ceil(SIDE).min(CELLS);
                 for (p, part) in parts.iter().enumerate() {
                     for half in 0..part.count.div_ceil(LANES) {
                         let lane = part.half * WIDE + half * LANES;
@@ -143,8 +143,8 @@ impl Kernel for Cells<'_> {
                         let column = x + SIDE * first;
                         for (row, sums) in (y..band.rows.1).zip(&sums) {
                             let from = grid.row(row) + column;
-                            let end = from + (grid.w - column).min(CHUNK);
-                            // SAFETY: `convolve` ran this as it does a band; tasks own disjoint rows.
+                            let end = from + (band.columns.1 - column).min(CHUNK);
+                            // SAFETY: `convolve` ran this as it does a band; tasks own disjoint pixels.
                             unsafe { band.store(simd, sums, (plane, outputs), 0, (from, end)) }
                         }
                     }
