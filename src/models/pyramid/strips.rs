@@ -31,11 +31,11 @@ use crate::{
     planes::Planes,
 };
 
-/// Pixels of a band across all strips for [`FEW`] threads: enough to keep them busy, and few enough for an 8K frame to
-/// fit in 3 GiB. More threads get more, as far as [`MOST`] times as many: they would wait for each other too often.
+/// Pixels of a band across all strips: enough to keep [`FEW`] threads busy, and few enough for an 8K frame to fit in
+/// 3 GiB. More threads get twice as many, as they would wait for each other too often. Still larger bands outgrow the
+/// memory that is recycled.
 const BAND_PIXELS: usize = 9 << 14;
 const FEW: usize = 8;
-const MOST: usize = 4;
 
 /// Columns of the widest strip: few enough for bands of few rows to fit in little memory, while strips, which
 /// overlap, take about a tenth longer at most.
@@ -200,8 +200,8 @@ impl Cut {
     /// Cuts the columns of a strip. `rows` are those of a band, if the user chose a number.
     fn new(passes: &PassSet, columns: Range<usize>, rows: Option<usize>) -> Self {
         let [width, height] = [passes.width, passes.height].map(|n| n.next_multiple_of(MULTIPLE));
-        let times = rayon::current_num_threads().div_ceil(FEW).min(MOST);
-        let rows = (rows.unwrap_or(times * BAND_PIXELS / width) / MULTIPLE * MULTIPLE).max(MULTIPLE);
+        let pixels = if rayon::current_num_threads() > FEW { 2 * BAND_PIXELS } else { BAND_PIXELS };
+        let rows = (rows.unwrap_or(pixels / width) / MULTIPLE * MULTIPLE).max(MULTIPLE);
         Self { columns, width, height, unpadded: passes.height, rows }
     }
 
