@@ -174,7 +174,9 @@ const COPIED: usize = 64 << 10;
 pub fn copy<T: Copy + Send + Sync>(into: &mut [T], from: &[T]) {
     assert_eq!(into.len(), from.len(), "as many values");
     let piece = COPIED / size_of::<T>();
-    into.par_chunks_mut(piece).zip(from.par_chunks(piece)).for_each(|(into, from)| into.copy_from_slice(from));
+    into.par_chunks_mut(piece)
+        .zip(from.par_chunks(piece))
+        .for_each(|(into, from)| into.copy_from_slice(from));
 }
 
 /// The values of planar images.

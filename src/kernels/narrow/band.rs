@@ -61,7 +61,8 @@ impl Kernel for Band<'_> {
             let outputs = (self.out.planes() - plane).min(2);
             for (phase, terms) in self.phases.iter().enumerate() {
                 let weights = self.weights[plane * plane_rows + phase * phase_rows..].as_ptr();
-                let chunks = |(first, end): (usize, usize)| (first..end).step_by(CHUNK).map(move |at| (at, end));
+                let chunks =
+                    |(first, end): (usize, usize)| (first..end).step_by(CHUNK).map(move |at| (at, end));
                 for (position, end) in self.runs().flat_map(chunks) {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint pixels.
