@@ -36,6 +36,9 @@ pub const SAME: (f32, f32) = (0.004, 1e-6);
 const STEPS: usize = 128;
 const OCTAVES: usize = 20;
 
+/// The step of a quotient of 1.
+const MIDDLE: usize = STEPS * OCTAVES;
+
 /// An exposure needs at least [`LEAST_EXPOSED`] pixels, and [`PEAK`] times as many as its second and third
 /// neighbours have on average. Quotients of surfaces that are only lit are spread by noise and by shape.
 const LEAST_EXPOSED: u32 = 16;
@@ -55,15 +58,18 @@ pub fn film_exposure(render: &Render) -> f32 {
     let Render { radiance, albedo, .. } = render;
     let pixels = radiance.pixels();
     let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)));
-    let per_octave = STEPS as f32 / std::f32::consts::LN_2;
-    let middle = STEPS * OCTAVES;
-    let none = || vec![0u32; 2 * middle + 1];
-    let count = |mut counts: Vec<u32>, at: usize| {
-        let [light, white] = [light, white].map(|planes| planes.map(|plane| plane[at]));
-        let sums = [light, white].map(|colours| colours.iter().sum::<f32>());
-        if sums.into_iter().all(|sum| sum > f32::MIN_POSITIVE) && equals(light, white, sums[0] / sums[1]) {
-            let step = (ln(sums[0] / sums[1]) * per_octave).round() + middle as f32;
-            if let Some(count) = counts.get_mut(step as usize) {
+    let step = step_through(pixels, radiance.width);
+    let looked_at = pixels.div_ceil(step);
+    let none = || vec![0u32; 2 * MIDDLE + 1];
+    let count = |mut counts: Vec<u32>, part: usize| {
+        let part = part * COUNTED_AT_ONCE..looked_at.min((part + 1) * COUNTED_AT_ONCE);
+        let gathered = |plane: &[f32]| part.clone().map(|at| plane[at * step]).collect::<Vec<f32>>();
+        let [light, white] = [light, white].map(|planes| planes.map(gathered));
+        let mut quotients = vec![0.0; part.len()];
+        let [light, white] = [&light, &white].map(|planes| planes.each_ref().map(|values| &values[..]));
+        vectorised::run(Quotients { light, white, quotients: &mut quotients });
+        for quotient in quotients {
+            if let Some(count) = counts.get_mut(quotient as usize) {
                 *count += 1;
             }
         }
@@ -73,22 +79,49 @@ pub fn film_exposure(render: &Render) -> f32 {
         counts.iter_mut().zip(others).for_each(|(count, other)| *count += other);
         counts
     };
-    let looked_at = (0..pixels).into_par_iter().step_by(step_through(pixels, radiance.width));
-    let counts = looked_at.with_min_len(COUNTED_AT_ONCE).fold(none, count).reduce(none, plus);
+    let parts = (0..looked_at.div_ceil(COUNTED_AT_ONCE)).into_par_iter();
+    let counts = parts.fold(none, count).reduce(none, plus);
     let is_peak = |step: usize| {
         let around = [step - 3, step - 2, step + 2, step + 3].map(|step| counts[step]);
         let usual = around.iter().sum::<u32>() as f32 / around.len() as f32;
         counts[step] >= LEAST_EXPOSED && counts[step] as f32 > PEAK * usual
     };
-    if is_peak(middle) {
+    if is_peak(MIDDLE) {
         return 1.0;
     }
     let peaks = (3..counts.len() - 3).filter(|step| is_peak(*step));
-    let highest = peaks.max_by_key(|step| counts[*step]).unwrap_or(middle);
+    let highest = peaks.max_by_key(|step| counts[*step]).unwrap_or(MIDDLE);
     // Whole octaves apart from the rest, so that they are exact.
-    let steps = highest as i32 - middle as i32;
+    let steps = highest as i32 - MIDDLE as i32;
     let (octave, rest) = (steps.div_euclid(STEPS as i32), steps.rem_euclid(STEPS as i32));
     (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
+}
+
+/// Writes to `quotients` the step of each pixel's quotient of light and albedo, infinity where that of its colours
+/// differs.
+struct Quotients<'a> {
+    light: [&'a [f32]; 3],
+    white: [&'a [f32]; 3],
+    quotients: &'a mut [f32],
+}
+
+impl Vectorised for Quotients<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { light, white, quotients } = self;
+        let per_octave = STEPS as f32 / std::f32::consts::LN_2;
+        let pixels = quotients.len();
+        let [[r, g, b], white] = [light, white].map(|planes| planes.map(|plane| &plane[..pixels]));
+        for (i, step) in quotients.iter_mut().enumerate() {
+            let (light, white) = ([r[i], g[i], b[i]], [white[0][i], white[1][i], white[2][i]]);
+            let [lit, whole] = [light, white].map(|[r, g, b]| r + g + b);
+            let quotient = lit / whole;
+            let is_light = (lit > f32::MIN_POSITIVE) & (whole > f32::MIN_POSITIVE);
+            let is_seen = is_light & equals(light, white, quotient);
+            let rounded = (ln(quotient) * per_octave).round() + MIDDLE as f32;
+            *step = if is_seen { rounded } else { f32::INFINITY };
+        }
+    }
 }
 
 /// The distance of the pixels that are counted of a frame. It has no factor in common with the frame's width: otherwise only
