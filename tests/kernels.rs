@@ -486,13 +486,14 @@ proptest! {
 }
 
 #[test]
-fn planes_of_few_rows_are_cut_into_parts() {
+fn planes_of_few_rows_are_cut_into_pieces() {
     for geometry in [Geometry::Same(1), Geometry::Same(3), Geometry::Transposed] {
         check_layer(geometry, Shape::new(1, 40, 3, 150), 24, 36, 11);
         for engine in Engine::available() {
             check_int8(engine, geometry, Shape::new(1, 40, 3, 150), 24, 36, 12);
         }
     }
+    check_layer(Geometry::Same(5), Shape { pad: 2, ..Shape::new(2, 40, 3, 150) }, 24, 36, 13);
 }
 
 /// The same once more on each tier: what rounds to 8 bits chooses the fastest itself.

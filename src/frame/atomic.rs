@@ -101,12 +101,23 @@ pub fn prepare_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Keeps other runs of demc out of a folder until it is dropped.
+pub struct Alone(File);
+
+impl Drop for Alone {
+    fn drop(&mut self) {
+        // Closing the file alone would leave the lock to processes that other threads are just starting: each holds a
+        // copy of every open file until its program begins.
+        let _ = self.0.unlock();
+    }
+}
+
 /// Keeps other runs of demc that ask for this out of a folder for results, until what is returned is dropped. Where the
 /// disk knows no locks nothing is kept out.
 ///
 /// # Errors
 /// Another run works there, or no file can be made.
-pub fn alone_in(folder: &Path) -> Result<File> {
+pub fn alone_in(folder: &Path) -> Result<Alone> {
     let path = folder.join(".lock");
     let file = File::create(&path).map_err(Error::io("write", &path))?;
     match file.try_lock() {
@@ -114,7 +125,7 @@ pub fn alone_in(folder: &Path) -> Result<File> {
             folder,
             "another run of demc works in this folder; wait for it, or choose another --out",
         )),
-        _ => Ok(file),
+        _ => Ok(Alone(file)),
     }
 }
 
@@ -152,7 +163,11 @@ fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
 
 #[cfg(test)]
 mod tests {
-    use std::time::SystemTime;
+    use std::{
+        process::Command,
+        sync::atomic::{AtomicBool, Ordering},
+        time::SystemTime,
+    };
 
     use super::*;
 
@@ -163,6 +178,23 @@ mod tests {
             .collect();
         names.sort();
         names
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_folder_is_free_at_once_whatever_processes_start_meanwhile() {
+        let folder = tempfile::tempdir().unwrap();
+        let done = AtomicBool::new(false);
+        std::thread::scope(|threads| {
+            threads.spawn(|| {
+                while !done.load(Ordering::Relaxed) {
+                    Command::new("true").status().unwrap();
+                }
+            });
+            let refused = (0..2000).filter(|_| alone_in(folder.path()).is_err()).count();
+            done.store(true, Ordering::Relaxed);
+            assert_eq!(refused, 0);
+        });
     }
 
     #[test]

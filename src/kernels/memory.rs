@@ -33,13 +33,18 @@ impl<T: Clone> Pool<T> {
 
     /// Memory as [`Pool::take`] gives it, all of it `value`; none where the system has no room for new memory.
     pub fn try_filled(&'static self, len: usize, value: T) -> Option<Pooled<T>> {
-        let mut data = self.take_free(len).unwrap_or_default();
-        if data.is_empty() {
-            data.try_reserve_exact(len).ok()?;
-            data.resize(len, value);
-        } else {
-            data[..len].fill(value);
-        }
+        let data = match self.take_free(len) {
+            Some(mut free) => {
+                free[..len].fill(value);
+                free
+            }
+            None => {
+                let mut new = Vec::new();
+                new.try_reserve_exact(len).ok()?;
+                new.resize(len, value);
+                new
+            }
+        };
         Some(Pooled { len, data, pool: Some(self) })
     }
 

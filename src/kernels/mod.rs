@@ -190,8 +190,8 @@ pub fn thirds<T>(values: &mut [T]) -> [&mut [T]; 3] {
 #[derive(Clone, Copy)]
 struct Shared(*mut Block);
 
-// SAFETY: every kernel that shares one gives each task its own rows of its own planes, so no two
-// tasks ever touch the same block.
+// SAFETY: every kernel that shares one gives each task its own pixels or planes, so no two tasks
+// ever touch the same block.
 unsafe impl Send for Shared {}
 // SAFETY: as above.
 unsafe impl Sync for Shared {}

@@ -58,18 +58,18 @@ pub fn film_exposure(render: &Render) -> f32 {
     let Render { radiance, albedo, .. } = render;
     let pixels = radiance.pixels();
     let [light, white] = [radiance, albedo].map(|planes| [0, 1, 2].map(|c| planes.channel(c)));
-    let step = step_through(pixels, radiance.width);
-    let looked_at = pixels.div_ceil(step);
+    let apart = distance(pixels, radiance.width);
+    let looked_at = pixels.div_ceil(apart);
     let none = || vec![0u32; 2 * MIDDLE + 1];
     let count = |mut counts: Vec<u32>, part: usize| {
         let part = part * COUNTED_AT_ONCE..looked_at.min((part + 1) * COUNTED_AT_ONCE);
-        let gathered = |plane: &[f32]| part.clone().map(|at| plane[at * step]).collect::<Vec<f32>>();
+        let gathered = |plane: &[f32]| part.clone().map(|at| plane[at * apart]).collect::<Vec<f32>>();
         let [light, white] = [light, white].map(|planes| planes.map(gathered));
-        let mut quotients = vec![0.0; part.len()];
+        let mut steps = vec![0.0; part.len()];
         let [light, white] = [&light, &white].map(|planes| planes.each_ref().map(|values| &values[..]));
-        vectorised::run(Quotients { light, white, quotients: &mut quotients });
-        for quotient in quotients {
-            if let Some(count) = counts.get_mut(quotient as usize) {
+        vectorised::run(StepsOf { light, white, steps: &mut steps });
+        for step in steps {
+            if let Some(count) = counts.get_mut(step as usize) {
                 *count += 1;
             }
         }
@@ -97,22 +97,22 @@ pub fn film_exposure(render: &Render) -> f32 {
     (rest as f32 / STEPS as f32).exp2() * 2f32.powi(octave)
 }
 
-/// Writes to `quotients` the step of each pixel's quotient of light and albedo, infinity where that of its colours
-/// differs.
-struct Quotients<'a> {
+/// Writes to `steps` the step of each pixel's quotient of light and albedo: infinity where its colours have different
+/// quotients, or next to no light.
+struct StepsOf<'a> {
     light: [&'a [f32]; 3],
     white: [&'a [f32]; 3],
-    quotients: &'a mut [f32],
+    steps: &'a mut [f32],
 }
 
-impl Vectorised for Quotients<'_> {
+impl Vectorised for StepsOf<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self { light, white, quotients } = self;
+        let Self { light, white, steps } = self;
         let per_octave = STEPS as f32 / std::f32::consts::LN_2;
-        let pixels = quotients.len();
+        let pixels = steps.len();
         let [[r, g, b], white] = [light, white].map(|planes| planes.map(|plane| &plane[..pixels]));
-        for (i, step) in quotients.iter_mut().enumerate() {
+        for (i, step) in steps.iter_mut().enumerate() {
             let (light, white) = ([r[i], g[i], b[i]], [white[0][i], white[1][i], white[2][i]]);
             let [lit, whole] = [light, white].map(|[r, g, b]| r + g + b);
             let quotient = lit / whole;
@@ -126,7 +126,7 @@ impl Vectorised for Quotients<'_> {
 
 /// The distance of the pixels that are counted of a frame. It has no factor in common with the frame's width: otherwise only
 /// some columns would ever be looked at, and what stands between them would not count.
-fn step_through(pixels: usize, width: usize) -> usize {
+fn distance(pixels: usize, width: usize) -> usize {
     let divisor = |a: usize, b: usize| {
         let (mut a, mut b) = (a, b);
         while b > 0 {
@@ -168,7 +168,7 @@ impl Seen<'_> {
     pub fn is_all(&self) -> bool {
         let most = (UNLIKE * self.radiance.pixels() as f64) as usize;
         let unlike = AtomicUsize::new(0);
-        // Most frames are told by their first rows.
+        // No more rows are looked at once too many pixels differ: in most frames after a few.
         (0..self.radiance.height).into_par_iter().all(|y| {
             let [light, white] = [self.radiance, self.albedo].map(|planes| planes.rows(y));
             let colours = |planes: [&[f32]; 3], x: usize| planes.map(|row| row[x]);

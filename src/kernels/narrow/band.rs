@@ -1,4 +1,4 @@
-//! The work of one task of a narrow convolution: the sums of some rows, finished and stored.
+//! The work of one task of a narrow convolution: the sums of some rows, or of a piece of each, finished and stored.
 
 use super::{CHUNK, Engine, Format, Grid, LANES, Sums, Term, Wide, engine::Product};
 use crate::kernels::{
@@ -25,7 +25,7 @@ pub enum Target {
     Planes(Unpacked),
 }
 
-/// The work of one task: some rows, or a part of each, of all output planes of one image.
+/// The work of one task: some rows, or a piece of each, of all output planes of one image.
 pub struct Band<'a> {
     pub engine: Engine,
     pub grid: Grid,

@@ -385,14 +385,14 @@ pub fn convolve(
         if by_cells { vec![places(n)] } else { (0..spread * spread).map(|phase| terms(n, phase)).collect() }
     };
     let phases: Vec<Vec<Vec<Term>>> = (0..out.n).map(phases_of).collect();
-    // Bands of rows keep their input in the second-level cache. Where an image has too few rows to keep every thread
-    // busy, they are cut into parts.
-    let tasks = (2 * rayon::current_num_threads()).max(16).div_ceil(out.n.max(1));
-    let bands = tasks.max(grid.h * grid.w / 4096).clamp(1, grid.h);
+    // Bands of some 4096 pixels keep their input in the second-level cache. Where an image has too few rows for two tasks
+    // a thread, its bands are cut into pieces from left to right, in steps of the columns that are computed at once.
+    let tasks = (2 * rayon::current_num_threads()).div_ceil(out.n.max(1));
+    let bands = tasks.max(16 / out.n.max(1)).max(grid.h * grid.w / 4096).clamp(1, grid.h);
     let band = grid.h.div_ceil(bands).next_multiple_of(if by_cells { SIDE } else { 1 });
     let bands = grid.h.div_ceil(band);
-    let part = grid.w.div_ceil(tasks.div_ceil(bands)).next_multiple_of(SIDE * CELLS);
-    let parts = grid.w.div_ceil(part);
+    let piece = grid.w.div_ceil(tasks.div_ceil(bands)).max(1).next_multiple_of(SIDE * CELLS);
+    let pieces = grid.w.div_ceil(piece);
     let (target, step) = match output {
         Output::F32(view) => (Target::F32(Shared(view.data.as_mut_ptr())), 1.0),
         Output::Narrow(operand) => {
@@ -420,8 +420,8 @@ pub fn convolve(
         .collect();
     let (scale, bias) = (in_steps(&weights.scale), in_steps(&bias));
     let tier = Tier::detect();
-    (0..out.n * bands * parts).into_par_iter().for_each(|task| {
-        let (x0, y0, n) = (task % parts * part, task / parts % bands * band, task / (parts * bands));
+    (0..out.n * bands * pieces).into_par_iter().for_each(|task| {
+        let (x0, y0, n) = (task % pieces * piece, task / pieces % bands * band, task / (pieces * bands));
         let band = Band {
             engine,
             grid,
@@ -437,7 +437,7 @@ pub fn convolve(
             target,
             n,
             rows: (y0, grid.h.min(y0 + band)),
-            columns: (x0, grid.w.min(x0 + part)),
+            columns: (x0, grid.w.min(x0 + piece)),
         };
         engine.ready(|| {
             if by_cells {

@@ -76,7 +76,7 @@ pub fn pack(parts: &[Part], outputs: usize, kernel: impl Fn(usize, usize) -> [i1
     rows
 }
 
-/// The work of one task by cells: some rows, or a part of each, of all output planes of one image.
+/// The work of one task by cells: some rows, or a piece of each, of all output planes of one image.
 pub struct Cells<'a> {
     pub band: Band<'a>,
     pub parts: &'a [Part],
