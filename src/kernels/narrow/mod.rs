@@ -5,8 +5,8 @@
 //! A [`Wide`] is 32 or 64 consecutive channels of one pixel. A plane of them is one long row of positions,
 //! borders included, so that a tap is a fixed offset and a chunk of 32 positions may run over the end of a
 //! row. What a chunk computes for border positions is dropped. So levels with few columns are as fast as
-//! those with many, but where rows are cut into pieces, so that more threads have some. Where products are slow, 3x3 convolutions are computed by cells of outputs, which need
-//! fewer products (`winograd.rs`).
+//! those with many, but where rows are cut into pieces, so that more threads have some. Where products are slow,
+//! 3x3 convolutions are computed by cells of outputs, which need fewer products (`winograd.rs`).
 //!
 //! [`Engine`] holds all that depends on the processor: matrix products and conversions. Its portable form is
 //! the oracle of the others.

@@ -32,8 +32,8 @@ use crate::{
 };
 
 /// Pixels of a band across all strips: enough to keep [`FEW`] threads busy, and few enough for an 8K frame to fit in
-/// 3 GiB with them. More threads get twice as many, as they would wait for each other too often. Still larger bands outgrow the
-/// memory that is recycled.
+/// 3 GiB with them. More threads get twice as many, as they would wait for each other too often. Still larger bands
+/// outgrow the memory that is recycled.
 const BAND_PIXELS: usize = 9 << 14;
 const FEW: usize = 8;
 
