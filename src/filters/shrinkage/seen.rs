@@ -66,7 +66,6 @@ pub fn film_exposure(render: &Render) -> f32 {
         let gathered = |plane: &[f32]| part.clone().map(|at| plane[at * apart]).collect::<Vec<f32>>();
         let [light, white] = [light, white].map(|planes| planes.map(gathered));
         let mut steps = vec![0.0; part.len()];
-        let [light, white] = [&light, &white].map(|planes| planes.each_ref().map(|values| &values[..]));
         vectorised::run(StepsOf { light, white, steps: &mut steps });
         for step in steps {
             if let Some(count) = counts.get_mut(step as usize) {
@@ -100,8 +99,8 @@ pub fn film_exposure(render: &Render) -> f32 {
 /// Writes to `steps` the step of each pixel's quotient of light and albedo: infinity where its colours have different
 /// quotients, or next to no light.
 struct StepsOf<'a> {
-    light: [&'a [f32]; 3],
-    white: [&'a [f32]; 3],
+    light: [Vec<f32>; 3],
+    white: [Vec<f32>; 3],
     steps: &'a mut [f32],
 }
 
@@ -111,7 +110,8 @@ impl Vectorised for StepsOf<'_> {
         let Self { light, white, steps } = self;
         let per_octave = STEPS as f32 / std::f32::consts::LN_2;
         let pixels = steps.len();
-        let [[r, g, b], white] = [light, white].map(|planes| planes.map(|plane| &plane[..pixels]));
+        let [[r, g, b], white] =
+            [&light, &white].map(|planes| planes.each_ref().map(|values| &values[..pixels]));
         for (i, step) in steps.iter_mut().enumerate() {
             let (light, white) = ([r[i], g[i], b[i]], [white[0][i], white[1][i], white[2][i]]);
             let [lit, whole] = [light, white].map(|[r, g, b]| r + g + b);

@@ -61,9 +61,7 @@ impl Kernel for Band<'_> {
             let outputs = (self.out.planes() - plane).min(2);
             for (phase, terms) in self.phases.iter().enumerate() {
                 let weights = self.weights[plane * plane_rows + phase * phase_rows..].as_ptr();
-                let chunks =
-                    |(first, end): (usize, usize)| (first..end).step_by(CHUNK).map(move |at| (at, end));
-                for (position, end) in self.runs().flat_map(chunks) {
+                for (position, end) in self.chunks() {
                     // SAFETY: `convolve` made the terms from operands whose borders and slack cover their
                     // reach, and runs this inside `ready`; tasks own disjoint pixels.
                     unsafe {
@@ -76,13 +74,7 @@ impl Kernel for Band<'_> {
                             plane: plane_rows,
                         };
                         self.engine.multiply(self.format, product, &mut sums);
-                        self.store(
-                            simd,
-                            &sums,
-                            (plane, outputs),
-                            phase,
-                            (position, end.min(position + CHUNK)),
-                        );
+                        self.store(simd, &sums, (plane, outputs), phase, (position, end));
                     }
                 }
             }
@@ -91,11 +83,15 @@ impl Kernel for Band<'_> {
 }
 
 impl Band<'_> {
-    /// The positions of the pixels: those of whole rows as one run with the borders between them, others row by row.
-    fn runs(&self) -> impl Iterator<Item = (usize, usize)> {
+    /// The positions of the pixels, at most [`CHUNK`] at a time: those of whole rows are one run, with the borders
+    /// between them, others go row by row.
+    fn chunks(&self) -> impl Iterator<Item = (usize, usize)> {
         let (grid, (top, bottom), (left, right)) = (self.grid, self.rows, self.columns);
         let rows = if right - left == grid.w { bottom - top } else { 1 };
-        (top..bottom).step_by(rows).map(move |y| (grid.row(y) + left, grid.row(y + rows - 1) + right))
+        (top..bottom).step_by(rows).flat_map(move |y| {
+            let (first, end) = (grid.row(y) + left, grid.row(y + rows - 1) + right);
+            (first..end).step_by(CHUNK).map(move |at| (at, end.min(at + CHUNK)))
+        })
     }
 
     /// Finishes the sums of positions `from..end` and stores those that are pixels.
