@@ -86,7 +86,7 @@ fn write(
     let radiance = frame.require(Pass::Combined, "training")?;
     let albedo = frame.require(Pass::DenoisingAlbedo, "training")?;
     let exposure = features::exposure(radiance);
-    let render = Render { radiance, albedo, exposure, samples: Some(spp), empty: None };
+    let render = Render { radiance, albedo, exposure, samples: Some(spp) };
     let features = shrinkage::features(denoised, &render);
     let (mut result, mut shares) = (denoised.clone(), Planes::new(1, denoised.width, denoised.height));
     shrinkage::shrink(&mut result, &render, Some(&mut shares));

@@ -349,7 +349,7 @@ fn demc_l_is_the_mean_of_two_looks_whose_squares_lie_apart() {
     let [radiance, albedo] =
         [Pass::Combined, Pass::DenoisingAlbedo].map(|p| frame.require(p, "test").unwrap());
     let (exposure, samples) = (features::exposure(radiance), frame.samples);
-    shrink(&mut mean, &Render { radiance, albedo, exposure, samples, empty: None }, None);
+    shrink(&mut mean, &Render { radiance, albedo, exposure, samples }, None);
     assert_eq!(twice.denoise(&Shot::new(frame.clone())).unwrap(), mean);
 }
 

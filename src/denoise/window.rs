@@ -25,7 +25,7 @@ use crate::{
     filters::{
         agreement::{self, Guides, Look},
         motion::{Direction, Flow},
-        shrinkage::Empty,
+        shrinkage::{Alpha, Empty},
         structure::{self, Sight},
         temporal::{self, Link, likeness},
     },
@@ -308,8 +308,10 @@ impl<'a> Window<'a> {
         let results: Vec<(&Planes, &Link)> =
             others.iter().map(|other| (other.moment.result(), &other.link)).collect();
         let mut blended = own.inside(temporal::blend(own.result(), &radiance, own.exposure, &results));
-        if let Some(empty) = own.shot.passes.get(Pass::Alpha).and_then(|alpha| Empty::of(&radiance, alpha)) {
-            empty.clear(&mut blended);
+        let passes = &own.shot.passes;
+        if let Some(rendered) = passes.get(Pass::Alpha) {
+            let empty = Empty::of(&radiance, Alpha { rendered, denoised: None }, passes.samples);
+            empty.iter().for_each(|empty| empty.clear(&mut blended));
         }
         Ok(blended)
     }

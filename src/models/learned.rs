@@ -16,7 +16,7 @@ use crate::{
     features::{PREFILTERED_PASSES, exposure, guide_rows, tame_alike, with_stand_ins},
     filters::{
         coverage,
-        shrinkage::{Empty, Render, Shrinkage, take_back},
+        shrinkage::{Alpha, Empty, Render, Shrinkage, take_back},
     },
     nn::Precision,
     passes::{Pass, PassSet},
@@ -242,11 +242,7 @@ impl Learned {
         let radiance = passes.require(Pass::Combined, &self.name)?;
         let albedo = passes.require(Pass::DenoisingAlbedo, &self.name)?;
         let (exposure, samples) = (exposure(radiance), passes.samples);
-        let is_alpha = |along: &&Companion| along.kind == Kind::Share && along.planes.channels == 1;
-        let denoised_alpha = companions.iter().find(is_alpha).map(|along| &along.planes);
-        let alpha = denoised_alpha.or(passes.get(Pass::Alpha));
-        let empty = alpha.and_then(|alpha| Empty::of(radiance, alpha));
-        let render = Render { radiance, albedo, exposure, samples, empty };
+        let render = Render { radiance, albedo, exposure, samples };
         let size = (passes.width, passes.height);
         // Of such a frame, as a clear sky or a black frame, all that a network made would be taken back.
         let shrinkage = Shrinkage::of(&render);
@@ -256,6 +252,12 @@ impl Learned {
             return Ok((image, expects.then(|| ExpectedError::none(size))));
         }
         let mut image = self.looks(passes, companions, tile)?;
+        for Companion { planes, rendered, .. } in
+            companions.iter_mut().filter(|along| along.kind == Kind::Share)
+        {
+            coverage::take_back(planes, rendered, render.samples_or_guess());
+        }
+        let shrinkage = shrinkage.keeping(find_empty(radiance, passes, companions));
         let mut shares = (!companions.is_empty()).then(|| Planes::unwritten(1, size.0, size.1));
         let error = if expects {
             let squares = shrinkage.shrink_expecting(&mut image, shares.as_mut());
@@ -266,11 +268,8 @@ impl Learned {
         };
         for (companion, shares) in companions.iter_mut().zip(shares.iter().cycle()) {
             let rendered = std::mem::take(&mut companion.rendered);
-            match companion.kind {
-                Kind::Light | Kind::Colour => take_back(&mut companion.planes, &rendered, shares),
-                Kind::Share => {
-                    coverage::take_back(&mut companion.planes, &rendered, render.samples_or_guess())
-                }
+            if companion.kind != Kind::Share {
+                take_back(&mut companion.planes, &rendered, shares);
             }
         }
         Ok((image, error))
@@ -299,6 +298,18 @@ impl Learned {
         }
         Ok(image)
     }
+}
+
+/// Where nothing was met, as the frame's alpha tells, or an alpha that was denoised along with it, which is cleared there.
+fn find_empty(radiance: &Planes, passes: &PassSet, companions: &mut [Companion]) -> Option<Empty> {
+    if let Some(rendered) = passes.get(Pass::Alpha) {
+        return Empty::of(radiance, Alpha { rendered, denoised: None }, passes.samples);
+    }
+    let is_alpha = |along: &&mut Companion| along.kind == Kind::Share && along.planes.channels == 1;
+    let Companion { planes, rendered, .. } = companions.iter_mut().find(is_alpha)?;
+    let empty = Empty::of(radiance, Alpha { rendered, denoised: Some(planes) }, passes.samples)?;
+    empty.clear(planes);
+    Some(empty)
 }
 
 /// Replaces planes by the mean of two.

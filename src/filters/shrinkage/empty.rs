@@ -5,118 +5,168 @@
 
 use rayon::prelude::*;
 
+use super::grown;
 use crate::planes::Planes;
 
-/// Pixels in each direction that have to be empty as well. Nearer to things, samples may have missed them: of 32 crops at
-/// 4 samples, references had 1e-4 of their light at most where 7x7 pixels were empty, 2e-3 where 3x3 were.
-const REACH: usize = 3;
+/// A pixel is empty where this many samples in and around it met nothing, or where none in the 7x7 pixels around it met
+/// anything: nearer to things, samples may have missed them. Of 32 crops at 4 samples, references had 1e-4 of their light at most
+/// where 7x7 pixels were empty, 2e-3 where 3x3 were.
+const SAMPLES: u32 = 144;
+const FARTHEST: usize = 3;
 
-/// The pixels of a frame that are not empty, or are near one.
+/// Below this, denoised alpha is a trace as well, and a pixel is empty where its own samples met nothing; where they are
+/// fewer than [`OWN_SAMPLES`], those of the 3x3 pixels around it. At the rim of what is blurred by focus or motion, where
+/// samples are few and alpha is low but not zero, denoised alpha is above it.
+const TRACE: f32 = 5e-4;
+const OWN_SAMPLES: u32 = 64;
+
+/// The alpha of a frame, (1, H, W).
+#[derive(Clone, Copy)]
+pub struct Alpha<'a> {
+    /// As rendered.
+    pub rendered: &'a Planes,
+    /// Denoised with the light, where it is.
+    pub denoised: Option<&'a Planes>,
+}
+
+/// The empty pixels of a frame.
 pub struct Empty {
     width: usize,
-    height: usize,
-    /// Whether something was met in a pixel or at most [`REACH`] columns away.
-    met: Vec<bool>,
+    is_empty: Vec<bool>,
 }
 
 impl Empty {
-    /// Of radiance, (3, H, W), and alpha, (1, H, W); nothing where alpha is zero nowhere, or everywhere: programs fill in
-    /// an alpha that they do not know with zeros.
+    /// Of radiance, (3, H, W), alpha, and the number of samples of a pixel, if it is known; nothing where alpha is zero
+    /// nowhere, or everywhere: programs fill in an alpha that they do not know with zeros.
     ///
     /// # Panics
     /// If sizes differ.
-    pub fn of(radiance: &Planes, alpha: &Planes) -> Option<Self> {
-        let (width, height) = (radiance.width, radiance.height);
-        assert_eq!(alpha.extent(), (1, width, height), "planes of one frame");
-        let (mut has_clear, mut has_covered) = (false, false);
-        for alpha in &alpha.data {
-            has_clear |= *alpha == 0.0;
-            has_covered |= *alpha != 0.0;
+    pub fn of(radiance: &Planes, alpha: Alpha, samples: Option<u32>) -> Option<Self> {
+        let size = (radiance.width, radiance.height);
+        for alpha in [alpha.rendered].into_iter().chain(alpha.denoised) {
+            assert_eq!(alpha.extent(), (1, size.0, size.1), "planes of one frame");
         }
-        if !(has_clear && has_covered) {
+        let rendered = &alpha.rendered.data;
+        if rendered.iter().all(|a| *a == 0.0) || rendered.iter().all(|a| *a != 0.0) {
             return None;
         }
-        let mut met = vec![false; width * height];
-        met.par_chunks_mut(width).enumerate().for_each_init(
-            || vec![false; width + 2 * REACH],
-            |own, (y, met)| {
-                let row = |plane: &'_ [f32], own: &mut [bool]| {
-                    let plane = &plane[y * width..][..width];
-                    own.iter_mut().zip(plane).for_each(|(own, value)| *own |= *value != 0.0);
-                };
-                own.fill(false);
-                let inner = &mut own[REACH..][..width];
-                row(&alpha.data, inner);
-                (0..3).for_each(|c| row(radiance.channel(c), inner));
-                for shifted in (0..=2 * REACH).map(|first| &own[first..]) {
-                    met.iter_mut().zip(shifted).for_each(|(met, near)| *met |= near);
-                }
-            },
-        );
-        Some(Self { width, height, met })
+        let has_met = |at: usize| rendered[at] != 0.0 || (0..3).any(|c| radiance.channel(c)[at] != 0.0);
+        let met: Vec<bool> = (0..rendered.len()).into_par_iter().map(has_met).collect();
+        let mut is_empty = grown(&met, size, reach(samples));
+        is_empty.par_iter_mut().for_each(|is| *is = !*is);
+        if let Some(denoised) = alpha.denoised {
+            let has_enough = samples.is_some_and(|samples| samples >= OWN_SAMPLES);
+            let near = if has_enough { met } else { grown(&met, size, 1) };
+            let pixels = is_empty.par_iter_mut().zip(&near).zip(&denoised.data);
+            pixels.for_each(|((is, near), alpha)| *is |= !near & (*alpha < TRACE));
+        }
+        Some(Self { width: size.0, is_empty })
     }
 
-    /// Makes an image, (3, H, W), black where it is empty.
+    /// Makes an image, (C, H, W), black where it is empty.
     ///
     /// # Panics
     /// If sizes differ.
     pub fn clear(&self, image: &mut Planes) {
-        assert_eq!((image.width, image.height), (self.width, self.height), "planes of one frame");
-        let mut is_near = vec![true; self.width];
-        for y in 0..self.height {
-            self.row(y, &mut is_near);
-            for c in 0..image.channels {
-                let row = &mut image.channel_mut(c)[y * self.width..][..self.width];
-                row.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(value, _)| *value = 0.0);
-            }
+        assert_eq!(image.pixels(), self.is_empty.len(), "planes of one frame");
+        for plane in image.data.chunks_mut(self.is_empty.len()) {
+            let pixels = plane.par_iter_mut().zip(&self.is_empty);
+            pixels.filter(|(_, is_empty)| **is_empty).for_each(|(value, _)| *value = 0.0);
         }
     }
 
-    /// Sets for each pixel of a row whether something was met in it or near it.
-    pub fn row(&self, y: usize, is_near: &mut [bool]) {
-        is_near.fill(false);
-        let rows = y.saturating_sub(REACH)..(y + REACH + 1).min(self.height);
-        for met in self.met[rows.start * self.width..rows.end * self.width].chunks(self.width) {
-            is_near.iter_mut().zip(met).for_each(|(near, met)| *near |= met);
-        }
+    /// Whether each pixel of a row is empty.
+    pub fn row(&self, y: usize) -> &[bool] {
+        &self.is_empty[y * self.width..][..self.width]
     }
+}
+
+/// Rows and columns to each side that hold [`SAMPLES`].
+fn reach(samples: Option<u32>) -> usize {
+    let holds = |reach: &usize| {
+        let pixels = (2 * *reach as u32 + 1).pow(2);
+        samples.is_some_and(|samples| samples.saturating_mul(pixels) >= SAMPLES)
+    };
+    (1..FARTHEST).find(holds).unwrap_or(FARTHEST)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const SIZE: (usize, usize) = (23, 17);
+    const LIT: (usize, usize) = (20, 2);
+    const COVERED: (usize, usize) = (4, 16);
+
+    fn at((x, y): (usize, usize)) -> usize {
+        y * SIZE.0 + x
+    }
+
+    /// Light in one pixel, alpha in another.
+    fn film() -> [Planes; 2] {
+        let [mut radiance, mut alpha] = [3, 1].map(|channels| Planes::new(channels, SIZE.0, SIZE.1));
+        radiance.channel_mut(2)[at(LIT)] = 1e-6;
+        alpha.data[at(COVERED)] = 1.0;
+        [radiance, alpha]
+    }
+
+    /// The distance to the nearer of the two.
+    fn distance(x: usize, y: usize) -> usize {
+        [LIT, COVERED].map(|(a, b)| x.abs_diff(a).max(y.abs_diff(b))).into_iter().min().unwrap()
+    }
+
+    #[track_caller]
+    fn assert_empty(empty: &Empty, expected: impl Fn(usize, usize) -> bool) {
+        let mut cleared = Planes::from_vec(3, SIZE.0, SIZE.1, vec![1.0; 3 * SIZE.0 * SIZE.1]);
+        empty.clear(&mut cleared);
+        for y in 0..SIZE.1 {
+            for (x, is_empty) in empty.row(y).iter().enumerate() {
+                assert_eq!(*is_empty, expected(x, y), "{x}, {y}");
+                let value = if *is_empty { 0.0 } else { 1.0 };
+                assert!((0..3).all(|c| cleared.channel(c)[at((x, y))] == value), "{x}, {y}");
+            }
+        }
+    }
+
     #[test]
     fn what_is_far_from_light_and_from_alpha_is_empty() {
-        let size = (23, 17);
-        let at = |x: usize, y: usize| y * size.0 + x;
-        let opaque = Planes::from_vec(1, size.0, size.1, vec![1e-4; size.0 * size.1]);
-        assert!(Empty::of(&Planes::new(3, size.0, size.1), &opaque).is_none());
-        let unknown = Planes::new(1, size.0, size.1);
-        assert!(
-            Empty::of(&Planes::new(3, size.0, size.1), &unknown).is_none(),
-            "an alpha that tells nothing"
-        );
-        let lit = (21, 2);
-        let covered = (4, 16);
-        let mut radiance = Planes::new(3, size.0, size.1);
-        radiance.channel_mut(2)[at(lit.0, lit.1)] = 1e-6;
-        let mut alpha = Planes::new(1, size.0, size.1);
-        alpha.data[at(covered.0, covered.1)] = 1.0;
-        let empty = Empty::of(&radiance, &alpha).unwrap();
-        let mut cleared = Planes::from_vec(3, size.0, size.1, vec![1.0; 3 * size.0 * size.1]);
-        empty.clear(&mut cleared);
-        for y in 0..size.1 {
-            let mut is_near = vec![true; size.0];
-            empty.row(y, &mut is_near);
-            for (x, near) in is_near.into_iter().enumerate() {
-                let distance = |other: (usize, usize)| x.abs_diff(other.0).max(y.abs_diff(other.1));
-                assert_eq!(near, distance(lit).min(distance(covered)) <= 3, "{x}, {y}");
-                assert!(
-                    (0..3).all(|c| cleared.channel(c)[at(x, y)] == f32::from(u8::from(near))),
-                    "{x}, {y}"
-                );
-            }
+        let [radiance, alpha] = &film();
+        let alpha = Alpha { rendered: alpha, denoised: None };
+        for (samples, reach) in [
+            (None, 3),
+            (Some(1), 3),
+            (Some(5), 3),
+            (Some(6), 2),
+            (Some(15), 2),
+            (Some(16), 1),
+            (Some(u32::MAX), 1),
+        ] {
+            assert_empty(&Empty::of(radiance, alpha, samples).unwrap(), |x, y| distance(x, y) > reach);
+        }
+    }
+
+    #[test]
+    fn an_alpha_without_zeros_or_of_zeros_alone_tells_nothing() {
+        let [radiance, alpha] = &film();
+        for value in [0.0, 1e-4] {
+            let rendered = &Planes::from_vec(1, SIZE.0, SIZE.1, vec![value; alpha.pixels()]);
+            assert!(Empty::of(radiance, Alpha { rendered, denoised: None }, Some(4)).is_none(), "{value}");
+        }
+    }
+
+    #[test]
+    fn where_denoised_alpha_is_a_trace_pixels_nearer_to_things_are_empty() {
+        let [radiance, rendered] = &film();
+        // Things are blurred to the left: there alpha is low, but no trace.
+        let denoised = Planes::from_rows(1, SIZE, |_, _, row| {
+            row.iter_mut().enumerate().for_each(|(x, alpha)| *alpha = if x < 4 { 1e-3 } else { 1e-4 });
+        });
+        let alpha = Alpha { rendered, denoised: Some(&denoised) };
+        for (samples, reach, of_trace) in
+            [(None, 3, 1), (Some(4), 3, 1), (Some(15), 2, 1), (Some(63), 1, 1), (Some(64), 1, 0)]
+        {
+            let empty = Empty::of(radiance, alpha, samples).unwrap();
+            assert_empty(&empty, |x, y| distance(x, y) > if x < 4 { reach } else { of_trace });
         }
     }
 }

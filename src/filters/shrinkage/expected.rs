@@ -10,7 +10,7 @@ use std::sync::LazyLock;
 use rayon::prelude::*;
 
 use super::{
-    FLOOR, Render,
+    Empty, FLOOR, Render,
     features::{FEATURES, SAMPLES, TINY, WINDOWS, each_row},
 };
 use crate::{
@@ -47,12 +47,12 @@ static PERCEPTRON: LazyLock<Perceptron> =
 
 /// The squared error to be expected in each square of pixels, (1, H / 4, W / 4) rounded up. RelMSE is the
 /// mean of such errors.
-pub fn errors(result: &Planes, render: &Render, sums: &[f32]) -> Planes {
+pub fn errors(result: &Planes, render: &Render, empty: Option<&Empty>, sums: &[f32]) -> Planes {
     let squares = result.width.div_ceil(SQUARE);
     if result.pixels() == 0 {
         return Planes::new(1, squares, result.height.div_ceil(SQUARE));
     }
-    let of_squares = changes(result, render);
+    let of_squares = changes(result, render, empty);
     let window = WINDOWS[1];
     let rows: Vec<&[f32]> = of_squares.chunks(3 * squares).map(|row| &row[..2 * squares]).collect();
     let errors = each_row(sums, squares, 1, render, |row, features, error| {
@@ -113,7 +113,7 @@ impl Vectorised for Compare<'_> {
 /// result; ones; and the factor that turns the perceptron's error into one that RelMSE is the mean of. The
 /// perceptron sees a frame as exposed and does not know its brightness, so in dark frames its errors are
 /// relative to less light than those of RelMSE.
-fn changes(result: &Planes, render: &Render) -> Vec<f32> {
+fn changes(result: &Planes, render: &Render, empty: Option<&Empty>) -> Vec<f32> {
     let (width, height) = (result.width, result.height);
     let squares = width.div_ceil(SQUARE);
     let floor = FLOOR / render.exposure;
@@ -123,13 +123,10 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
         let (changes, rest) = lines.split_at_mut(squares);
         let (ones, units) = rest.split_at_mut(squares);
         ones.fill(1.0);
-        let mut is_near = vec![true; width];
         let [mut changes_of_row, mut units_of_row] = [(); 2].map(|()| vec![0.0; width]);
         let rows = row * SQUARE..((row + 1) * SQUARE).min(height);
         for y in rows.clone() {
-            if let Some(empty) = &render.empty {
-                empty.row(y, &mut is_near);
-            }
+            let is_empty = empty.map(|empty| empty.row(y));
             let [noisy, clean] = [render.radiance, result].map(|planes| planes.rows(y));
             let (changes_of_row, units_of_row) = (&mut changes_of_row, &mut units_of_row);
             let compare =
@@ -138,7 +135,7 @@ fn changes(result: &Planes, render: &Render) -> Vec<f32> {
             for x in 0..width {
                 changes[x / SQUARE] += changes_of_row[x];
                 // What stays as rendered because nothing was met has no error.
-                units[x / SQUARE] += if is_near[x] { units_of_row[x] } else { 0.0 };
+                units[x / SQUARE] += if is_empty.is_some_and(|row| row[x]) { 0.0 } else { units_of_row[x] };
             }
         }
         for (square, (change, unit)) in changes.iter_mut().zip(units).enumerate() {

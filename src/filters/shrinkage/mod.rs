@@ -16,19 +16,22 @@
 //!
 //! Light that the camera sees directly (`seen`: sky, screens, lamps) has no noise but that of antialiasing,
 //! and is kept. Of few samples, though, antialiasing is noise like any other: at 4 samples, a pixel in the
-//! gap of a blind before a bright sky may show a quarter of the sky, or nothing. What is `empty` is kept as well.
+//! gap of a blind before a bright sky may show a quarter of the sky, or nothing. What is `empty` is kept as well, and
+//! `lamps` do not glow into what lies beside them.
 
 mod empty;
 mod expected;
 mod features;
+mod lamps;
 mod restraint;
 mod seen;
 mod sums;
 
 use rayon::prelude::*;
 
-pub use self::empty::Empty;
+pub use self::empty::{Alpha, Empty};
 use self::{
+    lamps::Lamps,
     restraint::OUTPUTS,
     seen::{Seen, SeenRow, is_firefly},
     sums::LARGEST_RESIDUAL,
@@ -98,8 +101,6 @@ pub struct Render<'a> {
     pub exposure: f32,
     /// Samples of a pixel, where the file tells.
     pub samples: Option<u32>,
-    /// Where nothing was met, if alpha tells of such pixels: they stay as rendered.
-    pub empty: Option<Empty>,
 }
 
 impl Render<'_> {
@@ -109,16 +110,22 @@ impl Render<'_> {
     }
 }
 
-/// A frame that is about to be shrunk, and where its light is seen directly.
+/// A frame that is about to be shrunk, where its light is seen directly, and where nothing was met.
 pub struct Shrinkage<'a> {
     render: &'a Render<'a>,
     seen: Seen<'a>,
+    empty: Option<Empty>,
 }
 
 impl<'a> Shrinkage<'a> {
     /// Prepares to shrink a frame.
     pub fn of(render: &'a Render<'a>) -> Self {
-        Self { render, seen: Seen::of(render) }
+        Self { render, seen: Seen::of(render), empty: None }
+    }
+
+    /// The same with pixels, if there are any, that stay as rendered because nothing was met in them.
+    pub fn keeping(self, empty: Option<Empty>) -> Self {
+        Self { empty, ..self }
     }
 
     /// Whether the frame is nothing but light that the camera sees directly, or black: all of it is kept,
@@ -144,12 +151,12 @@ impl<'a> Shrinkage<'a> {
     /// If sizes differ.
     pub fn shrink_expecting(&self, image: &mut Planes, shares: Option<&mut Planes>) -> Planes {
         let sums = self.shrink_by_sums(image, shares);
-        expected::errors(image, self.render, &sums)
+        expected::errors(image, self.render, self.empty.as_ref(), &sums)
     }
 
     /// Shrinks, and returns the sums from which the shares were found.
     fn shrink_by_sums(&self, image: &mut Planes, shares: Option<&mut Planes>) -> Vec<f32> {
-        let Self { render, seen } = self;
+        let Self { render, seen, .. } = self;
         check(image, render);
         if image.pixels() == 0 {
             return Vec::new();
@@ -157,7 +164,7 @@ impl<'a> Shrinkage<'a> {
         let sums = sums::gather(image, render, seen);
         let squares = image.width.div_ceil(SQUARE);
         let judged = restraint::judge(&sums, squares, render);
-        mix(image, render, seen, &judged, Belief::of(render, &sums, squares), shares);
+        mix(image, self, &judged, Belief::of(render, &sums, squares), shares);
         sums
     }
 }
@@ -211,6 +218,25 @@ pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
     });
 }
 
+/// What is set in a mask, or lies at most `reach` rows and columns away from that.
+fn grown(mask: &[bool], (width, height): (usize, usize), reach: usize) -> Vec<bool> {
+    let mut grown = vec![false; mask.len()];
+    grown.par_chunks_mut(width).enumerate().for_each_init(
+        || vec![false; width + 2 * reach],
+        |of_columns, (y, grown)| {
+            of_columns.fill(false);
+            let rows = y.saturating_sub(reach)..(y + reach + 1).min(height);
+            for row in mask[rows.start * width..rows.end * width].chunks(width) {
+                of_columns[reach..].iter_mut().zip(row).for_each(|(any, is)| *any |= is);
+            }
+            for shifted in (0..=2 * reach).map(|first| &of_columns[first..]) {
+                grown.iter_mut().zip(shifted).for_each(|(grown, any)| *grown |= any);
+            }
+        },
+    );
+    grown
+}
+
 /// How much is taken of what shrinkage leaves of the denoised frame.
 #[derive(Clone, Copy)]
 struct Belief {
@@ -241,8 +267,7 @@ impl Belief {
 /// [judged](restraint::judge) of the squares.
 fn mix(
     image: &mut Planes,
-    render: &Render,
-    seen: &Seen,
+    Shrinkage { render, seen, empty }: &Shrinkage,
     judged: &[f32],
     belief: Belief,
     shares: Option<&mut Planes>,
@@ -256,6 +281,7 @@ fn mix(
     let is_all_seen = seen.is_all();
     let by_samples = ((samples / few).log2() / (many / few).log2()).clamp(0.0, 1.0);
     let keeps = if is_all_seen { 1.0 } else { by_samples };
+    let lamps = (keeps > 0.0).then(|| Lamps::of(render)).flatten();
     let [red, green, blue] = thirds(&mut image.data).map(|plane| plane.par_chunks_mut(width));
     let shares: Vec<Option<&mut [f32]>> = match shares {
         Some(shares) => shares.data.chunks_mut(width).map(Some).collect(),
@@ -263,11 +289,9 @@ fn mix(
     };
     red.zip(green).zip(blue).zip(shares).enumerate().for_each_init(
         || Memory::of(width, squares),
-        |Memory { line, judged: of_pixels, changes, backs, is_near, seen_row },
+        |Memory { line, judged: of_pixels, changes, backs, seen_row },
          (y, (((red, green), blue), shares))| {
-            if let Some(empty) = &render.empty {
-                empty.row(y, is_near);
-            }
+            let is_empty = empty.as_ref().map(|empty| empty.row(y));
             let (above, share) = between(y, square_rows);
             let of =
                 |row: usize| &judged[row.min(square_rows - 1) * OUTPUTS * squares..][..OUTPUTS * squares];
@@ -294,7 +318,7 @@ fn mix(
             }
             for (x, back) in backs.iter_mut().enumerate() {
                 let is_seen = seen_row.is_seen[x] > 0.0;
-                if (is_seen && keeps == 1.0) || !is_near[x] {
+                if (is_seen && keeps == 1.0) || is_empty.is_some_and(|row| row[x]) {
                     *back = 1.0;
                     continue;
                 }
@@ -306,6 +330,13 @@ fn mix(
                 *back = *back + direct - *back * direct;
                 if !is_seen && changes[x] >= LARGEST_RESIDUAL && is_firefly(render, x, y) {
                     *back = 0.0;
+                }
+                if let Some(most) = lamps.as_ref().and_then(|lamps| lamps.most_beside(x, y)) {
+                    let light = |planes: [&[f32]; 3]| planes.map(|row| row[x].max(0.0)).iter().sum::<f32>();
+                    let (denoised, rendered) = (light([red, green, blue]), light(noisy));
+                    if denoised > most {
+                        *back = back.max(keeps * (denoised - most) / (denoised - rendered));
+                    }
                 }
             }
             vectorised::run(Blend { image: [red, green, blue], noisy, backs });
@@ -324,7 +355,6 @@ struct Memory {
     judged: Vec<f32>,
     changes: Vec<f32>,
     backs: Vec<f32>,
-    is_near: Vec<bool>,
     seen_row: SeenRow,
 }
 
@@ -335,7 +365,6 @@ impl Memory {
             judged: vec![0.0; OUTPUTS * width],
             changes: vec![0.0; width],
             backs: vec![0.0; width],
-            is_near: vec![true; width],
             seen_row: SeenRow::none(width),
         }
     }
@@ -455,7 +484,7 @@ mod tests {
     /// What becomes of `denoised` beside `radiance`.
     fn shrunk(denoised: &Planes, radiance: &Planes, albedo: &Planes, samples: Option<u32>) -> Planes {
         let mut image = denoised.clone();
-        let render = Render { radiance, albedo, exposure: 0.6, samples, empty: None };
+        let render = Render { radiance, albedo, exposure: 0.6, samples };
         shrink(&mut image, &render, None);
         image
     }
@@ -576,7 +605,6 @@ mod tests {
                 albedo: &albedo,
                 exposure: 0.6 / film,
                 samples: Some(64),
-                empty: None,
             };
             assert!((film_exposure(&render) / film - 1.0).abs() < 0.003, "{film}");
             let mut exposed = times(&planes(picture));
@@ -598,19 +626,35 @@ mod tests {
                 Planes::from_vec(3, width, height, pixels)
             };
             let (albedo, radiance) = (light(1.0), light(1.5));
-            let render = Render {
-                radiance: &radiance,
-                albedo: &albedo,
-                exposure: 1.0,
-                samples: Some(64),
-                empty: None,
-            };
+            let render = Render { radiance: &radiance, albedo: &albedo, exposure: 1.0, samples: Some(64) };
             assert!((film_exposure(&render) / 1.5 - 1.0).abs() < 0.003, "columns from {first} on");
         }
         // A wall alone has no such light, whatever its noise.
         let albedo = &planes(|_, _, _| 0.5);
-        let render = Render { radiance: &wall, albedo, exposure: 1.0, samples: None, empty: None };
+        let render = Render { radiance: &wall, albedo, exposure: 1.0, samples: None };
         assert_eq!(film_exposure(&render), 1.0);
+    }
+
+    #[test]
+    fn lamps_do_not_glow_into_pixels_that_no_sample_of_them_met() {
+        // A lamp on a noisy wall, and what a network left of it in the pixels beside it.
+        let is_lamp = |x: usize, y: usize| (30..40).contains(&x) && (30..40).contains(&y);
+        let is_beside = |x: usize, y: usize| (28..42).contains(&x) && (28..42).contains(&y) && !is_lamp(x, y);
+        let wall = noisy(0.3);
+        let lit = |light: f32, x, y, other: f32| if is_lamp(x, y) { light } else { other };
+        let radiance = planes(|c, x, y| lit(2000.0, x, y, wall.channel(c)[y * SIZE.0 + x]));
+        let albedo = planes(|_, x, y| lit(2000.0, x, y, 0.5));
+        let denoised =
+            planes(|c, x, y| lit(2000.0, x, y, picture(c, x, y) + if is_beside(x, y) { 40.0 } else { 0.0 }));
+        for samples in [64, 256] {
+            let image = shrunk(&denoised, &radiance, &albedo, Some(samples));
+            for (x, y) in
+                (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))).filter(|(x, y)| is_beside(*x, *y))
+            {
+                let light = (0..3).map(|c| image.channel(c)[y * SIZE.0 + x]).sum::<f32>();
+                assert!(light < 3.0, "{samples} samples: {light} at {x}, {y}");
+            }
+        }
     }
 
     #[test]
@@ -695,10 +739,11 @@ mod tests {
             albedo: &planes(|_, x, _| if x < 40 { 0.5 } else { 2.0 }),
             exposure: 0.6,
             samples: Some(4),
-            empty: Empty::of(&radiance, &alpha),
         };
+        let empty = Empty::of(&radiance, Alpha { rendered: &alpha, denoised: None }, render.samples);
         let mut shares = Planes::new(1, SIZE.0, SIZE.1);
-        let errors = Shrinkage::of(&render).shrink_expecting(&mut image, Some(&mut shares));
+        let shrinkage = Shrinkage::of(&render).keeping(empty);
+        let errors = shrinkage.shrink_expecting(&mut image, Some(&mut shares));
         for (at, error) in errors.data.iter().enumerate() {
             let first = at % errors.width * SQUARE;
             assert_eq!(*error > 0.0, first < 43, "{first}: {error}");
@@ -721,8 +766,8 @@ mod tests {
     fn of_more_samples_than_were_learned_from_as_much_is_expected_as_of_unknown_ones() {
         let (radiance, albedo, image) = (noisy(0.3), planes(|_, _, _| 0.5), planes(picture));
         let errors = |samples| {
-            let render = Render { radiance: &radiance, albedo: &albedo, exposure: 0.6, samples, empty: None };
-            expected::errors(&image, &render, &sums::gather(&image, &render, &Seen::of(&render))).data
+            let render = Render { radiance: &radiance, albedo: &albedo, exposure: 0.6, samples };
+            expected::errors(&image, &render, None, &sums::gather(&image, &render, &Seen::of(&render))).data
         };
         assert_eq!(errors(Some(257)), errors(None));
         assert_eq!(errors(Some(4096)), errors(None));
@@ -736,7 +781,7 @@ mod tests {
                 let of = |v: f32| Planes::from_vec(3, w, h, vec![v; 3 * w * h]);
                 let mut image = of(v);
                 let (radiance, albedo) = (&of(0.5 * v), &of(0.7));
-                let render = Render { radiance, albedo, exposure: 1.0, samples: None, empty: None };
+                let render = Render { radiance, albedo, exposure: 1.0, samples: None };
                 shrink(&mut image, &render, None);
                 assert!(image.data.iter().all(|x| x.is_finite() && *x <= v && *x >= 0.5 * v), "{w}x{h}, {v}");
             }
