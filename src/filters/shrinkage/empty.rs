@@ -50,8 +50,10 @@ impl Empty {
         if rendered.iter().all(|a| *a == 0.0) || rendered.iter().all(|a| *a != 0.0) {
             return None;
         }
-        let has_met = |at: usize| rendered[at] != 0.0 || (0..3).any(|c| radiance.channel(c)[at] != 0.0);
-        let met: Vec<bool> = (0..rendered.len()).into_par_iter().map(has_met).collect();
+        let [red, green, blue] = [0, 1, 2].map(|c| radiance.channel(c));
+        let pixels = rendered.par_iter().zip(red).zip(green).zip(blue);
+        let met: Vec<bool> =
+            pixels.map(|(((a, r), g), b)| (*a != 0.0) | (*r != 0.0) | (*g != 0.0) | (*b != 0.0)).collect();
         let mut is_empty = grown(&met, size, reach(samples));
         is_empty.par_iter_mut().for_each(|is| *is = !*is);
         if let Some(denoised) = alpha.denoised {

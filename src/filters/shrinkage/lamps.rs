@@ -33,11 +33,12 @@ impl<'a> Lamps<'a> {
     pub fn of(render: &'a Render<'a>) -> Option<Self> {
         let albedo = render.albedo;
         let (width, height) = (albedo.width, albedo.height);
-        let is_beyond = |at: usize| (0..3).any(|c| albedo.channel(c)[at] > BEYOND_WHITE);
-        if !(0..width * height).into_par_iter().any(is_beyond) {
+        let [red, green, blue] = [0, 1, 2].map(|c| albedo.channel(c));
+        let colours = red.par_iter().zip(green).zip(blue);
+        let beyond: Vec<bool> = colours.map(|((r, g), b)| r.max(*g).max(*b) > BEYOND_WHITE).collect();
+        if !beyond.contains(&true) {
             return None;
         }
-        let beyond: Vec<bool> = (0..width * height).into_par_iter().map(is_beyond).collect();
         let has_company = |at: usize| {
             let around = albedo.near(at % width, at / width, 1).filter(|(x, y)| beyond[y * width + x]);
             around.count() > COMPANY // itself among them
