@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use super::grown;
 use crate::planes::Planes;
 
-/// A pixel is empty where this many samples in and around it met nothing, or where none in the 7x7 pixels around it met
-/// anything: nearer to things, samples may have missed them. Of 32 crops at 4 samples, references had 1e-4 of their light at most
-/// where 7x7 pixels were empty, 2e-3 where 3x3 were.
+/// A pixel is empty where this many samples in and around it met nothing, or where none in the 7x7 pixels around it
+/// met anything: nearer to things, samples may have missed them. Of 32 crops at 4 samples, references had 1e-4 of
+/// their light at most where 7x7 pixels were empty, 2e-3 where 3x3 were (docs/decisions.md, Shrinkage).
 const SAMPLES: u32 = 144;
 const FARTHEST: usize = 3;
 
