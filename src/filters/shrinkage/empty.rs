@@ -70,7 +70,8 @@ impl Empty {
     /// # Panics
     /// If sizes differ.
     pub fn clear(&self, image: &mut Planes) {
-        assert_eq!(image.pixels(), self.is_empty.len(), "planes of one frame");
+        let size = (self.width, self.is_empty.len());
+        assert_eq!((image.width, image.pixels()), size, "planes of one frame");
         for plane in image.data.chunks_mut(self.is_empty.len()) {
             let pixels = plane.par_iter_mut().zip(&self.is_empty);
             pixels.filter(|(_, is_empty)| **is_empty).for_each(|(value, _)| *value = 0.0);
