@@ -3,29 +3,24 @@
 //! Shares are averaged by the beauty's kernels, which know nothing of them where the beauty is black, as under
 //! a caught shadow or along the edge of a dark thing. But a share is the mean of a pixel's samples, each
 //! between 0 and 1, so its noise is known: of `n` independent samples of a mean of `d` the variance is at most
-//! `d (1 - d) / n`, and samples that are spread evenly have less. What a share was changed by is compared with
-//! that, over the pixels around. The denoised share `d` and the rendered one `r` are mixed as
-//! `d + w (r - d)`, where `w` is what the noise does not explain of the mean of `(r - d)^2`.
+//! `d (1 - d) / n`, and of samples spread evenly over a pixel that an edge crosses it falls with `n^1.5`. What a
+//! share was changed by is compared with that, over the pixels around. The denoised share `d` and the rendered one
+//! `r` are mixed as `d + w (r - d)`, where `w` is what the noise does not explain of the mean of `(r - d)^2`.
 
 use rayon::prelude::*;
 
 use super::box_mean;
 use crate::planes::Planes;
 
-/// The variance of Cycles' samples over that of independent ones, for up to [`EVEN_SAMPLES`]; beyond, it falls
-/// with the root of their number. Found on six scenes (docs/decisions.md).
-const EVENNESS: f32 = 0.3;
-const EVEN_SAMPLES: f32 = 16.0;
-
 /// Rows and columns to each side over which noise and change are averaged.
-const REACH: usize = 2;
+const REACH: usize = 3;
 
 /// Squared change below which none is seen.
 const LEAST_CHANGE: f32 = 1e-12;
 
 /// What `d (1 - d)` is multiplied by to be the variance of a share.
 fn scale(samples: f32) -> f32 {
-    EVENNESS * (EVEN_SAMPLES / samples).min(1.0).sqrt() / samples
+    samples.powf(-1.5)
 }
 
 /// Mixes a denoised share, (C, H, W), with what was rendered of it in `samples` samples a pixel.
@@ -81,7 +76,7 @@ mod tests {
 
     #[test]
     fn noise_goes_and_blurred_edges_come_back() {
-        for n in [4.0, 64.0] {
+        for n in [1.0, 4.0, 64.0] {
             let [truth, noisy] = sampled(n);
             let mut denoised = truth.clone();
             take_back(&mut denoised, &noisy, n);
