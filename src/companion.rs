@@ -43,6 +43,17 @@ impl Companion {
         Self { kind, planes, rendered: Planes::default() }
     }
 
+    /// Whether it is alpha.
+    pub fn is_alpha(&self) -> bool {
+        self.kind == Kind::Share && self.planes.channels == 1
+    }
+
+    /// Takes it out of its place, where nothing is left.
+    pub fn take(&mut self) -> Self {
+        let [planes, rendered] = [&mut self.planes, &mut self.rendered].map(std::mem::take);
+        Self { kind: self.kind, planes, rendered }
+    }
+
     /// Puts what was made of it in its place.
     pub fn becomes(&mut self, denoised: Planes) {
         self.rendered = std::mem::replace(&mut self.planes, denoised);

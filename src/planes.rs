@@ -239,6 +239,37 @@ impl Planes {
         })
     }
 
+    /// All planes of these, then all of `more`.
+    ///
+    /// # Panics
+    /// If sizes differ.
+    pub fn followed_by(&self, more: &Self) -> Self {
+        let size = (self.width, self.height);
+        assert_eq!(size, (more.width, more.height), "planes of one size");
+        Self::from_rows(self.channels + more.channels, size, |c, y, out| {
+            let (from, c) = if c < self.channels { (self, c) } else { (more, c - self.channels) };
+            out.copy_from_slice(from.row(c, y));
+        })
+    }
+
+    /// The first so many planes, and the rest.
+    ///
+    /// # Panics
+    /// If there are fewer.
+    pub fn split_after(&self, channels: usize) -> [Self; 2] {
+        assert!(channels <= self.channels, "so many planes at least");
+        [0..channels, channels..self.channels].map(|of| {
+            Self::from_rows(of.len(), (self.width, self.height), |c, y, out| {
+                out.copy_from_slice(self.row(of.start + c, y));
+            })
+        })
+    }
+
+    /// Whether there are two different values.
+    pub fn varies(&self) -> bool {
+        self.data.iter().any(|value| *value != self.data[0])
+    }
+
     /// How many values are NaN or infinite.
     pub fn non_finite(&self) -> usize {
         self.data.iter().filter(|v| !v.is_finite()).count()

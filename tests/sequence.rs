@@ -427,13 +427,49 @@ fn where_a_transparent_film_is_empty_nothing_comes_from_neighbours_either() {
         }));
     }
     assert!(denoised(&with, 2) != denoised(&alone, 2), "neighbours count");
-    // A still among them leaves its alpha as it is, too.
-    fs::copy(named(&dir, 2), dir.path().join("still.exr")).unwrap();
-    network(&with, &dir.path().join("still.exr"), &["--temporal"]);
-    for file in [with.join("still.exr"), result(&with, 2)] {
-        let image = read_exr(file);
-        assert_eq!(values(&image, "ViewLayer.Denoised.A"), values(&image, "ViewLayer.Combined.A"));
+}
+
+#[test]
+fn alpha_is_averaged_with_that_of_neighbours() {
+    let dir = tempfile::tempdir().unwrap();
+    let shot = Shot { speed: 0.0, ..SHOT };
+    let truth = |i: usize| if (14..34).contains(&(i % SIZE.0)) { 0.5 } else { 0.0 };
+    for n in 1..=5 {
+        let covers = |i: usize, sample: u32| random([n as u32, i as u32, sample]) < truth(i);
+        let share = |i: usize| (0..4).filter(|sample| covers(i, *sample)).count() as f32 / 4.0;
+        let alpha: Vec<f32> = (0..SIZE.0 * SIZE.1).map(share).collect();
+        let mut channels = shot.channels("ViewLayer", "", n);
+        for channel in &mut channels {
+            if let FlatSamples::F32(values) = &mut channel.sample_data
+                && channel.name.to_string().contains("Combined")
+            {
+                values.iter_mut().zip(&alpha).for_each(|(value, alpha)| *value *= alpha);
+            }
+        }
+        channels.push(AnyChannel::new("ViewLayer.Combined.A", FlatSamples::F32(alpha)));
+        write_channels(&named(&dir, n), SIZE, channels, &[]);
     }
+    let alpha = |file: &Path, layer: &str| planes(file, layer, &["A"]).data.to_vec();
+    let error = |alpha: &[f32]| alpha.iter().enumerate().map(|(i, a)| (a - truth(i)).powi(2)).sum::<f32>();
+    let out = dir.path().join("out");
+    let of = |arguments: &[&str]| {
+        let mut command = Command::cargo_bin("demc").unwrap();
+        command.args(["denoise", "--model", "demc-s", "--overwrite", "--out"]).args([&out, dir.path()]);
+        command.args(arguments).assert().success();
+        alpha(&result(&out, 3), "Denoised")
+    };
+    let rendered = alpha(&named(&dir, 3), "Combined");
+    let errors = [&rendered, &of(&[]), &of(&["--temporal", "1"]), &of(&["--temporal"])].map(|a| error(a));
+    assert!(errors.is_sorted_by(|before, after| *after < 0.9 * before), "{errors:?}");
+    assert!(of(&["--temporal", "--alpha", "denoise"]) == of(&["--temporal"]));
+    assert!(of(&["--temporal", "--alpha", "keep"]) == rendered);
+    // A still among them is denoised alone.
+    fs::copy(named(&dir, 3), dir.path().join("still.exr")).unwrap();
+    let still = |arguments: &[&str]| {
+        of(arguments);
+        alpha(&out.join("still.exr"), "Denoised")
+    };
+    assert!(still(&["--temporal"]) == still(&[]));
 }
 
 /// Writes a frame that tells how many samples it had, with other noise.

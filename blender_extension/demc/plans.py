@@ -144,8 +144,6 @@ def _options_of_files(scene, overwrite=False):
     options = _options(scene)
     if settings.use_temporal and settings.light_passes:
         raise JobError("Temporal leaves light passes as they are: turn off Light Passes or Temporal")
-    if settings.use_temporal and settings.alpha == "denoise":
-        raise JobError("Temporal leaves alpha as it is: set Alpha to Automatic or Keep, or turn off Temporal")
     options += [] if settings.keep_noisy else ["--replace"]
     if settings.use_temporal:
         options += ["--temporal", str(settings.temporal)]

@@ -283,8 +283,6 @@ class Extension(unittest.TestCase):
         bpy.ops.render.render(animation=True)
         self.scene.demc.use_temporal = self.scene.demc.light_passes = True
         self.refused(bpy.ops.demc.denoise_range, "turn off Light Passes or Temporal")
-        self.scene.demc.light_passes, self.scene.demc.alpha = False, "denoise"
-        self.refused(bpy.ops.demc.denoise_range, "set Alpha to")
 
     def test_a_view_layer_of_the_results_name(self):
         self.prepared()

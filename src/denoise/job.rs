@@ -350,11 +350,8 @@ pub fn check_options(model: &dyn Denoiser, options: &Options) -> Result<()> {
     if options.confidence {
         check_expects(model, "--confidence")?;
     }
-    let by_frame = options.passes || options.confidence || options.alpha == Alpha::Denoise;
-    if options.temporal.is_some() && by_frame {
-        let why =
-            "--passes, --confidence and --alpha denoise work frame by frame; leave out --temporal, or them";
-        return wrong(why.into());
+    if options.temporal.is_some() && (options.passes || options.confidence) {
+        return wrong("--passes and --confidence work frame by frame; leave out --temporal, or them".into());
     }
     Ok(())
 }

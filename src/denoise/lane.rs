@@ -166,7 +166,7 @@ impl Lane {
     fn denoise_all(&self, frames: &Receiver<Loaded>, next: &SyncSender<(Job, Views<Denoised>)>) {
         let Shared { model, options, .. } = &*self.shared;
         let model = &**model;
-        let new_window = || Window::new(self.reach(), model, options.tile);
+        let new_window = || Window::new(self.reach(), model, (options.tile, options.alpha));
         let mut window = new_window();
         for loaded in frames {
             if self.shared.is_stopped() {

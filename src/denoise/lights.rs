@@ -37,6 +37,15 @@ impl Alpha {
     /// All, by their names on the command line.
     pub const ALL: [(&str, Self); 3] =
         [("auto", Self::Auto), ("denoise", Self::Denoise), ("keep", Self::Keep)];
+
+    /// Whether a model is to denoise an alpha, (1, H, W).
+    pub(super) fn is_denoised(self, alpha: &Planes, model: &dyn Denoiser) -> bool {
+        match self {
+            Self::Keep => false,
+            Self::Denoise => true,
+            Self::Auto => model.takes_companions() && alpha.varies(),
+        }
+    }
 }
 
 /// Light passes that are stored divided by a colour, and that colour.
@@ -108,17 +117,10 @@ impl Along {
     /// Takes out of a shot the passes that are to go along, and notes those that cannot.
     pub fn take(shot: &mut Shot, model: &dyn Denoiser, options: &Options, notes: &mut Vec<String>) -> Self {
         let mut along = Self::default();
-        let denoises_alpha = match options.alpha {
-            Alpha::Keep => false,
-            Alpha::Denoise => true,
-            // Neighbours leave alpha as it is, and so does a frame that has none.
-            Alpha::Auto if options.temporal.is_some() => false,
-            Alpha::Auto => {
-                let varies = |alpha: &Planes| alpha.data.iter().any(|v| *v != alpha.data[0]);
-                model.takes_companions() && shot.passes.get(Pass::Alpha).is_some_and(varies)
-            }
-        };
-        if denoises_alpha && let Some(alpha) = shot.passes.remove(Pass::Alpha) {
+        let is_denoised = |alpha: &Planes| options.alpha.is_denoised(alpha, model);
+        if shot.passes.get(Pass::Alpha).is_some_and(is_denoised)
+            && let Some(alpha) = shot.passes.remove(Pass::Alpha)
+        {
             along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha);
         }
         if options.passes {

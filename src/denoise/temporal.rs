@@ -3,7 +3,10 @@
 //! In: a [`Shot`] with its neighbours. Out: what [`super::Batch`] makes of the frame with
 //! [`super::Options::temporal`].
 
-use super::window::{Candidates, PASSES, Window};
+use super::{
+    Alpha,
+    window::{Candidates, PASSES, Window},
+};
 use crate::{Result, models::Denoiser, passes::Pass, planes::Planes, shot::Shot};
 
 /// What its name ends in.
@@ -28,7 +31,7 @@ impl Temporal {
 
     /// A window around a frame with the neighbours that the shot has.
     fn window(&self, shot: &Shot) -> Window<'_> {
-        let mut window = Window::new(self.reach, &*self.model, None);
+        let mut window = Window::new(self.reach, &*self.model, (None, Alpha::Auto));
         let reach = i32::try_from(self.reach).unwrap_or(i32::MAX);
         for (&offset, passes) in shot.neighbours.range(-reach..=reach) {
             window.enter_shot(offset.into(), Shot::new(passes.clone()));

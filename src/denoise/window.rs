@@ -15,17 +15,18 @@ use std::{
 };
 
 use super::{
-    Denoised, Report, Views,
+    Alpha, Denoised, Report, Views,
     half_floats::HalfFloats,
     job::{finish, run},
 };
 use crate::{
     Error, Result,
+    companion::{Companion, Kind},
     features::exposure,
     filters::{
         agreement::{self, Guides, Look},
         motion::{Direction, Flow},
-        shrinkage::{Alpha, Empty},
+        shrinkage::{self, Empty},
         structure::{self, Sight},
         temporal::{self, Link, likeness},
     },
@@ -104,8 +105,18 @@ struct Moment {
     links: BTreeMap<i32, Result<Found, Gap>>,
     /// What the model makes of it and its neighbours' renders.
     result: Option<Planes>,
+    /// What it makes of alpha, where that is denoised.
+    alpha: Option<Cover>,
     /// Frames whose renders the result was made without since they were not there, or could not be used.
     lacked: BTreeSet<i64>,
+}
+
+/// Alpha of a result.
+enum Cover {
+    /// The same everywhere, as rendered.
+    Even(f32),
+    /// Denoised, (1, H, W).
+    Varying(Planes),
 }
 
 /// What is kept of a [`Link`], whose flow is followed anew.
@@ -156,6 +167,7 @@ pub struct Window<'a> {
     model: &'a dyn Denoiser,
     /// See [`Options::tile`](super::Options::tile).
     tile: Option<usize>,
+    alpha: Alpha,
     /// How many frames away the renders are that are averaged, and the results.
     reaches: [i32; 2],
     held: BTreeMap<i64, Held>,
@@ -165,11 +177,12 @@ pub struct Window<'a> {
 
 impl<'a> Window<'a> {
     /// An empty window of so many frames before and after one.
-    pub fn new(reach: usize, model: &'a dyn Denoiser, tile: Option<usize>) -> Self {
+    pub fn new(reach: usize, model: &'a dyn Denoiser, (tile, alpha): (Option<usize>, Alpha)) -> Self {
         let renders = reach.min(RENDERS);
         Self {
             model,
             tile,
+            alpha,
             reaches: [renders, reach - renders].map(|n| i32::try_from(n).unwrap_or(i32::MAX)),
             held: BTreeMap::new(),
             is_stream: false,
@@ -205,7 +218,7 @@ impl<'a> Window<'a> {
     /// # Errors
     /// The model cannot denoise it.
     pub fn denoise_shot(&mut self, number: i64) -> Result<Planes> {
-        self.view(number, &ViewKey::default(), &mut Report::default())
+        Ok(self.view(number, &ViewKey::default(), &mut Report::default())?.0)
     }
 
     /// Lets go of what no frame after one needs that has been denoised, if frames come in order.
@@ -266,11 +279,11 @@ impl<'a> Window<'a> {
         let rest = held.rest.take().expect("it is denoised once");
         rest.each(|_, layer, (), report| {
             let start = Instant::now();
-            let radiance = self.view(number, &key(layer), report)?;
+            let (radiance, alpha) = self.view(number, &key(layer), report)?;
             report.seconds = start.elapsed().as_secs_f64();
-            let passes = &self.moment(number, &key(layer)).expect("its views have entered").shot.passes;
-            let alpha = passes.get(Pass::Alpha).cloned();
-            finish(&passes.path, radiance, (alpha, Vec::new()), self.model, report)
+            let own = self.moment(number, &key(layer)).expect("its views have entered");
+            let alpha = alpha.or_else(|| own.pass(Pass::Alpha).map(Cow::into_owned));
+            finish(&own.shot.passes.path, radiance, (alpha, Vec::new()), self.model, report)
         })
     }
 
@@ -300,20 +313,35 @@ impl<'a> Window<'a> {
         })
     }
 
-    fn view(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<Planes> {
+    /// Radiance, and alpha where it was denoised.
+    fn view(&mut self, number: i64, view: &ViewKey, report: &mut Report) -> Result<(Planes, Option<Planes>)> {
         self.gather(number, view, report)?;
         let own = self.moment(number, view).expect("its views have entered");
         let radiance = own.render();
         let others: Vec<Neighbour> = self.neighbours(number, view, self.reaches[1]).collect();
-        let results: Vec<(&Planes, &Link)> =
-            others.iter().map(|other| (other.moment.result(), &other.link)).collect();
-        let mut blended = own.inside(temporal::blend(own.result(), &radiance, own.exposure, &results));
-        let passes = &own.shot.passes;
-        if let Some(rendered) = passes.get(Pass::Alpha) {
-            let empty = Empty::of(&radiance, Alpha { rendered, denoised: None }, passes.samples);
-            empty.iter().for_each(|empty| empty.clear(&mut blended));
+        let mut moments = others.iter().map(|other| other.moment).chain([own]);
+        let has_alpha = moments.any(|moment| matches!(moment.alpha, Some(Cover::Varying(_))));
+        let results: Vec<Cow<Planes>> =
+            others.iter().map(|other| other.moment.result_with(has_alpha)).collect();
+        let neighbours: Vec<(&Planes, &Link)> =
+            results.iter().zip(&others).map(|(result, other)| (&**result, &other.link)).collect();
+        let blended = temporal::blend(&own.result_with(has_alpha), &radiance, own.exposure, &neighbours);
+        let blended = own.inside(blended);
+        let (mut blended, mut alpha) = match has_alpha {
+            true => {
+                let [light, mut alpha] = blended.split_after(3);
+                alpha.data.iter_mut().for_each(|share| *share = share.clamp(0.0, 1.0));
+                (light, Some(alpha))
+            }
+            false => (blended, None),
+        };
+        if let Some(rendered) = own.pass(Pass::Alpha) {
+            let both = shrinkage::Alpha { rendered: &rendered, denoised: alpha.as_ref() };
+            if let Some(empty) = Empty::of(&radiance, both, own.shot.passes.samples) {
+                [Some(&mut blended), alpha.as_mut()].into_iter().flatten().for_each(|of| empty.clear(of));
+            }
         }
-        Ok(blended)
+        Ok((blended, alpha))
     }
 
     /// Finds the neighbours of a frame, and runs the model over it and over those whose results are averaged.
@@ -373,7 +401,7 @@ impl<'a> Window<'a> {
 
     /// Runs the model over a frame's render, averaged with its neighbours', unless that was done.
     fn infer(&mut self, number: i64, view: &ViewKey) -> Result<()> {
-        let Self { model, tile, reaches: [renders, _], .. } = *self;
+        let Self { model, tile, alpha, reaches: [renders, _], .. } = *self;
         if self.moment(number, view).is_some_and(|own| own.result.is_some()) {
             return Ok(());
         }
@@ -388,7 +416,7 @@ impl<'a> Window<'a> {
         // Half buffers are the frame's own: a model that holds them against each other reads no average
         // beside them.
         let is_linked = offsets(renders).any(|offset| self.is_linked(number, view, offset));
-        let shot = if is_linked && !model.reads_halves() {
+        let mut shot = if is_linked && !model.reads_halves() {
             let others: Vec<Neighbour> = self.neighbours(number, view, renders).collect();
             let mut average = Shot::new(average(own, &others, model));
             average.wraps = own.shot.wraps;
@@ -397,9 +425,21 @@ impl<'a> Window<'a> {
             own.shot()
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number));
-        let (image, _) = run(&shot, &mut [], false, (model, tile))?;
+        let (mut along, mut even) = (Vec::new(), None);
+        if let Some(rendered) = shot.passes.get(Pass::Alpha)
+            && alpha != Alpha::Keep
+        {
+            if alpha.is_denoised(rendered, model) {
+                let rendered = shot.passes.remove(Pass::Alpha);
+                along.extend(rendered.map(|rendered| Companion::new(Kind::Share, rendered)));
+            } else if !rendered.varies() {
+                even = rendered.data.first().copied();
+            }
+        }
+        let (image, _) = run(&shot, &mut along, false, (model, tile))?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
+        moment.alpha = along.pop().map(|alpha| Cover::Varying(alpha.planes)).or(even.map(Cover::Even));
         (moment.result, moment.lacked) = (Some(image), lacked);
         Ok(())
     }
@@ -462,10 +502,13 @@ impl<'a> Window<'a> {
                 });
             }
         };
-        let held = |of: Guides| [of.albedo.is_some(), of.normal.is_some(), of.depth.is_some()];
-        if held(own.guides()) != held(other.guides()) {
+        let held = |moment: &Moment| {
+            let Guides { albedo, normal, depth } = moment.guides();
+            [albedo, normal, depth, moment.values(Pass::Alpha)].map(|pass| pass.is_some())
+        };
+        if held(own) != held(other) {
             return said(format!(
-                "frame {there} holds other passes: albedo, normal or depth is missing in one of them"
+                "frame {there} holds other passes: albedo, normal, depth or alpha is missing in one of them"
             ));
         }
         let are_zero = |nearer: i32| {
@@ -540,6 +583,7 @@ impl Moment {
             region,
             links: BTreeMap::new(),
             result: None,
+            alpha: None,
             lacked: BTreeSet::new(),
         }
     }
@@ -661,6 +705,21 @@ impl Moment {
         self.result.as_ref().expect("the model ran over it")
     }
 
+    /// Likewise, with alpha as a fourth plane if that is wanted.
+    fn result_with(&self, alpha: bool) -> Cow<'_, Planes> {
+        let result = self.result();
+        match &self.alpha {
+            _ if !alpha => Cow::Borrowed(result),
+            Some(Cover::Varying(alpha)) => Cow::Owned(result.followed_by(alpha)),
+            Some(Cover::Even(share)) => {
+                let mut even = Planes::unwritten(1, result.width, result.height);
+                even.data.fill(*share);
+                Cow::Owned(result.followed_by(&even))
+            }
+            None => unreachable!("frames with alpha and without are not averaged"),
+        }
+    }
+
     /// With all its passes.
     fn shot(&self) -> Shot {
         let mut shot = self.shot.clone();
@@ -689,9 +748,9 @@ impl Moment {
     }
 }
 
-/// Whether a pass tells where a pixel's content lies and how far it covers it: it is never averaged.
+/// Whether a pass tells where a pixel's content lies: it is never averaged.
 fn is_place(pass: Pass) -> bool {
-    matches!(pass.quantity(), Quantity::Place | Quantity::Distance | Quantity::Share)
+    matches!(pass.quantity(), Quantity::Place | Quantity::Distance)
 }
 
 /// What tells, besides light, whether two frames show the same.
@@ -714,8 +773,7 @@ fn offsets(reach: i32) -> impl Iterator<Item = i32> {
     (1..=reach).flat_map(|n| [-n, n])
 }
 
-/// The passes of a frame that the model reads, and alpha, averaged with those of its neighbours. Places, and shares such
-/// as alpha, remain its own.
+/// The passes of a frame that the model reads, and alpha, averaged with those of its neighbours. Places remain its own.
 fn average(own: &Moment, others: &[Neighbour<'_>], model: &dyn Denoiser) -> PassSet {
     let passes = &own.shot.passes;
     // With as many samples as the frame alone: fireflies are spread over more pixels, but not rarer. Told that there are

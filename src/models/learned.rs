@@ -207,6 +207,18 @@ impl Denoiser for Learned {
             refuse_companions(&self.name, companions)?;
             return Ok((self.network.infer(passes, tile)?, None));
         }
+        // What of a film is empty is told by alpha once that is denoised, whether the caller wants it or not.
+        if let Some(alpha) = passes.get(Pass::Alpha)
+            && self.is_restrained
+            && alpha.varies()
+            && !companions.iter().any(Companion::is_alpha)
+        {
+            let mut along: Vec<Companion> = companions.iter_mut().map(Companion::take).collect();
+            along.push(Companion::new(Kind::Share, alpha.clone()));
+            let done = self.denoise_along(shot, &mut along, tile, expects);
+            companions.iter_mut().zip(along).for_each(|(companion, along)| *companion = along);
+            return done;
+        }
         let (place, size) = passes.rendered();
         let whole = (passes.width, passes.height);
         // Alpha or a shadow catcher may go on where nothing that the network reads does: then a thing on a transparent
@@ -300,13 +312,9 @@ impl Learned {
     }
 }
 
-/// Where nothing was met, as the frame's alpha tells, or an alpha that was denoised along with it, which is cleared there.
+/// Where nothing was met, as alpha tells, which was denoised along with the frame and is cleared there.
 fn find_empty(radiance: &Planes, passes: &PassSet, companions: &mut [Companion]) -> Option<Empty> {
-    if let Some(rendered) = passes.get(Pass::Alpha) {
-        return Empty::of(radiance, Alpha { rendered, denoised: None }, passes.samples);
-    }
-    let is_alpha = |along: &&mut Companion| along.kind == Kind::Share && along.planes.channels == 1;
-    let Companion { planes, rendered, .. } = companions.iter_mut().find(is_alpha)?;
+    let Companion { planes, rendered, .. } = companions.iter_mut().find(|along| along.is_alpha())?;
     let empty = Empty::of(radiance, Alpha { rendered, denoised: Some(planes) }, passes.samples)?;
     empty.clear(planes);
     Some(empty)

@@ -66,8 +66,8 @@ const SIGNED: usize = 0;
 const SQUARED: usize = 1;
 
 impl<'a> Own<'a> {
-    /// Of a denoised `image`, (3, H, W), the frame's `radiance` as rendered, and the `exposure` that brings it
-    /// to middle grey.
+    /// Of a denoised `image`, (3, H, W), or (4, H, W) with alpha, the frame's `radiance` as rendered, and the `exposure`
+    /// that brings it to middle grey.
     pub fn of(image: &'a Planes, radiance: &Planes, exposure: f32) -> Self {
         let (size, floor) = ((image.width, image.height), FLOOR / exposure);
         let noise = Planes::from_rows(1, size, |_, y, squared| {
@@ -215,16 +215,30 @@ impl Vectorised for Difference<'_> {
 /// The neighbour's image at the places where the content of the frame lies in it; the frame's own where
 /// that is outside.
 fn fetch(own: &Planes, other: &Planes, link: &Link) -> Planes {
+    assert_eq!(own.channels, other.channels, "both with alpha, or without");
+    match own.channels {
+        3 => fetch_channels::<3>(own, other, link),
+        4 => fetch_channels::<4>(own, other, link),
+        n => unreachable!("{n} planes are no image"),
+    }
+}
+
+fn fetch_channels<const N: usize>(own: &Planes, other: &Planes, link: &Link) -> Planes {
     let (width, height) = link.flow.size();
-    Planes::from_rows_of_all(3, (width, height), |y, out| {
+    // Alpha, behind the light, is as high in dark frames as in bright ones.
+    let factors: [f32; N] = std::array::from_fn(|c| if c < 3 { link.brightness } else { 1.0 });
+    Planes::from_rows_of_all(N, (width, height), |y, out| {
         let (columns, rows) = link.flow.row(y);
         for x in 0..width {
-            let colours = if columns[x].is_nan() {
-                [0, 1, 2].map(|c| own.channel(c)[y * width + x])
+            let mut values: [f32; N] = if columns[x].is_nan() {
+                std::array::from_fn(|c| own.channel(c)[y * width + x])
             } else {
-                sharp(other, (columns[x], rows[x])).map(|colour| link.brightness * colour)
+                sharp(other, (columns[x], rows[x]))
             };
-            out.iter_mut().zip(colours).for_each(|(out, colour)| out[x] = colour);
+            if !columns[x].is_nan() {
+                values.iter_mut().zip(factors).for_each(|(value, factor)| *value *= factor);
+            }
+            out.iter_mut().zip(values).for_each(|(out, value)| out[x] = value);
         }
     })
 }

@@ -90,7 +90,8 @@ pub fn merge(own: &dyn Values, is_light: bool, neighbours: &[(&dyn Values, &Link
 }
 
 /// The weighted mean of a denoised `image`, (3, H, W), and its neighbours' denoised images, as far as each is
-/// [alike](Own). `radiance` is the frame as rendered, `exposure` what brings it to middle grey.
+/// [alike](Own). Alpha may be a fourth plane of all of them: it goes where the light does. `radiance` is the frame as
+/// rendered, `exposure` what brings it to middle grey.
 ///
 /// # Panics
 /// If sizes differ.
@@ -108,7 +109,7 @@ pub fn blend(image: &Planes, radiance: &Planes, exposure: f32, neighbours: &[(&P
             own.weigh(other, link)
         })
         .collect();
-    Planes::from_rows_of_all(3, size, |y, rows| {
+    Planes::from_rows_of_all(image.channels, size, |y, rows| {
         let mut sums = vec![1.0; size.0];
         for (_, weights) in &others {
             sums.iter_mut().zip(weights.row(0, y)).for_each(|(sum, weight)| *sum += weight);
@@ -192,5 +193,17 @@ mod tests {
         let far = blend(&image, &radiance, 0.6, &[(&grey(|_, _| 0.9), &link)]);
         assert!(far.data.iter().all(|v| (0.3..0.32).contains(v)), "{}", far.data[0]);
         assert_eq!(blend(&image, &radiance, 0.6, &[]), image);
+        // Alpha goes where the light does, and is no brighter in a brighter frame.
+        let with_alpha = |image: &Planes, alpha: f32| {
+            image.followed_by(&Planes::from_vec(1, SIZE.0, SIZE.1, vec![alpha; SIZE.0 * SIZE.1]))
+        };
+        let link = Link { brightness: 2.0, ..link };
+        let (own, other) = (with_alpha(&image, 0.4), with_alpha(&grey(|_, _| 0.155), 0.8));
+        let [light, alpha] = blend(&own, &radiance, 0.6, &[(&other, &link)]).split_after(3);
+        assert_eq!(light, near);
+        let moved = light.channel(0).iter().map(|light| (light - 0.3) / 0.01);
+        for (moved, alpha) in moved.zip(&alpha.data) {
+            assert!((alpha - (0.4 + 0.4 * moved)).abs() < 1e-3, "{alpha} {moved}");
+        }
     }
 }
