@@ -12,8 +12,10 @@ use std::{
 use common::{
     files::{read_exr, values, write_render},
     python::{self, run},
+    shot::{SHOT, Shot, random, write_channels},
 };
 use demc::passes::{self, Pass, PassSet};
+use exr::prelude::{AnyChannel, FlatSamples};
 use predicates::{prelude::*, str::contains};
 use tempfile::TempDir;
 
@@ -318,6 +320,56 @@ fn alpha_of_many_samples_is_not_blurred() {
         let done = alpha(&denoise("many.exr", out.path(), &format!("--model {model} --overwrite --replace")));
         let [before, after] = [&noisy, &done].map(|alpha| error(alpha));
         assert!(after < before, "{model}: alpha is off by {after}, as rendered by {before}");
+    }
+}
+
+#[test]
+fn caught_shadows_are_denoised_though_the_beauty_is_black_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let (width, height) = (96, 64);
+    let shot = Shot { size: (width, height), speed: 0.0, ..SHOT };
+    // A thing, its shadow, of which samples see more or less, and nothing.
+    let truth = |i: usize| [1.0, 0.6, 0.0][usize::from(i % width >= 12) + usize::from(i % width >= 80)];
+    for frame in 1..=3 {
+        let hits = |i: usize| (0..4).filter(|sample| random([frame, i as u32, *sample]) < truth(i)).count();
+        let alpha: Vec<f32> = (0..width * height).map(|i| hits(i) as f32 / 4.0).collect();
+        let mut channels = shot.channels("ViewLayer", "", frame.into());
+        for channel in &mut channels {
+            if let FlatSamples::F32(values) = &mut channel.sample_data
+                && channel.name.to_string().contains("Combined")
+            {
+                values.iter_mut().enumerate().filter(|(i, _)| i % width >= 12).for_each(|(_, v)| *v = 0.0);
+            }
+        }
+        let kept: Vec<f32> = alpha.iter().map(|alpha| 1.0 - alpha).collect();
+        for c in ["R", "G", "B"] {
+            let name = format!("ViewLayer.Shadow Catcher.{c}");
+            channels.push(AnyChannel::new(name.as_str(), FlatSamples::F32(kept.clone())));
+        }
+        channels.push(AnyChannel::new("ViewLayer.Combined.A", FlatSamples::F32(alpha)));
+        write_channels(&dir.path().join(format!("s_0004spp.{frame:04}.exr")), shot.size, channels, &[]);
+    }
+    let out = dir.path().join("out");
+    for model in ["demc-s", "demc-m"] {
+        let denoise = |arguments: &str| {
+            let mut command = common::demc();
+            command.args(["denoise", "--overwrite", "--model", model, "--out"]).args([&*out, dir.path()]);
+            command.args(arguments.split_whitespace()).assert().success();
+            let result = read_exr(out.join("s_0004spp.0002.exr"));
+            let error = |channel: &str, kept: bool| {
+                let got = values(&result, &format!("ViewLayer.{channel}"));
+                let of = |(i, v): (usize, f32)| (if kept { 1.0 - v } else { v } - truth(i)).powi(2);
+                got.into_iter().enumerate().map(of).sum::<f32>()
+            };
+            let passes = arguments.contains("--passes");
+            let catcher = passes.then(|| error("Shadow Catcher.Denoised.R", true));
+            (error("Combined.A", false), error("Denoised.A", false), catcher)
+        };
+        let (rendered, alone, catcher) = denoise("--passes");
+        assert!(alone < 0.1 * rendered, "{model}: alpha is off by {alone}, as rendered by {rendered}");
+        assert!(catcher.is_some_and(|off| off < 0.1 * rendered), "{model}: {catcher:?} of {rendered}");
+        let (_, with, _) = denoise("--temporal");
+        assert!(with < alone, "{model}: alpha is off by {with} with neighbours, {alone} alone");
     }
 }
 

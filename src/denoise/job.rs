@@ -411,10 +411,10 @@ fn denoise_here(loaded: Views<Shot>, model: &dyn Denoiser, options: &Options) ->
         report.notes.extend(model.notes(&shot).filter(|note| !report.notes.contains(note)));
         let start = Instant::now();
         let (radiance, error) = run(&shot, &mut along.companions, true, (model, options.tile))?;
-        report.seconds += start.elapsed().as_secs_f64();
         let (path, alpha) = (shot.passes.path.clone(), shot.passes.remove(Pass::Alpha));
-        // What was read is not needed any more, so its memory is freed.
-        drop(shot);
+        // What was read is not needed after that, so its memory is freed.
+        along.denoise_apart(shot, (model, options.tile))?;
+        report.seconds += start.elapsed().as_secs_f64();
         let (denoised_alpha, lights) = along.finish(frame, layer);
         let done = finish(&path, radiance, (denoised_alpha.or(alpha), lights), model, report)?;
         Ok(Denoised { error, ..done })
@@ -443,7 +443,9 @@ pub fn shot(mut shot: Shot, model: &dyn Denoiser, options: &Options) -> Result<(
         let mut along = Along::take(&mut shot, model, options, &mut report.notes);
         let (radiance, _) = run(&shot, &mut along.companions, false, (model, options.tile))?;
         let radiance = finite(radiance, model.name(), &shot.passes.path, &mut report)?;
-        Ok((radiance, along.alpha().or(shot.passes.remove(Pass::Alpha))))
+        let alpha = shot.passes.remove(Pass::Alpha);
+        along.denoise_apart(shot, (model, options.tile))?;
+        Ok((radiance, along.alpha().or(alpha)))
     })
 }
 

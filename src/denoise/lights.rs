@@ -10,9 +10,11 @@ use std::collections::HashSet;
 
 use half::f16;
 
-use super::Options;
+use super::{Options, job::run};
 use crate::{
+    Error, Result,
     companion::{Companion, Kind},
+    filters::caught::Caught,
     frame::{Frame, SampleKind},
     models::Denoiser,
     passes::{BLENDER, Layer, Pass, PassChannels},
@@ -111,20 +113,30 @@ pub struct Along {
     /// The environment, where a transparent film does not show it: it is no part of the beauty, so that what is found
     /// of that says nothing of it, and it stays as rendered.
     unseen: Option<Planes>,
+    /// A shadow in alpha, and the shadow catcher's picture: the beauty is black where they are, so that they are denoised
+    /// by themselves.
+    caught: Option<Caught>,
+    shadows: Option<Planes>,
 }
 
 impl Along {
     /// Takes out of a shot the passes that are to go along, and notes those that cannot.
     pub fn take(shot: &mut Shot, model: &dyn Denoiser, options: &Options, notes: &mut Vec<String>) -> Self {
-        let mut along = Self::default();
-        let is_denoised = |alpha: &Planes| options.alpha.is_denoised(alpha, model);
-        if shot.passes.get(Pass::Alpha).is_some_and(is_denoised)
-            && let Some(alpha) = shot.passes.remove(Pass::Alpha)
-        {
-            along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha);
-        }
+        let mut along = Self::of_alpha(shot, model, options.alpha);
         if options.passes {
             along.take_lights(shot, notes);
+        }
+        along
+    }
+
+    /// Takes alpha out of a shot, if it is to be denoised.
+    pub fn of_alpha(shot: &mut Shot, model: &dyn Denoiser, how: Alpha) -> Self {
+        let mut along = Self::default();
+        if shot.passes.get(Pass::Alpha).is_some_and(|alpha| how.is_denoised(alpha, model))
+            && let Some(alpha) = shot.passes.remove(Pass::Alpha)
+        {
+            along.caught = shot.passes.get(Pass::Combined).and_then(|beauty| Caught::of(beauty, &alpha));
+            along.push(Source::Pass(Pass::Alpha), Kind::Share, alpha);
         }
         along
     }
@@ -191,16 +203,15 @@ impl Along {
                 self.push(Source::Pass(pass), Kind::Light, planes);
             }
         }
-        if let Some(planes) = shot.passes.remove(Pass::ShadowCatcher) {
-            self.push(Source::Pass(Pass::ShadowCatcher), Kind::Share, planes);
-        }
+        self.shadows = shot.passes.remove(Pass::ShadowCatcher);
         for (name, planes) in std::mem::take(&mut shot.light_groups) {
             self.push(Source::LightGroup(name), Kind::Light, planes);
         }
         for companion in self.companions.iter_mut().filter(|companion| companion.kind == Kind::Light) {
             below.iter().for_each(|at| companion.planes.data[*at] = 0.0);
         }
-        if self.unseen.is_none() && self.sources.iter().all(|source| *source == Source::Pass(Pass::Alpha)) {
+        let is_apart = self.unseen.is_some() || self.shadows.is_some();
+        if !is_apart && self.sources.iter().all(|source| *source == Source::Pass(Pass::Alpha)) {
             let remedy = match shot.passes.renderer.is_blender() {
                 true => "turn on View Layer Properties > Passes > Light, or light groups",
                 false => "--map 'PASS=NAME' tells where they are, if there are any",
@@ -218,11 +229,34 @@ impl Along {
         (0..light.pixels()).any(|at| alpha.data[at] == 0.0 && channels().any(|values| values[at] > 0.0))
     }
 
+    /// Denoises what the beauty knows nothing of, with the guides of a shot whose beauty has been denoised and which is of
+    /// no use after that. The albedo is none of these guides: it would draw the outlines of things.
+    ///
+    /// # Errors
+    /// The model cannot denoise it.
+    pub fn denoise_apart(&mut self, mut shot: Shot, with: (&dyn Denoiser, Option<usize>)) -> Result<()> {
+        for pass in [Pass::Alpha, Pass::DenoisingAlbedo] {
+            drop(shot.passes.remove(pass));
+        }
+        let mut denoise = |picture: Planes| {
+            shot.passes.insert(Pass::Combined, picture);
+            Ok::<_, Error>(run(&shot, &mut [], false, with)?.0)
+        };
+        if let Some(caught) = self.caught.take() {
+            let is_alpha = |companion: &&mut Companion| companion.is_alpha();
+            let alpha = self.companions.iter_mut().find(is_alpha).expect("the shadow was found in it");
+            caught.put(&denoise(caught.picture())?, &mut alpha.planes);
+        }
+        self.shadows = self.shadows.take().map(denoise).transpose()?;
+        Ok(())
+    }
+
     /// Each source with what became of it.
     fn done(self) -> Vec<(Source, Planes)> {
         let denoised = self.companions.into_iter().map(|companion| companion.planes);
         let unseen = self.unseen.map(|planes| (Source::Pass(Pass::Environment), planes));
-        self.sources.into_iter().zip(denoised).chain(unseen).collect()
+        let shadows = self.shadows.map(|planes| (Source::Pass(Pass::ShadowCatcher), planes));
+        self.sources.into_iter().zip(denoised).chain(unseen).chain(shadows).collect()
     }
 
     /// Alpha, (1, H, W), once the model has denoised it, if it goes along.

@@ -18,10 +18,10 @@ use super::{
     Alpha, Denoised, Report, Views,
     half_floats::HalfFloats,
     job::{finish, run},
+    lights::Along,
 };
 use crate::{
     Error, Result,
-    companion::{Companion, Kind},
     features::exposure,
     filters::{
         agreement::{self, Guides, Look},
@@ -425,21 +425,14 @@ impl<'a> Window<'a> {
             own.shot()
         };
         offsets(renders).chain([0]).for_each(|n| self.trim(number + i64::from(n), view, number));
-        let (mut along, mut even) = (Vec::new(), None);
-        if let Some(rendered) = shot.passes.get(Pass::Alpha)
-            && alpha != Alpha::Keep
-        {
-            if alpha.is_denoised(rendered, model) {
-                let rendered = shot.passes.remove(Pass::Alpha);
-                along.extend(rendered.map(|rendered| Companion::new(Kind::Share, rendered)));
-            } else if !rendered.varies() {
-                even = rendered.data.first().copied();
-            }
-        }
-        let (image, _) = run(&shot, &mut along, false, (model, tile))?;
+        let mut along = Along::of_alpha(&mut shot, model, alpha);
+        let even = shot.passes.get(Pass::Alpha).filter(|rendered| alpha != Alpha::Keep && !rendered.varies());
+        let even = even.and_then(|rendered| rendered.data.first().copied());
+        let (image, _) = run(&shot, &mut along.companions, false, (model, tile))?;
+        along.denoise_apart(shot, (model, tile))?;
         let lacked = self.lost(number, view, renders);
         let moment = self.moment_mut(number, view).expect("it is there");
-        moment.alpha = along.pop().map(|alpha| Cover::Varying(alpha.planes)).or(even.map(Cover::Even));
+        moment.alpha = along.alpha().map(Cover::Varying).or(even.map(Cover::Even));
         (moment.result, moment.lacked) = (Some(image), lacked);
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! Takes back what denoising changed of a share, such as alpha, beyond its noise.
 //!
-//! Shares are averaged by the beauty's kernels, which know nothing of them where the beauty is black, as under
-//! a caught shadow or along the edge of a dark thing. But a share is the mean of a pixel's samples, each
+//! Shares are averaged by the beauty's kernels, which know nothing of them where the beauty is black, as along the
+//! edge of a dark thing. But a share is the mean of a pixel's samples, each
 //! between 0 and 1, so its noise is known: of `n` independent samples of a mean of `d` the variance is at most
 //! `d (1 - d) / n`, and of samples spread evenly over a pixel that an edge crosses it falls with `n^1.5`. What a
 //! share was changed by is compared with that, over the pixels around. The denoised share `d` and the rendered one

@@ -3,8 +3,8 @@
 //! [`nl_means`] holds the patch weights and the filter that averages by them. [`regression`] holds weighted
 //! first-order fits over whole windows, and [`refit`] fits that correct a denoised frame, whose sums are
 //! gathered in [`squares`]; [`solve`] solves the small symmetric systems of both. [`variance`] estimates the
-//! noise, and [`shrinkage`] takes back what was changed beyond the noise, [`coverage`] the same of alpha. Work is cut into tiles of the
-//! frame, one a thread; inner loops run over consecutive pixels so that the compiler can vectorise them.
+//! noise, and [`shrinkage`] takes back what was changed beyond the noise, [`coverage`] the same of alpha, of which [`caught`] finds
+//! shadows that the beauty does not show. Work is cut into tiles of the frame, one a thread; inner loops run over consecutive pixels so that the compiler can vectorise them.
 //! Results do not depend on the number of threads.
 //!
 //! For sequences, [`motion`] follows what moves from frame to frame, [`agreement`] tells where two frames
@@ -13,6 +13,7 @@
 pub mod agreement;
 pub mod blocks;
 mod box_mean;
+pub mod caught;
 pub mod coverage;
 pub mod motion;
 pub mod nl_means;

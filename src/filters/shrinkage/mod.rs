@@ -219,7 +219,7 @@ pub fn take_back(denoised: &mut Planes, rendered: &Planes, shares: &Planes) {
 }
 
 /// What is set in a mask, or lies at most `reach` rows and columns away from that.
-fn grown(mask: &[bool], (width, height): (usize, usize), reach: usize) -> Vec<bool> {
+pub(super) fn grown(mask: &[bool], (width, height): (usize, usize), reach: usize) -> Vec<bool> {
     let mut grown = vec![false; mask.len()];
     grown.par_chunks_mut(width).enumerate().for_each_init(
         || vec![false; width + 2 * reach],
