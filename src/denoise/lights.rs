@@ -60,6 +60,10 @@ const LIT: [([Pass; 2], Pass); 3] = [
 /// Light passes that are stored as they are added.
 const ADDED: [Pass; 4] = [Pass::VolumeDirect, Pass::VolumeIndirect, Pass::Emission, Pass::Environment];
 
+/// Pictures of their own, of which the beauty knows nothing: where shadows are caught it is black, and what occludes a
+/// surface lights it in its own way.
+const APART: [Pass; 2] = [Pass::ShadowCatcher, Pass::AmbientOcclusion];
+
 /// The least value of a denoised colour by which light is divided: large enough for half floats to hold it
 /// with sufficient precision, and too small to be seen.
 const LEAST_COLOUR: f32 = 1e-3;
@@ -67,7 +71,7 @@ const LEAST_COLOUR: f32 = 1e-3;
 /// Every pass that may go along, except alpha.
 pub fn light_passes() -> Vec<Pass> {
     let lit = LIT.iter().flat_map(|(lights, colour)| [lights[0], lights[1], *colour]);
-    lit.chain(ADDED).chain([Pass::ShadowCatcher]).collect()
+    lit.chain(ADDED).chain(APART).collect()
 }
 
 /// Where the light passes and light groups of a layer are that can be denoised: light is stored with its colour
@@ -75,7 +79,7 @@ pub fn light_passes() -> Vec<Pass> {
 pub fn denoised_lights(layer: &Layer) -> Vec<&PassChannels> {
     let lit =
         LIT.iter().filter(|(_, colour)| layer.passes.contains_key(colour)).flat_map(|(lights, _)| lights);
-    let passes = lit.chain(&ADDED).chain(&[Pass::ShadowCatcher]).filter_map(|pass| layer.passes.get(pass));
+    let passes = lit.chain(&ADDED).chain(&APART).filter_map(|pass| layer.passes.get(pass));
     passes.chain(layer.light_groups.values()).collect()
 }
 
@@ -113,10 +117,9 @@ pub struct Along {
     /// The environment, where a transparent film does not show it: it is no part of the beauty, so that what is found
     /// of that says nothing of it, and it stays as rendered.
     unseen: Option<Planes>,
-    /// A shadow in alpha, and the shadow catcher's picture: the beauty is black where they are, so that they are denoised
-    /// by themselves.
+    /// A shadow in alpha, where the beauty is black, and those [`APART`]: they are denoised by themselves.
     caught: Option<Caught>,
-    shadows: Option<Planes>,
+    apart: Vec<(Pass, Planes)>,
 }
 
 impl Along {
@@ -162,8 +165,7 @@ impl Along {
         }
         let adds_up = |pass: &Pass| match pass {
             Pass::Combined => true,
-            Pass::ShadowCatcher => false,
-            pass => light_passes().contains(pass),
+            pass => !APART.contains(pass) && light_passes().contains(pass),
         };
         let of_passes = shot.repaired.iter().filter(|(pass, _)| adds_up(pass)).map(|(_, count)| count);
         let broken: usize = of_passes.chain(shot.repaired_groups.values()).sum();
@@ -203,15 +205,16 @@ impl Along {
                 self.push(Source::Pass(pass), Kind::Light, planes);
             }
         }
-        self.shadows = shot.passes.remove(Pass::ShadowCatcher);
+        let held = APART.into_iter().filter_map(|pass| Some((pass, shot.passes.remove(pass)?)));
+        self.apart = held.collect();
         for (name, planes) in std::mem::take(&mut shot.light_groups) {
             self.push(Source::LightGroup(name), Kind::Light, planes);
         }
         for companion in self.companions.iter_mut().filter(|companion| companion.kind == Kind::Light) {
             below.iter().for_each(|at| companion.planes.data[*at] = 0.0);
         }
-        let is_apart = self.unseen.is_some() || self.shadows.is_some();
-        if !is_apart && self.sources.iter().all(|source| *source == Source::Pass(Pass::Alpha)) {
+        let has_others = self.unseen.is_some() || !self.apart.is_empty();
+        if !has_others && self.sources.iter().all(|source| *source == Source::Pass(Pass::Alpha)) {
             let remedy = match shot.passes.renderer.is_blender() {
                 true => "turn on View Layer Properties > Passes > Light, or light groups",
                 false => "--map 'PASS=NAME' tells where they are, if there are any",
@@ -247,7 +250,9 @@ impl Along {
             let alpha = self.companions.iter_mut().find(is_alpha).expect("the shadow was found in it");
             caught.put(&denoise(caught.picture())?, &mut alpha.planes);
         }
-        self.shadows = self.shadows.take().map(denoise).transpose()?;
+        for (_, picture) in &mut self.apart {
+            *picture = denoise(std::mem::take(picture))?;
+        }
         Ok(())
     }
 
@@ -255,8 +260,8 @@ impl Along {
     fn done(self) -> Vec<(Source, Planes)> {
         let denoised = self.companions.into_iter().map(|companion| companion.planes);
         let unseen = self.unseen.map(|planes| (Source::Pass(Pass::Environment), planes));
-        let shadows = self.shadows.map(|planes| (Source::Pass(Pass::ShadowCatcher), planes));
-        self.sources.into_iter().zip(denoised).chain(unseen).chain(shadows).collect()
+        let apart = self.apart.into_iter().map(|(pass, planes)| (Source::Pass(pass), planes));
+        self.sources.into_iter().zip(denoised).chain(unseen).chain(apart).collect()
     }
 
     /// Alpha, (1, H, W), once the model has denoised it, if it goes along.

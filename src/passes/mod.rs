@@ -76,6 +76,8 @@ pub enum Pass {
     Environment,
     /// What shadow catchers leave of the light behind them: 1 without shadow, RGB.
     ShadowCatcher,
+    /// How open the surroundings of a surface are, from 0 to 1, RGB.
+    AmbientOcclusion,
     /// Distance from the camera of the first sample, one channel; 1e10 where nothing is hit.
     Depth,
     /// Motion to the previous (XY) and next (ZW) frame in pixels, four channels.
@@ -103,7 +105,7 @@ pub enum Quantity {
 
 impl Pass {
     /// Every pass.
-    pub const ALL: [Pass; 24] = [
+    pub const ALL: [Pass; 25] = [
         Pass::Combined,
         Pass::Alpha,
         Pass::Normal,
@@ -126,6 +128,7 @@ impl Pass {
         Pass::Emission,
         Pass::Environment,
         Pass::ShadowCatcher,
+        Pass::AmbientOcclusion,
         Pass::Depth,
         Pass::Vector,
     ];
@@ -137,9 +140,8 @@ impl Pass {
             Combined | NoisyImage | DiffuseDirect | DiffuseIndirect | GlossyDirect | GlossyIndirect
             | TransmissionDirect | TransmissionIndirect | VolumeDirect | VolumeIndirect | Emission
             | Environment => Quantity::Radiance,
-            DiffuseColor | GlossyColor | TransmissionColor | DenoisingAlbedo | ShadowCatcher => {
-                Quantity::Colour
-            }
+            DiffuseColor | GlossyColor | TransmissionColor | DenoisingAlbedo | ShadowCatcher
+            | AmbientOcclusion => Quantity::Colour,
             Normal | DenoisingNormal => Quantity::Direction,
             Position => Quantity::Place,
             Depth | DenoisingDepth => Quantity::Distance,

@@ -118,6 +118,7 @@ pub static BLENDER: Renderer = Renderer {
         blender!(Emission, ["Emission", "Emit"], "Light > Emission"),
         blender!(Environment, ["Environment", "Env"], "Light > Environment"),
         blender!(ShadowCatcher, ["Shadow Catcher"], "Light > Shadow Catcher"),
+        blender!(AmbientOcclusion, ["Ambient Occlusion", "AO"], "Light > Ambient Occlusion"),
         blender!(DenoisingNormal, ["Denoising Normal"], "Data > Denoising Data"),
         blender!(DenoisingAlbedo, ["Denoising Albedo"], "Data > Denoising Data"),
         blender!(DenoisingDepth, ["Denoising Depth"], "Data > Denoising Data"),
