@@ -238,6 +238,7 @@ impl Along {
     /// # Errors
     /// The model cannot denoise it.
     pub fn denoise_apart(&mut self, mut shot: Shot, with: (&dyn Denoiser, Option<usize>)) -> Result<()> {
+        let region = shot.passes.rendered();
         for pass in [Pass::Alpha, Pass::DenoisingAlbedo] {
             drop(shot.passes.remove(pass));
         }
@@ -248,7 +249,7 @@ impl Along {
         if let Some(caught) = self.caught.take() {
             let is_alpha = |companion: &&mut Companion| companion.is_alpha();
             let alpha = self.companions.iter_mut().find(is_alpha).expect("the shadow was found in it");
-            caught.put(&denoise(caught.picture())?, &mut alpha.planes);
+            caught.put(&denoise(caught.picture(region))?, &mut alpha.planes);
         }
         for (_, picture) in &mut self.apart {
             *picture = denoise(std::mem::take(picture))?;

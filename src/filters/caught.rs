@@ -57,9 +57,18 @@ impl Caught {
         })
     }
 
-    /// The picture that a network is to denoise, (3, H, W).
-    pub fn picture(&self) -> Planes {
-        self.kept.of_first(3)
+    /// The picture that a network is to denoise, (3, H, W). Where a region was rendered, given by its first pixel and its size,
+    /// it is black beyond, as all that a network reads, unless something is covered there.
+    pub fn picture(&self, (place, size): ((usize, usize), (usize, usize))) -> Planes {
+        let inside =
+            |x, y| (place.0..place.0 + size.0).contains(&x) && (place.1..place.1 + size.1).contains(&y);
+        let ends_there =
+            |y| self.kept.row(0, y).iter().enumerate().all(|(x, kept)| *kept == 1.0 || inside(x, y));
+        let picture = self.kept.of_first(3);
+        if !(0..self.kept.height).all(ends_there) {
+            return picture;
+        }
+        picture.window(place, size).placed_in((picture.width, picture.height), place)
     }
 
     /// Puts what was made of the picture in place of alpha that was denoised with the beauty, the more of it the fewer pixels
@@ -108,7 +117,12 @@ mod tests {
         let alpha = of_columns(1, |x| [1.0, 0.6, 0.0][usize::from(x >= 10) + usize::from(x >= 25)]);
         let caught = Caught::of(&radiance, &alpha).unwrap();
         assert!(
-            caught.picture().row(2, 7).iter().zip(alpha.row(0, 7)).all(|(kept, alpha)| *kept == 1.0 - alpha)
+            caught
+                .picture(((0, 0), SIZE))
+                .row(2, 7)
+                .iter()
+                .zip(alpha.row(0, 7))
+                .all(|(kept, alpha)| *kept == 1.0 - alpha)
         );
         let mut denoised = of_columns(1, |_| 0.9);
         caught.put(&of_columns(3, |_| 0.3), &mut denoised);
@@ -122,6 +136,16 @@ mod tests {
         let caught = Caught::of(&of_columns(3, |_| 0.0), &black).unwrap();
         caught.put(&of_columns(3, |_| 0.01), &mut denoised);
         assert!(denoised.row(0, 3)[..27].iter().all(|alpha| *alpha == 1.0));
+    }
+
+    #[test]
+    fn the_picture_of_a_region_ends_where_that_does() {
+        let alpha = of_columns(1, |x| if (5..30).contains(&x) { 0.5 } else { 0.0 });
+        let caught = Caught::of(&of_columns(3, |_| 0.0), &alpha).unwrap();
+        let picture = |region| caught.picture(region).row(1, 9).to_vec();
+        let within = picture(((4, 0), (28, SIZE.1)));
+        assert_eq!((within[3], within[4], within[5], within[31], within[32]), (0.0, 1.0, 0.5, 1.0, 0.0));
+        assert_eq!(picture(((6, 0), (28, SIZE.1))), picture(((0, 0), SIZE)), "more is covered");
     }
 
     #[test]
