@@ -367,7 +367,7 @@ fn layer_names() {
 #[test]
 fn replaces_the_layers_it_added_and_no_others() {
     // Each file has a layer that demc does not read, in its own letter case or with bare channels.
-    for (file, layer) in [("blender4.exr", "AO"), ("blender5_stereo.exr", "cryptoobject00")] {
+    for (file, layer) in [("blender4.exr", "CryptoObject00"), ("blender5_stereo.exr", "cryptoobject00")] {
         let (_dir, out) = out();
         let run = demc(&out).arg(data(file)).args(["--layer", layer]).assert().code(1);
         run.stderr(contains(format!("'ViewLayer.{layer}' without demc's mark; give --layer another name")));
