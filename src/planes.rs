@@ -265,6 +265,15 @@ impl Planes {
         })
     }
 
+    /// Whether all that is not zero lies in the window of (width, height) pixels from (x, y) on.
+    ///
+    /// # Panics
+    /// If that window is not inside of the planes.
+    pub fn lies_within(&self, place: (usize, usize), size: (usize, usize)) -> bool {
+        let whole = (self.width, self.height);
+        size == whole || self.window(place, size).placed_in(whole, place) == *self
+    }
+
     /// Whether there are two different values.
     pub fn varies(&self) -> bool {
         self.data.iter().any(|value| *value != self.data[0])

@@ -163,10 +163,8 @@ impl Along {
                 "Combined is below zero in {count} of the pixels: there it and its light are denoised as black"
             ));
         }
-        let adds_up = |pass: &Pass| match pass {
-            Pass::Combined => true,
-            pass => !APART.contains(pass) && light_passes().contains(pass),
-        };
+        let adds_up =
+            |pass: &Pass| *pass == Pass::Combined || light_passes().contains(pass) && !APART.contains(pass);
         let of_passes = shot.repaired.iter().filter(|(pass, _)| adds_up(pass)).map(|(_, count)| count);
         let broken: usize = of_passes.chain(shot.repaired_groups.values()).sum();
         if broken > 0 {

@@ -338,7 +338,8 @@ impl<'a> Window<'a> {
         if let Some(rendered) = own.pass(Pass::Alpha) {
             let both = shrinkage::Alpha { rendered: &rendered, denoised: alpha.as_ref() };
             if let Some(empty) = Empty::of(&radiance, both, own.shot.passes.samples) {
-                [Some(&mut blended), alpha.as_mut()].into_iter().flatten().for_each(|of| empty.clear(of));
+                empty.clear(&mut blended);
+                alpha.iter_mut().for_each(|alpha| empty.clear(alpha));
             }
         }
         Ok((blended, alpha))

@@ -17,8 +17,8 @@ const REACH: usize = 3;
 
 /// A caught shadow.
 pub struct Caught {
-    /// What the background keeps of its light, (1, H, W).
-    kept: Planes,
+    /// Alpha as rendered, (1, H, W).
+    alpha: Planes,
     /// How many of the pixels around one are lit, from 0 to 1, (1, H, W).
     lit: Planes,
     /// Where some pixel around is covered, and where one is not wholly.
@@ -48,9 +48,7 @@ impl Caught {
             grown(&alpha.data.par_iter().map(|alpha| is(*alpha)).collect::<Vec<bool>>(), size, REACH)
         };
         Some(Self {
-            kept: Planes::from_rows(1, size, |_, y, row| {
-                row.iter_mut().zip(alpha.row(0, y)).for_each(|(kept, alpha)| *kept = (1.0 - alpha).max(0.0));
-            }),
+            alpha: alpha.clone(),
             lit: Planes::from_rows(1, size, |_, y, row| box_mean::row(&lit, size, y, REACH, row)),
             is_covered: grown_where(|alpha| alpha > 0.0),
             is_open: grown_where(|alpha| alpha < 1.0),
@@ -60,15 +58,15 @@ impl Caught {
     /// The picture that a network is to denoise, (3, H, W). Where a region was rendered, given by its first pixel and its size,
     /// it is black beyond, as all that a network reads, unless something is covered there.
     pub fn picture(&self, (place, size): ((usize, usize), (usize, usize))) -> Planes {
-        let inside =
-            |x, y| (place.0..place.0 + size.0).contains(&x) && (place.1..place.1 + size.1).contains(&y);
-        let ends_there =
-            |y| self.kept.row(0, y).iter().enumerate().all(|(x, kept)| *kept == 1.0 || inside(x, y));
-        let picture = self.kept.of_first(3);
-        if !(0..self.kept.height).all(ends_there) {
-            return picture;
+        let whole = (self.alpha.width, self.alpha.height);
+        let kept = Planes::from_rows(3, whole, |_, y, row| {
+            row.iter_mut().zip(self.alpha.row(0, y)).for_each(|(kept, alpha)| *kept = (1.0 - alpha).max(0.0));
+        });
+        if self.alpha.lies_within(place, size) {
+            kept.window(place, size).placed_in(whole, place)
+        } else {
+            kept
         }
-        picture.window(place, size).placed_in((picture.width, picture.height), place)
     }
 
     /// Puts what was made of the picture in place of alpha that was denoised with the beauty, the more of it the fewer pixels
@@ -77,7 +75,7 @@ impl Caught {
     /// # Panics
     /// If sizes differ.
     pub fn put(&self, picture: &Planes, alpha: &mut Planes) {
-        let (width, height) = (self.kept.width, self.kept.height);
+        let (width, height) = (self.alpha.width, self.alpha.height);
         assert_eq!(
             (picture.extent(), alpha.extent()),
             ((3, width, height), (1, width, height)),

@@ -221,10 +221,9 @@ impl Denoiser for Learned {
         }
         let (place, size) = passes.rendered();
         let whole = (passes.width, passes.height);
-        // Alpha or a shadow catcher may go on where nothing that the network reads does: then a thing on a transparent
-        // film fills that part, and no region was rendered.
-        let ends_there =
-            |along: &Companion| along.planes.window(place, size).placed_in(whole, place) == along.planes;
+        // Alpha may go on where nothing that the network reads does: then a thing on a transparent film fills that part,
+        // and no region was rendered.
+        let ends_there = |along: &Companion| along.planes.lies_within(place, size);
         if size == whole || !companions.iter().all(ends_there) {
             return self.restrained(passes, companions, tile, expects);
         }

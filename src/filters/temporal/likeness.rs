@@ -230,14 +230,12 @@ fn fetch_channels<const N: usize>(own: &Planes, other: &Planes, link: &Link) -> 
     Planes::from_rows_of_all(N, (width, height), |y, out| {
         let (columns, rows) = link.flow.row(y);
         for x in 0..width {
-            let mut values: [f32; N] = if columns[x].is_nan() {
+            let values: [f32; N] = if columns[x].is_nan() {
                 std::array::from_fn(|c| own.channel(c)[y * width + x])
             } else {
-                sharp(other, (columns[x], rows[x]))
+                let there: [f32; N] = sharp(other, (columns[x], rows[x]));
+                std::array::from_fn(|c| factors[c] * there[c])
             };
-            if !columns[x].is_nan() {
-                values.iter_mut().zip(factors).for_each(|(value, factor)| *value *= factor);
-            }
             out.iter_mut().zip(values).for_each(|(out, value)| out[x] = value);
         }
     })
